@@ -1,0 +1,1 @@
+"""One package per protocol; they know the core and nothing of each other."""

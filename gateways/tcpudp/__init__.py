@@ -1,0 +1,65 @@
+"""The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
+
+``messages`` declares the packets, ``session`` holds the conversation in both roles, ``translate`` turns
+packets into fleet messages and commands into packets, ``simulator`` is a robot to play with.
+"""
+
+from __future__ import annotations
+
+from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
+from zbridge.protocol import Protocol, Simulation
+
+TEMPLATE = """\
+# A gateway for one robot of the TCP/UDP package protocol. Start it with: zbridge run FILE
+
+[robot]
+name = "{name}"                         # its keys begin with fleet/{name}/
+realm = "fleet"
+
+[device]
+protocol = "tcpudp"
+connect = ["tcp://127.0.0.1:11001"]     # the robot's address
+
+[device.options]
+gap_s = 0.01                            # least time between two packets: robots take one read as one packet
+force = []                              # features to use although the robot does not announce them, for
+                                        # example ["joystick", "lidar"], and ids of raw packets it knows
+combine = "exclusive"                   # drive that moves and turns: "exclusive" sends the larger, "both" both
+speed_full = 1.0                        # packet speed at full scale
+turn_full = 1.0                         # packet turn speed at full scale
+length_unit_m = 0.01                    # the robot's unit of length in metres
+heading_offset = 1.5707963267948966     # added to the robot's heading, radians
+map_cell_m = 0.01                       # side of a map cell where the robot does not announce it
+# map_origin = [0.0, 0.0]               # x, y of map cell (0, 0) in metres; left out: the map is centred
+
+[bus]
+mode = "peer"                           # peer, client, router (embedded); client when only connect is given
+connect = []                            # for example ["tcp/127.0.0.1:7447"]
+listen = []
+multicast = true                        # find peers on the local network
+stream = "drop"                         # "block": lose nothing when the bus is slower than the robot
+
+[control]
+lease_s = 3.0
+deadman_s = 2.0                         # motion without a fresh command ends after so many seconds
+
+# [metrics]
+# listen = "127.0.0.1:9100"             # counters for Prometheus
+"""
+
+
+async def _simulate(simulation: Simulation) -> None:
+    from gateways.tcpudp.simulator import simulate
+
+    await simulate(simulation)
+
+
+PROTOCOL = Protocol(
+    name=NAME,
+    summary="TCP/UDP package protocol: joystick, lidar, SLAM map",
+    options=Options,
+    links=1,
+    robot=TcpUdpRobot,
+    simulate=_simulate,
+    template=TEMPLATE,
+)

@@ -1,0 +1,298 @@
+"""The packets of the TCP/UDP package protocol, each declared once, and how they are framed.
+
+Source: the packet table and "Framing" of the protocol page. Names are the protocol's own, spelling included.
+Sans-IO.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from enum import Enum
+from typing import ClassVar, TypeVar
+
+import msgspec
+
+from zbridge.errors import ProtocolError
+from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
+
+MAX_FRAME = 4 * 2**20
+"""Bytes of the longest packet that is taken: a map of 2048 x 2048."""
+HEADER = struct.Struct("<iBB")
+SERVER_ID = 1
+"""The ``id`` byte of every packet from the robot."""
+
+
+class Sender(Enum):
+    """Who sends a packet."""
+
+    ROBOT = "robot"
+    HQ = "hq"
+    BOTH = "both"
+
+
+class Carrier(Enum):
+    """What carries a packet; ``UDP_IF_AGREED`` is the table's ``UDP*``."""
+
+    TCP = "tcp"
+    UDP = "udp"
+    UDP_IF_AGREED = "udp*"
+
+
+class Feature(Enum):
+    """The flags of the settings block, in their order on the wire."""
+
+    UDP = "udp"
+    CAM = "cam"
+    JOYSTICK = "joystick"
+    CHAT = "chat"
+    LIDAR = "lidar"
+    LIDAR_SIM = "lidar_sim"
+    SLAM_MAP = "slam_map"
+
+
+class Packet(Message, frozen=True):
+    """A message of this protocol."""
+
+    spec: ClassVar[Spec]
+
+
+P = TypeVar("P", bound=Packet)
+
+
+class Spec(msgspec.Struct, frozen=True, eq=False):
+    """A row of the packet table.
+
+    features: a robot that announces any of these has registered the packet; none means always.
+    """
+
+    id: int
+    name: str
+    sender: Sender
+    carrier: Carrier
+    features: tuple[Feature, ...]
+    packet: type[Packet]
+    codec: BinaryCodec[Packet]
+
+
+PACKETS: dict[int, Spec] = {}
+"""The packet table, by packet id."""
+
+
+def packet(
+    packet_id: int, name: str, sender: Sender, carrier: Carrier = Carrier.TCP, needs: tuple[Feature, ...] = ()
+) -> Callable[[type[P]], type[P]]:
+    """Enter a declaration into the packet table."""
+
+    def enter(declared: type[P]) -> type[P]:
+        spec = Spec(packet_id, name, sender, carrier, needs, declared, BinaryCodec(declared))
+        declared.spec = PACKETS[packet_id] = spec
+        return declared
+
+    return enter
+
+
+_JOYSTICK = (Feature.JOYSTICK,)
+_MAPPING = (Feature.SLAM_MAP, Feature.LIDAR)
+
+
+@packet(1, "debugMessage", Sender.BOTH)
+class DebugMessage(Packet, frozen=True):
+    """A text for people; an empty one crashes deployed robots."""
+
+    text: Text
+
+
+@packet(2, "serverSettings", Sender.ROBOT)
+class ServerSettings(Packet, frozen=True):
+    """The robot speaks first. What its newest listed version does not have is missing at the end.
+
+    slam_map_size and slam_map_interval are in the robot's length unit.
+    """
+
+    client_id: U8
+    versions: Text
+    udp: Bool
+    cam: Bool
+    joystick: Bool
+    chat: Bool
+    lidar: Bool
+    lidar_sim: Bool | None = None
+    slam_map: Bool | None = None
+    slam_map_size: I32 | None = None
+    slam_map_interval: I32 | None = None
+    tail: Rest = b""
+
+
+@packet(3, "clientSettings", Sender.HQ)
+class ClientSettings(Packet, frozen=True):
+    """The HQ's answer."""
+
+    versions: Text
+    udp: Bool
+    cam: Bool
+    joystick: Bool
+    chat: Bool
+    lidar: Bool
+    lidar_sim: Bool | None = None
+    slam_map: Bool | None = None
+    tail: Rest = b""
+
+
+@packet(4, "serverStartUDP", Sender.ROBOT)
+class ServerStartUDP(Packet, frozen=True):
+    """The robot waits for the HQ's datagram."""
+
+
+@packet(5, "clientUDPConnection", Sender.HQ, Carrier.UDP)
+class ClientUDPConnection(Packet, frozen=True):
+    """The datagram that tells the robot where the HQ's socket is."""
+
+
+@packet(6, "serverUDPConnection", Sender.ROBOT, Carrier.UDP)
+class ServerUDPConnection(Packet, frozen=True):
+    """Whether that datagram arrived; comes by UDP if it did, by TCP if not."""
+
+    received: Bool
+
+
+@packet(7, "clientUDPConnectionStatus", Sender.HQ)
+class ClientUDPConnectionStatus(Packet, frozen=True):
+    """Whether the robot's datagram arrived."""
+
+    connected: Bool
+
+
+@packet(10, "clientControllMode", Sender.HQ, needs=_JOYSTICK)
+class ClientControllMode(Packet, frozen=True):
+    """1 none, 2 joystick, 3 AI."""
+
+    mode: I32
+
+
+@packet(11, "clientJoystickMove", Sender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+class ClientJoystickMove(Packet, frozen=True):
+    """Move along (x right, y forward), a vector of length 1 at most."""
+
+    x: F32
+    y: F32
+    speed: F32
+
+
+@packet(12, "clientJoystickRotate", Sender.HQ, Carrier.UDP_IF_AGREED, needs=_JOYSTICK)
+class ClientJoystickRotate(Packet, frozen=True):
+    """Turn on the spot, positive to the right."""
+
+    speed: F32
+
+
+@packet(13, "clientJoystickStop", Sender.HQ, needs=_JOYSTICK)
+class ClientJoystickStop(Packet, frozen=True):
+    """Stand still."""
+
+
+@packet(21, "clientMoveAI", Sender.HQ, needs=_JOYSTICK)
+class ClientMoveAI(Packet, frozen=True):
+    """Not defined by the document: opaque."""
+
+    body: Rest = b""
+
+
+@packet(31, "serverCamMode", Sender.ROBOT)
+class ServerCamMode(Packet, frozen=True):
+    """1 on, 2 off."""
+
+    mode: I32
+
+
+@packet(40, "chatMessage", Sender.BOTH, needs=(Feature.CHAT,))
+class ChatMessage(Packet, frozen=True):
+    """Not defined by the document: opaque."""
+
+    body: Rest = b""
+
+
+@packet(50, "clientLidarMode", Sender.HQ, needs=(Feature.LIDAR,))
+class ClientLidarMode(Packet, frozen=True):
+    """1 on, 2 off."""
+
+    mode: I32
+
+
+@packet(51, "serverLidarStatus", Sender.ROBOT)
+class ServerLidarStatus(Packet, frozen=True):
+    """1 on, 2 off."""
+
+    mode: I32
+
+
+@packet(52, "clientGetSLAMMap", Sender.HQ, needs=_MAPPING)
+class ClientGetSLAMMap(Packet, frozen=True):
+    """Ask for the map."""
+
+
+@packet(53, "servertSLAMMap", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+class ServerSLAMMap(Packet, frozen=True):
+    """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y; empty: no map yet."""
+
+    cells: Blob
+
+
+@packet(54, "clientGetPosition", Sender.HQ, needs=_MAPPING)
+class ClientGetPosition(Packet, frozen=True):
+    """Ask for the position."""
+
+
+@packet(55, "serverPosition", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+class ServerPosition(Packet, frozen=True):
+    """Position in the robot's length unit, heading in degrees."""
+
+    x: F32
+    y: F32
+    heading_deg: F32
+
+
+@packet(60, "serverGetSimulatedLidarData", Sender.ROBOT)
+class ServerGetSimulatedLidarData(Packet, frozen=True):
+    """The robot asks for simulated lidar data."""
+
+
+@packet(61, "clientSimulatedLidarData", Sender.HQ, Carrier.UDP_IF_AGREED, needs=(Feature.LIDAR_SIM,))
+class ClientSimulatedLidarData(Packet, frozen=True, eq=False):
+    """float32[360] ranges in the robot's length unit, index = degree."""
+
+    ranges: F32Array
+
+
+class OpaquePacket(Packet, frozen=True):
+    """A packet the table reserves (70-79, the LED stripe) or does not know; its body is passed on as it is."""
+
+    id: int
+    body: bytes = b""
+
+
+def frame_end(data: bytes, start: int) -> int:
+    """Find where the packet at ``start`` ends ("Framing"): ``int32 length | u8 id | u8 packet id | body``."""
+    if len(data) - start < HEADER.size:
+        return start + HEADER.size
+    length = int.from_bytes(data[start : start + 4], "little", signed=True)
+    if length < 2:
+        raise ProtocolError(f"length {length}, expected at least 2")
+    return start + 4 + length
+
+
+def encode_packet(message: Packet, sender_id: int) -> bytes:
+    """Write a packet with its header; raise EncodeError for values it cannot carry."""
+    if isinstance(message, OpaquePacket):
+        packet_id, body = message.id, message.body
+    else:
+        packet_id, body = message.spec.id, message.spec.codec.encode(message)
+    return HEADER.pack(2 + len(body), sender_id, packet_id) + body
+
+
+def decode_packet(frame: bytes) -> Packet:
+    """Read a packet, header included; raise ProtocolError for a body that is not what its id says."""
+    spec = PACKETS.get(frame[5])
+    if spec is None:
+        return OpaquePacket(frame[5], frame[HEADER.size :])
+    return spec.codec.decode(frame, HEADER.size)

@@ -1,0 +1,186 @@
+"""Sessions of the TCP/UDP package protocol in both roles: handshake, identities, what may be sent. Sans-IO.
+
+Source: "Handshake", "Settings and version negotiation" and "The gateway as HQ" of the protocol page.
+Spoken here: version 1.3 over TCP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from gateways.tcpudp.messages import (
+    MAX_FRAME,
+    PACKETS,
+    SERVER_ID,
+    ClientSettings,
+    DebugMessage,
+    Feature,
+    OpaquePacket,
+    Packet,
+    Sender,
+    ServerSettings,
+    decode_packet,
+    encode_packet,
+    frame_end,
+)
+from zbridge.errors import EncodeError, ProtocolError, Refused
+from zbridge.session.negotiation import agree, parse_versions
+from zbridge.session.session import Limits, Role, Session
+
+VERSIONS = ("1.3",)
+"""The versions that are spoken."""
+LISTED = "1.1,1.2,1.3"
+"""What peers of version 1.3 send, and the only list deployed 1.3 robots take safely."""
+MAX_WRITE = 4096
+"""Bytes of the longest packet a deployed robot reads whole."""
+HANDSHAKE_S = 5.0
+ANNOUNCED = ClientSettings(
+    versions=LISTED,
+    udp=False,
+    cam=False,
+    joystick=False,
+    chat=False,
+    lidar=False,
+    lidar_sim=True,
+    slam_map=False,
+)
+"""What deployed HQ programs of version 1.3 announce (UDP aside): robots are known to take it."""
+
+
+def limits(gap_s: float) -> Limits:
+    """Give the bounds of a session that leaves ``gap_s`` seconds between two packets."""
+    return Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S, gap_s=gap_s)
+
+
+class _TcpUdpSession(Session[Packet]):
+    """What both roles share: framing, and the ``id`` byte of what they send."""
+
+    frame_end = staticmethod(frame_end)
+    sender: Sender
+    sender_id: int
+
+    def encode(self, message: Packet) -> bytes:
+        return encode_packet(message, self.sender_id)
+
+    def decode(self, frame: bytes) -> Packet:
+        self.check_sender(frame[4])
+        spec = PACKETS.get(frame[5])
+        if spec is not None and spec.sender is self.sender:
+            raise ProtocolError(f"{spec.name} ({spec.id}) from the wrong side")
+        return decode_packet(frame)
+
+    def check_sender(self, sender_id: int) -> None:
+        """Raise ProtocolError for an ``id`` byte the peer may not use."""
+        raise NotImplementedError
+
+    def refuse_versions(self, listed: str, now: float) -> None:
+        """Tell the peer and the operator that no version is common, and close."""
+        reason = f"no common version: the peer speaks {listed!r}, this gateway {', '.join(VERSIONS)}"
+        self.send(DebugMessage(reason))
+        self.close(reason, now)
+
+
+class HqSession(_TcpUdpSession):
+    """We play HQ towards a robot. ``force``: features and packet ids to use although it does not announce them."""
+
+    role = Role.HQ
+    sender = Sender.HQ
+
+    def __init__(self, limits: Limits, *, force: Iterable[Feature | int] = ()) -> None:
+        super().__init__(limits)
+        self.sender_id = 0
+        self.settings: ServerSettings | None = None
+        self._force = frozenset(force)
+        self._usable: frozenset[Feature | int] = self._force
+
+    def check_sender(self, sender_id: int) -> None:
+        if sender_id != SERVER_ID:
+            raise ProtocolError(f"packet with id {sender_id}, a robot's is {SERVER_ID}")
+
+    def overdue(self) -> str:
+        return (
+            f"connected, but no settings within {self.limits.handshake_s:g} s: "
+            "its one connection may be used up, restart the robot program"
+        )
+
+    def accept(self, message: Packet, now: float) -> bool:
+        if isinstance(message, ServerSettings):
+            self._take_settings(message, now)
+            return False
+        if self.version is None:
+            raise ProtocolError(f"{type(message).__name__} before serverSettings")
+        return True
+
+    def may_send(self, message: Packet) -> None:
+        """Raise Refused for a packet that this robot may not know: an unregistered id crashes it."""
+        packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
+        if packet_id in self._force:
+            return
+        if isinstance(message, OpaquePacket):
+            raise Refused(f"packet {packet_id} may crash the robot; list it in options.force if it knows it")
+        needed = message.spec.features
+        if needed and self._usable.isdisjoint(needed):
+            names = " or ".join(feature.value for feature in needed)
+            raise Refused(f"{message.spec.name}: the robot does not announce {names}")
+
+    def encode(self, message: Packet) -> bytes:
+        """Write a packet the robot can take whole; raise Refused for one it may not know."""
+        self.may_send(message)
+        if isinstance(message, DebugMessage) and not message.text:
+            raise Refused("an empty text crashes the robot")
+        frame = super().encode(message)
+        if len(frame) > MAX_WRITE:
+            raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
+        return frame
+
+    def _take_settings(self, settings: ServerSettings, now: float) -> None:
+        if self.settings is not None:
+            raise ProtocolError("serverSettings a second time")
+        self.settings, self.sender_id = settings, settings.client_id
+        version = agree(VERSIONS, parse_versions(settings.versions))
+        if version is None:
+            self.refuse_versions(settings.versions, now)
+            return
+        announced = tuple(feature for feature in Feature if getattr(settings, feature.value))
+        self._usable = self._force.union(announced)
+        self.send(ANNOUNCED)
+        self.establish(version, tuple(feature.value for feature in announced))
+
+
+class RobotSession(_TcpUdpSession):
+    """We play the robot towards an HQ. ``settings`` is what we announce, client id included."""
+
+    role = Role.ROBOT
+    sender = Sender.ROBOT
+    sender_id = SERVER_ID
+
+    def __init__(self, limits: Limits, settings: ServerSettings) -> None:
+        super().__init__(limits)
+        self.settings = settings
+        self.client: ClientSettings | None = None
+
+    def opened(self, now: float) -> None:
+        self.send(self.settings)
+
+    def check_sender(self, sender_id: int) -> None:
+        if sender_id not in (0, self.settings.client_id):
+            raise ProtocolError(f"packet with id {sender_id}, this client's is {self.settings.client_id}")
+
+    def accept(self, message: Packet, now: float) -> bool:
+        if isinstance(message, ClientSettings):
+            self._take_settings(message, now)
+            return False
+        if self.version is None:
+            raise ProtocolError(f"{type(message).__name__} before clientSettings")
+        return True
+
+    def _take_settings(self, client: ClientSettings, now: float) -> None:
+        if self.client is not None:
+            raise ProtocolError("clientSettings a second time")
+        self.client = client
+        version = agree(VERSIONS, parse_versions(client.versions))
+        if version is None:
+            self.refuse_versions(client.versions, now)
+        else:
+            features = tuple(feature.value for feature in Feature if getattr(client, feature.value))
+            self.establish(version, features)

@@ -1,0 +1,267 @@
+"""A robot of the TCP/UDP package protocol to play with: moves, sees walls, builds a map, answers every packet.
+
+It speaks version 1.3 over TCP. Deterministic with a seed: the same packets at the same times give the
+same world. Source: the packet table and "Translation" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import random
+
+import numpy as np
+
+from gateways.tcpudp.messages import (
+    ChatMessage,
+    ClientControllMode,
+    ClientGetPosition,
+    ClientGetSLAMMap,
+    ClientJoystickMove,
+    ClientJoystickRotate,
+    ClientJoystickStop,
+    ClientLidarMode,
+    ClientMoveAI,
+    ClientSimulatedLidarData,
+    DebugMessage,
+    Packet,
+    ServerCamMode,
+    ServerGetSimulatedLidarData,
+    ServerLidarStatus,
+    ServerPosition,
+    ServerSettings,
+    ServerSLAMMap,
+)
+from gateways.tcpudp.session import LISTED, RobotSession, limits
+from zbridge.conversation import Conversation
+from zbridge.errors import Refused
+from zbridge.link import Address, Link, listen
+from zbridge.protocol import Simulation
+from zbridge.session.session import State
+from zbridge.world import Body, Grid, cast
+
+log = logging.getLogger("gateways.tcpudp.simulator")
+
+STEP_S = 0.02
+SPEED_M_S = 0.5
+"""Speed over ground at packet speed 1."""
+TURN_RAD_S = 1.0
+"""Rate of turn at packet speed 1."""
+SILENCE_S = 1.0
+"""Deployed simulators stop by themselves after so long without 11, 12 or 13."""
+UNIT_M = 0.01
+CELL = 10
+"""Side of a map cell in the robot's unit."""
+SIDE = 100
+"""Cells along a side of the map."""
+LIDAR_RANGE_M = 4.0
+_DEGREES = np.radians(np.arange(360.0))
+_POSE_EVERY, _MAP_EVERY, _ASK_EVERY = 5, 50, 50
+CLIENTS = range(2, 256)
+
+
+class Vehicle:
+    """The simulated robot itself: what packets make it do, and what it sees. Knows no connection."""
+
+    def __init__(self, seed: int) -> None:
+        rng = random.Random(seed)
+        self.body = Body(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3) + math.pi / 2)
+        self.grid = Grid(SIDE, CELL * UNIT_M)
+        self.mode = 1
+        self.lidar = True
+        self._rng = rng
+        self._motion = (0.0, 0.0, 0.0)
+        self._silent_s = 0.0
+
+    def __repr__(self) -> str:
+        return f"<Vehicle {self.body} moving {self._motion}>"
+
+    @property
+    def moving(self) -> bool:
+        """Whether it has been told to move and still obeys."""
+        return any(self._motion)
+
+    def step(self, dt: float) -> None:
+        """Live for ``dt`` seconds."""
+        self._silent_s += dt
+        if self._silent_s > SILENCE_S:
+            self._motion = (0.0, 0.0, 0.0)
+        self.body.step(*self._motion, dt)
+
+    def look(self) -> None:
+        """Enter one sweep of its own lidar into the map."""
+        angles = self.body.heading + _DEGREES
+        ranges = cast(self.body.x, self.body.y, angles, LIDAR_RANGE_M)
+        noise = np.array([self._rng.gauss(0.0, 0.005) for _ in range(len(ranges))])
+        self.grid.see(self.body.x, self.body.y, angles, ranges + noise * (ranges < LIDAR_RANGE_M), LIDAR_RANGE_M)
+
+    def position(self) -> ServerPosition:
+        """Say where it is: x, y in its unit, heading in degrees with 0 along y."""
+        heading_deg = math.degrees(self.body.heading - math.pi / 2)
+        return ServerPosition(self.body.x / UNIT_M, self.body.y / UNIT_M, heading_deg)
+
+    def map(self) -> ServerSLAMMap:
+        """Show the map, x-major."""
+        return ServerSLAMMap(self.grid.cells.tobytes())
+
+    def take(self, message: Packet) -> tuple[Packet, ...]:
+        """Obey or answer one packet of an HQ."""
+        match message:
+            case ClientJoystickMove():
+                scale = message.speed * SPEED_M_S
+                self._move(message.y * scale, -message.x * scale, 0.0)
+            case ClientJoystickRotate():
+                self._move(0.0, 0.0, -message.speed * TURN_RAD_S)
+            case ClientJoystickStop():
+                self._move(0.0, 0.0, 0.0)
+            case ClientControllMode():
+                self.mode = message.mode
+            case ClientLidarMode():
+                self.lidar = message.mode == 1
+                return (ServerLidarStatus(1 if self.lidar else 2),)
+            case ClientGetPosition():
+                return (self.position(),)
+            case ClientGetSLAMMap():
+                return (self.map(),)
+            case DebugMessage():
+                return (DebugMessage(f"echo: {message.text}"),)
+            case ChatMessage():
+                return (message,)
+            case ClientMoveAI():
+                return (DebugMessage("clientMoveAI taken"),)
+            case ClientSimulatedLidarData():
+                self._see(message)
+        return ()
+
+    def _move(self, forward: float, left: float, turn: float) -> None:
+        finite = all(math.isfinite(value) for value in (forward, left, turn))
+        self._motion = (forward, left, turn) if finite else (0.0, 0.0, 0.0)
+        self._silent_s = 0.0
+
+    def _see(self, message: ClientSimulatedLidarData) -> None:
+        ranges = message.ranges.astype(np.float64) * UNIT_M
+        if len(ranges) == len(_DEGREES):
+            known = np.isfinite(ranges) & (ranges > 0)
+            angles = (self.body.heading + _DEGREES)[known]
+            self.grid.see(self.body.x, self.body.y, angles, ranges[known], LIDAR_RANGE_M)
+
+
+class Simulator:
+    """Serves one vehicle to the HQ programs that connect."""
+
+    def __init__(self, seed: int) -> None:
+        self.vehicle = Vehicle(seed)
+        self._peers: dict[int, Conversation] = {}
+        self._loop = asyncio.get_running_loop()
+
+    def __repr__(self) -> str:
+        return f"<Simulator {self.vehicle} {len(self._peers)} HQ>"
+
+    async def run(self, simulation: Simulation) -> None:
+        """Listen and live until cancelled."""
+        server = await listen(simulation.address, lambda: _Peer(self))
+        async with server:
+            host, port = server.sockets[0].getsockname()[:2]
+            simulation.ready(Address(host, port))
+            await self._live()
+
+    def admit(self, link: Link) -> Conversation | None:
+        """Begin a conversation with a new HQ; None when all client ids are taken."""
+        client_id = next((free for free in CLIENTS if free not in self._peers), None)
+        if client_id is None:
+            return None
+        session = RobotSession(limits(0.0), _settings(client_id))
+        session.name = f"hq {client_id}"
+        conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
+        conversation.ended.add_done_callback(lambda _: self._peers.pop(client_id, None))
+        self._peers[client_id] = conversation
+        log.info("%s: connected as client %d", link.peer, client_id)
+        return conversation
+
+    def _deliver(self, conversation: Conversation, messages: list[Packet]) -> None:
+        for message in messages:
+            for answer in self.vehicle.take(message):
+                _send(conversation, answer)
+
+    def _tell_all(self, message: Packet) -> None:
+        for conversation in tuple(self._peers.values()):
+            if conversation.session.state is State.ESTABLISHED:
+                _send(conversation, message)
+                conversation.pump()
+
+    async def _live(self) -> None:
+        self.vehicle.look()
+        due, steps = self._loop.time(), 0
+        while True:
+            due = max(due + STEP_S, self._loop.time() - 1.0)
+            await asyncio.sleep(due - self._loop.time())
+            steps += 1
+            self.vehicle.step(STEP_S)
+            if steps % _POSE_EVERY == 0:
+                self._tell_all(self.vehicle.position())
+            if steps % _MAP_EVERY == 0:
+                if self.vehicle.lidar:
+                    self.vehicle.look()
+                self._tell_all(self.vehicle.map())
+            if steps % _ASK_EVERY == _ASK_EVERY // 2:
+                self._tell_all(ServerGetSimulatedLidarData())
+            if steps == _ASK_EVERY:
+                self._tell_all(ServerCamMode(2))
+                self._tell_all(ServerLidarStatus(1))
+
+
+class _Peer:
+    """The receiver of an accepted link, which finds its conversation when it is attached."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._conversation: Conversation | None = None
+
+    def attached(self, link: Link) -> None:
+        self._conversation = self._simulator.admit(link)
+        if self._conversation is None:
+            link.close()
+        else:
+            self._conversation.attached(link)
+
+    def received(self, data: bytes) -> None:
+        if self._conversation is not None:
+            self._conversation.received(data)
+
+    def lost(self, reason: str) -> None:
+        if self._conversation is not None:
+            log.info("%s: %s", self._conversation.session.peer, reason)
+            self._conversation.lost(reason)
+
+    def writable(self) -> None:
+        if self._conversation is not None:
+            self._conversation.writable()
+
+
+def _settings(client_id: int) -> ServerSettings:
+    return ServerSettings(
+        client_id=client_id,
+        versions=LISTED,
+        udp=False,
+        cam=True,
+        joystick=True,
+        chat=True,
+        lidar=True,
+        lidar_sim=True,
+        slam_map=True,
+        slam_map_size=SIDE * CELL,
+        slam_map_interval=CELL,
+    )
+
+
+def _send(conversation: Conversation, message: Packet) -> None:
+    try:
+        conversation.session.send(message)
+    except Refused as refusal:
+        log.debug("%s: not sent, %s", conversation.session.name, refusal)
+
+
+async def simulate(simulation: Simulation) -> None:
+    """Be a simulated robot until cancelled."""
+    await Simulator(simulation.seed).run(simulation)

@@ -1,0 +1,290 @@
+"""Packets to fleet messages and commands to packets, with all units and axes. Sans-IO.
+
+Source: "Translation" and "The gateway as HQ" of the protocol page. The robot's axes are x right and y
+forward, lengths in its own unit (centimetres), headings in degrees; the fleet's are those of REP 103.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from gateways.tcpudp.messages import (
+    PACKETS,
+    ChatMessage,
+    ClientControllMode,
+    ClientGetPosition,
+    ClientGetSLAMMap,
+    ClientJoystickMove,
+    ClientJoystickRotate,
+    ClientJoystickStop,
+    ClientLidarMode,
+    ClientMoveAI,
+    ClientSimulatedLidarData,
+    DebugMessage,
+    Feature,
+    OpaquePacket,
+    Packet,
+    ServerCamMode,
+    ServerGetSimulatedLidarData,
+    ServerLidarStatus,
+    ServerPosition,
+    ServerSettings,
+    ServerSLAMMap,
+)
+from gateways.tcpudp.session import HqSession, limits
+from zbridge.errors import ProtocolError, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
+from zbridge.fleet.topics import Topic
+from zbridge.protocol import Outcome, Robot, Telemetry
+
+NAME = "tcpudp"
+ON, OFF = 1, 2
+REPEAT_S = 0.25
+"""Seconds after which a drive command is repeated while the robot moves."""
+STOP_REPEAT_S = 0.1
+"""Seconds between the repetitions of a stop: a late datagram can restart motion."""
+SCAN_POINTS = 360
+"""Points deployed robots take in simulated lidar data, one a degree."""
+_MOTION = "motion"
+_CELLS = bytes(value if value <= 2 else 0 for value in range(256))
+
+ForcedFeature = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
+PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
+    force: tuple[ForcedFeature | PacketId, ...] = ()
+    combine: Literal["exclusive", "both"] = "exclusive"
+    speed_full: Positive = 1.0
+    turn_full: Positive = 1.0
+    length_unit_m: Positive = 0.01
+    heading_offset: float = math.pi / 2
+    map_cell_m: Positive = 0.01
+    map_origin: tuple[float, float] | None = None
+
+
+class TcpUdpRobot(Robot):
+    """One robot of the TCP/UDP package protocol, seen from its HQ."""
+
+    def __init__(self, options: Options, links: int = 1) -> None:
+        self.options = options
+        self.link_names = ("robot",)
+        self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
+        self._session: HqSession | None = None
+        self._unit_m = options.length_unit_m
+        self._heading_offset = options.heading_offset
+
+    @property
+    def driving(self) -> HqSession | None:
+        return self._session
+
+    def session(self, link: int, peer: str) -> HqSession:
+        self._session = HqSession(limits(self.options.gap_s), force=self._force)
+        return self._session
+
+    # Packets to telemetry
+
+    def telemetry(self, message: Packet, stamp_ns: int) -> Iterable[Telemetry]:
+        translate = _TELEMETRY.get(type(message), TcpUdpRobot._raw)
+        return translate(self, message, stamp_ns)
+
+    def _pose(self, message: ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
+        unit_m = self._unit_m
+        return (
+            (
+                topics.POSE,
+                Pose(
+                    message.x * unit_m,
+                    message.y * unit_m,
+                    math.radians(message.heading_deg) + self._heading_offset,
+                    stamp_ns=stamp_ns,
+                ),
+            ),
+        )
+
+    def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
+        """Turn the x-major cells (index = x * side + y) into rows of y, cells that are not 0, 1, 2 into unknown."""
+        settings = self._session.settings if self._session is not None else None
+        side = _side(len(message.cells), settings)
+        cell = self._cell_m(settings)
+        cells = np.frombuffer(message.cells.translate(_CELLS), np.uint8).reshape(side, side).T
+        half = -side * cell / 2
+        origin = self.options.map_origin or (half, half)
+        return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
+
+    def _cell_m(self, settings: ServerSettings | None) -> float:
+        interval = settings.slam_map_interval if settings is not None else None
+        return interval * self._unit_m if interval is not None and interval > 0 else self.options.map_cell_m
+
+    def _text(self, message: DebugMessage, stamp_ns: int) -> tuple[Telemetry, ...]:
+        return ((topics.TEXT, Text(message.text, "debug", stamp_ns=stamp_ns)),)
+
+    def _request(self, message: ServerGetSimulatedLidarData, stamp_ns: int) -> tuple[Telemetry, ...]:
+        return ((topics.TEXT, Text("simulated lidar data", "request", stamp_ns=stamp_ns)),)
+
+    def _lidar(self, message: ServerLidarStatus, stamp_ns: int) -> tuple[Telemetry, ...]:
+        return ((topics.LIDAR, _switch(message.mode, stamp_ns)),)
+
+    def _camera(self, message: ServerCamMode, stamp_ns: int) -> tuple[Telemetry, ...]:
+        return ((topics.CAMERA, _switch(message.mode, stamp_ns)),)
+
+    def _raw(self, message: Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
+        if isinstance(message, OpaquePacket):
+            raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
+        elif isinstance(message, ChatMessage):
+            raw = Raw(message.spec.id, message.body, stamp_ns=stamp_ns)
+        else:
+            return ()
+        return ((topics.RAW(NAME), raw),)
+
+    # Commands to packets
+
+    def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
+        carry_out = _COMMANDS.get(topic.path)
+        if carry_out is None:
+            raise Refused("a TCP/UDP robot has no such command")
+        return carry_out(self, command, now) or Outcome()
+
+    def stop(self, now: float, until: float) -> None:
+        self._stand((ClientJoystickStop(),), now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+
+    def ask(self, topic: Topic) -> None:
+        self._send(ClientGetSLAMMap() if topic is topics.MAP else ClientGetPosition())
+
+    def _drive(self, command: Drive, now: float) -> Outcome:
+        left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
+        if not command.moving:
+            self._stand((ClientJoystickStop(),), now, period_s=REPEAT_S, until=now + 1.0, urgent=False)
+            return Outcome(left_out=left_out)
+        translation = math.hypot(command.forward, command.left)
+        packets: list[Packet] = []
+        if translation:
+            speed = min(1.0, translation) * self.options.speed_full
+            packets.append(ClientJoystickMove(-command.left / translation, command.forward / translation, speed))
+        if command.turn:
+            packets.append(ClientJoystickRotate(-command.turn * self.options.turn_full))
+        if len(packets) == 2 and self.options.combine == "exclusive":
+            rotates = abs(command.turn) > translation
+            packets = packets[1:] if rotates else packets[:1]
+            left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
+        self._stand(tuple(packets), now, period_s=REPEAT_S, until=math.inf, urgent=False)
+        return Outcome(left_out=left_out)
+
+    def _mode(self, command: Mode, now: float) -> None:
+        self._send(ClientControllMode({"none": 1, "manual": 2, "autonomous": 3}[command.mode]))
+
+    def _switch_lidar(self, command: Switch, now: float) -> None:
+        self._send(ClientLidarMode(ON if command.on else OFF))
+
+    def _switch_camera(self, command: Switch, now: float) -> None:
+        raise Refused("no packet turns a camera on or off")
+
+    def _say(self, command: Text, now: float) -> None:
+        if command.kind != "debug":
+            raise Refused(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
+        self._send(DebugMessage(command.text))
+
+    def _feed_scan(self, command: Scan, now: float) -> Outcome:
+        self._send(ClientSimulatedLidarData(polar_ranges(command, self._unit_m)))
+        return Outcome(telemetry=((topics.SCAN, command),))
+
+    def _send_raw(self, command: Raw, now: float) -> None:
+        self._send(_raw_packet(command))
+
+    def _send(self, message: Packet) -> None:
+        self._connected().send(message)
+
+    def _stand(self, packets: tuple[Packet, ...], now: float, *, period_s: float, until: float, urgent: bool) -> None:
+        session = self._connected()
+        frames = tuple(session.encode(packet) for packet in packets)
+        session.outbox.stand(_MOTION, frames, now, period_s=period_s, until=until, urgent=urgent)
+
+    def _connected(self) -> HqSession:
+        if self._session is None:
+            raise Refused("offline")
+        return self._session
+
+
+def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Resample a scan to float32[360] in the robot's unit, index = degree counter-clockwise from straight ahead.
+
+    Each degree takes the nearest point of the scan, 0 where the scan has none or it is invalid or out of range.
+    """
+    count = len(scan.ranges)
+    polar = np.zeros(SCAN_POINTS, np.float32)
+    if count == 0 or not scan.angle_increment or not math.isfinite(scan.angle_increment + scan.angle_min):
+        return polar
+    turn = 2 * math.pi
+    offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
+    if scan.angle_increment > 0:
+        indices = np.rint(np.mod(offsets, turn) / scan.angle_increment).astype(np.int64)
+        indices[np.isclose(np.mod(offsets, turn), turn)] = 0
+    else:
+        indices = np.rint(np.mod(-offsets, turn) / -scan.angle_increment).astype(np.int64)
+    covered = indices < count
+    ranges = np.asarray(scan.ranges, np.float32)
+    values = ranges[indices[covered]]
+    usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
+    polar[covered] = np.where(usable, values / unit_m, 0)
+    return polar
+
+
+def _side(cells: int, settings: ServerSettings | None) -> int:
+    """Find the side of a square map: size / interval where that fits the body, else the root of its length."""
+    if settings is not None and settings.slam_map_size and settings.slam_map_interval:
+        announced = settings.slam_map_size // settings.slam_map_interval
+        if announced > 0 and announced * announced == cells:
+            return announced
+    side = math.isqrt(cells)
+    if side * side != cells:
+        raise ProtocolError(f"map of {cells} cells is not square")
+    return side
+
+
+def _switch(mode: int, stamp_ns: int) -> Switch:
+    if mode not in (ON, OFF):
+        raise ProtocolError(f"mode {mode}, expected {ON} (on) or {OFF} (off)")
+    return Switch(mode == ON, stamp_ns=stamp_ns)
+
+
+def _raw_packet(command: Raw) -> Packet:
+    """Make the packet of a raw command; raise Refused where a fleet message holds it."""
+    spec = PACKETS.get(command.id)
+    if spec is None:
+        if not 0 <= command.id <= 255:
+            raise Refused(f"packet id {command.id}, expected 0 to 255")
+        return OpaquePacket(command.id, command.body)
+    if spec.packet is ClientMoveAI:
+        return ClientMoveAI(command.body)
+    if spec.packet is ChatMessage:
+        return ChatMessage(command.body)
+    raise Refused(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
+
+
+_TELEMETRY: dict[type[Packet], Callable[[TcpUdpRobot, Any, int], tuple[Telemetry, ...]]] = {
+    ServerPosition: TcpUdpRobot._pose,
+    ServerSLAMMap: TcpUdpRobot._map,
+    DebugMessage: TcpUdpRobot._text,
+    ServerGetSimulatedLidarData: TcpUdpRobot._request,
+    ServerLidarStatus: TcpUdpRobot._lidar,
+    ServerCamMode: TcpUdpRobot._camera,
+}
+_COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
+    topics.CMD_DRIVE.path: TcpUdpRobot._drive,
+    topics.CMD_MODE.path: TcpUdpRobot._mode,
+    topics.CMD_LIDAR.path: TcpUdpRobot._switch_lidar,
+    topics.CMD_CAMERA.path: TcpUdpRobot._switch_camera,
+    topics.CMD_TEXT.path: TcpUdpRobot._say,
+    topics.CMD_SCAN.path: TcpUdpRobot._feed_scan,
+    topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
+}

@@ -1,0 +1,5 @@
+"""``python -m zbridge``: the command line."""
+
+from zbridge.cli import main
+
+main()

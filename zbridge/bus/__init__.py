@@ -1,0 +1,33 @@
+"""The bus: what gateways and commands use of Zenoh, its implementation, and a fake for tests.
+
+Nothing here knows a robot. Only :mod:`zbridge.bus.zenohbus` imports zenoh; it is imported where a bus is
+opened, so that whatever needs no bus starts without it.
+"""
+
+from __future__ import annotations
+
+from zbridge.bus.interface import Answer, Bus, BusSettings, Entry, Handle, Publisher, Question, Sample, Tls
+from zbridge.metrics import Metrics
+
+__all__ = [
+    "Answer",
+    "Bus",
+    "BusSettings",
+    "Entry",
+    "Handle",
+    "Publisher",
+    "Question",
+    "Sample",
+    "Tls",
+    "open_bus",
+]
+
+
+async def open_bus(settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False) -> Bus:
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
+
+    ``wait_for_peers`` returns only when the peers that scouting finds at once are connected.
+    """
+    from zbridge.bus.zenohbus import open_zenoh
+
+    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers)

@@ -1,0 +1,129 @@
+"""What gateways and commands use of the bus: keys, payloads and delivery. Knows neither zenoh nor robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol
+
+import msgspec
+
+from zbridge.fleet.topics import Topic
+
+
+class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Files for mutual TLS."""
+
+    ca: str
+    certificate: str | None = None
+    key: str | None = None
+
+
+class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The ``[bus]`` table of a configuration."""
+
+    mode: Literal["peer", "client", "router"] | None = None
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ()
+    multicast: bool = True
+    stream: Literal["drop", "block"] = "drop"
+    tls: Tls | None = None
+
+    @property
+    def effective_mode(self) -> str:
+        """The mode that is used: client when only ``connect`` is given, else peer."""
+        return self.mode or ("client" if self.connect and not self.listen else "peer")
+
+
+class Sample(msgspec.Struct, frozen=True):
+    """What came in on a key."""
+
+    key: str
+    payload: bytes
+    attachment: bytes | None = None
+
+
+class Question(Protocol):
+    """A query that waits for its answer; answer or refuse it once."""
+
+    key: str
+    payload: bytes
+    attachment: bytes | None
+
+    def answer(self, payload: bytes) -> None:
+        """Reply with a payload on the asked key."""
+
+    def refuse(self, reason: str) -> None:
+        """Reply with an error text."""
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """One reply to a query; ``error`` instead of a payload where it was refused."""
+
+    key: str
+    payload: bytes
+    error: str | None = None
+
+
+class Publisher(Protocol):
+    """Writes one key."""
+
+    key: str
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        """Publish now, as the key's class of delivery says; never blocks the event loop."""
+
+    def close(self) -> None:
+        """Give the key up; idempotent."""
+
+
+class Handle(Protocol):
+    """Something declared on the bus."""
+
+    def close(self) -> None:
+        """Take it back; idempotent."""
+
+
+Entry = tuple[Publisher, bytes]
+
+
+class Bus(Protocol):
+    """What gateways and commands use of Zenoh. Handlers are called on the event loop's thread."""
+
+    @property
+    def zid(self) -> str:
+        """The id of this session on the bus."""
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        """Declare that ``key`` will be written."""
+
+    def put_all(self, batch: Sequence[Entry]) -> bool:
+        """Publish stream messages in order; False asks to pause the source until the relief handler is called."""
+
+    def on_relief(self, handler: Callable[[], None]) -> None:
+        """Call ``handler`` when a source that was asked to pause may go on."""
+
+    def subscribe(
+        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+    ) -> Handle:
+        """Take samples; ``first`` ones are handled before all others, ``history`` asks for last values too."""
+
+    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards."""
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
+
+    def announce(self, key: str) -> Handle:
+        """Declare a liveliness token."""
+
+    async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
+        """List the liveliness tokens that exist."""
+
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
+        """Declare a stream key and be told whether anybody listens to it."""
+
+    def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
+        """Be told when the first connection to the bus is made and when the last one is gone."""
+
+    async def close(self) -> None:
+        """Leave the bus; idempotent."""

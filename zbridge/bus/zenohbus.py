@@ -1,0 +1,387 @@
+"""The bus over Zenoh: the only module that imports it.
+
+Zenoh calls back on threads of its own, and a slow callback stalls the whole session: callbacks here only
+put what came where the event loop finds it. Whatever may block (states, answers, streams in ``block``
+mode) is written by a thread of ours, never by the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import zenoh
+import zenoh.ext
+
+from zbridge.bus.inbox import Inbox
+from zbridge.bus.interface import Answer, BusSettings, Entry, Handle, Publisher, Question, Sample
+from zbridge.bus.writer import Writer
+from zbridge.errors import BusError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
+from zbridge.metrics import Metrics
+
+H = TypeVar("H", bound=Handle)
+
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+
+_PRIORITIES = {
+    Priority.DATA: zenoh.Priority.DATA,
+    Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
+    Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
+}
+_CONGESTIONS = {
+    Congestion.DROP: zenoh.CongestionControl.DROP,
+    Congestion.BLOCK: zenoh.CongestionControl.BLOCK,
+}
+
+
+def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming what Zenoh does not take."""
+    values: dict[str, Any] = {
+        "mode": settings.effective_mode,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast,
+        "open/return_conditions/connect_scouted": wait_for_peers,
+    }
+    if settings.listen:
+        values["listen/endpoints"] = settings.listen
+    if settings.effective_mode == "client":
+        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+    if settings.tls is not None:
+        values["transport/link/tls/root_ca_certificate"] = settings.tls.ca
+        if settings.tls.certificate and settings.tls.key:
+            values["transport/link/tls/enable_mtls"] = True
+            for side in ("listen", "connect"):
+                values[f"transport/link/tls/{side}_certificate"] = settings.tls.certificate
+                values[f"transport/link/tls/{side}_private_key"] = settings.tls.key
+    config = zenoh.Config()
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key} = {value!r}: {error}") from error
+    return config
+
+
+async def open_zenoh(settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False) -> ZenohBus:
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers)
+    try:
+        session = await asyncio.to_thread(zenoh.open, config)
+    except zenoh.ZError as error:
+        raise BusError(str(error).split("  at ")[0]) from error
+    return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
+
+
+class ZenohBus:
+    """The bus over one Zenoh session."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        loop: asyncio.AbstractEventLoop,
+        metrics: Metrics,
+        *,
+        stream: str = "drop",
+    ) -> None:
+        self._session = session
+        self._loop = loop
+        self._inbox = Inbox(loop, metrics)
+        self._relief: list[Callable[[], None]] = []
+        self._writer = Writer("bus-writer", metrics, self._relieve)
+        self._streams = Writer("stream-writer", metrics, self._relieve) if stream == "block" else None
+        self._handles: list[Handle] = []
+
+    def __repr__(self) -> str:
+        return f"<ZenohBus {self._session.zid()}>"
+
+    @property
+    def zid(self) -> str:
+        """The id of the Zenoh session."""
+        return str(self._session.zid())
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        """Declare that ``key`` will be written."""
+        qos = topic.qos
+        options = _options(topic)
+        if qos.keeps_last:
+            return self._keep(_StatePublisher(self._session, key, options, self._writer))
+        if topic.delivery is Delivery.STREAM:
+            return self._keep(_StreamPublisher(self._session, key, options, blocks=self._streams is not None))
+        plain = self._session.declare_publisher(key, express=qos.express, **options)
+        blocks = qos.congestion is Congestion.BLOCK
+        return self._keep(_PlainPublisher(key, plain, self._writer if blocks else None))
+
+    def put_all(self, batch: Sequence[Entry]) -> bool:
+        """Publish stream messages in order: the last one express, which takes the others with it."""
+        if self._streams is None:
+            _put_batch(batch)
+            return True
+        return self._streams.batch(lambda: _put_batch(batch), len(batch))
+
+    def on_relief(self, handler: Callable[[], None]) -> None:
+        """Call ``handler`` when a source that was asked to pause may go on."""
+        self._relief.append(handler)
+
+    def subscribe(
+        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+    ) -> Handle:
+        """Take samples; ``first`` ones are handled before all others, ``history`` asks for last values too."""
+        inbox = self._inbox
+
+        def store(sample: zenoh.Sample) -> None:
+            inbox.put(handler, sample, _read_sample, first=first)
+
+        if not history:
+            return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
+        config = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        return self._keep(
+            _Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
+        )
+
+    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards."""
+        inbox, writer = self._inbox, self._writer
+
+        def store(query: zenoh.Query) -> None:
+            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), first=True)
+
+        return self._keep(_Declared(self._session.declare_queryable(key, store)))
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
+        replies = await self._collect(
+            lambda handler: self._session.get(
+                key_expr,
+                handler,
+                payload=payload,
+                timeout=timeout_s,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            ),
+            timeout_s,
+        )
+        return [_read_reply(reply) for reply in replies]
+
+    def announce(self, key: str) -> Handle:
+        """Declare a liveliness token."""
+        return self._keep(_Declared(self._session.liveliness().declare_token(key)))
+
+    async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
+        """List the liveliness tokens that exist."""
+        replies = await self._collect(
+            lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
+        )
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
+        """Declare a stream key and be told whether anybody listens to it."""
+        loop = self._loop
+        plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+        listener = plain.declare_matching_listener(lambda status: loop.call_soon_threadsafe(handler, status.matching))
+        publisher = self._keep(_PlainPublisher(key, plain, None))
+        return publisher, self._keep(_Declared(listener))
+
+    def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
+        """Be told when the first connection to the bus is made and when the last one is gone."""
+        loop, info = self._loop, self._session.info
+
+        def changed(_: zenoh.TransportEvent) -> None:
+            loop.call_soon_threadsafe(lambda: handler(bool(info.transports())))
+
+        return self._keep(_Declared(info.declare_transport_events_listener(changed, history=True)))
+
+    async def close(self) -> None:
+        """Leave the bus; idempotent."""
+        handles, self._handles = self._handles, []
+        await asyncio.to_thread(self._leave, handles)
+
+    def _leave(self, handles: list[Handle]) -> None:
+        for writer in (self._streams, self._writer):
+            if writer is not None:
+                writer.stop()
+        with contextlib.suppress(zenoh.ZError):
+            for handle in reversed(handles):
+                handle.close()
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _relieve(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            for handler in self._relief:
+                self._loop.call_soon_threadsafe(handler)
+
+    def _keep(self, handle: H) -> H:
+        self._handles.append(handle)
+        return handle
+
+    async def _collect(self, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
+        """Run a get whose replies are stored as they come; the last one's handler being dropped ends it."""
+        loop, replies = self._loop, list[Any]()
+        done = loop.create_future()
+
+        def finish() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        handler = zenoh.handlers.Callback(replies.append, lambda: loop.call_soon_threadsafe(finish))
+        try:
+            await asyncio.to_thread(start, handler)
+        except zenoh.ZError as error:
+            raise BusError(str(error)) from error
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(done, timeout_s + 0.5)
+        return list(replies)
+
+
+def _options(topic: Topic) -> dict[str, Any]:
+    qos: QoS = topic.qos
+    encoding = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(topic.message))
+    return {
+        "encoding": encoding,
+        "priority": _PRIORITIES[qos.priority],
+        "congestion_control": _CONGESTIONS[qos.congestion],
+    }
+
+
+def _read_sample(raw: zenoh.Sample) -> Sample:
+    attachment = raw.attachment
+    return Sample(str(raw.key_expr), raw.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None)
+
+
+def _read_reply(reply: zenoh.Reply) -> Answer:
+    if reply.ok is not None:
+        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+    error = reply.err
+    return Answer("", b"", error.payload.to_bytes().decode("utf-8", "replace") if error else "no answer")
+
+
+class _Declared:
+    """Anything of Zenoh's that is undeclared to end it."""
+
+    def __init__(self, entity: Any) -> None:
+        self._entity = entity
+
+    def close(self) -> None:
+        entity, self._entity = self._entity, None
+        if entity is not None:
+            entity.undeclare()
+
+
+class _PlainPublisher(_Declared):
+    """Writes a key directly, or by way of the writing thread where a full queue blocks."""
+
+    def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None) -> None:
+        super().__init__(publisher)
+        self.key = key
+        self._put = publisher.put
+        self._writer = writer
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        if self._writer is None:
+            self._put(payload, attachment=attachment)
+        else:
+            self._writer.call(lambda: self._put(payload, attachment=attachment))
+
+
+class _StreamPublisher:
+    """Writes a stream key, plain or express: express is what makes a batch leave at once."""
+
+    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], *, blocks: bool) -> None:
+        self.key = key
+        if blocks:
+            options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
+        self._publishers = (
+            session.declare_publisher(key, **options),
+            session.declare_publisher(key, express=True, **options),
+        )
+        self.put_plain = self._publishers[0].put
+        self.put_express = self._publishers[1].put
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        self.put_express(payload, attachment=attachment)
+
+    def close(self) -> None:
+        publishers, self._publishers = self._publishers, ()  # type: ignore[assignment]
+        for publisher in publishers:
+            publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
+class _StatePublisher:
+    """Writes a state key: cached for late joiners, and answered to a plain get."""
+
+    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
+        self.key = key
+        self._writer = writer
+        self._last: bytes | None = None
+        self._encoding = options["encoding"]
+        self._publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            key,
+            cache=zenoh.ext.CacheConfig(1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            publisher_detection=True,
+            **options,
+        )
+        self._queryable = session.declare_queryable(key, self._reply)
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        self._last = payload
+        self._writer.state(self.key, lambda: self._publisher.put(payload, attachment=attachment))
+
+    def close(self) -> None:
+        self._queryable.undeclare()  # type: ignore[no-untyped-call]
+        self._publisher.undeclare()  # type: ignore[no-untyped-call]
+
+    def _reply(self, query: zenoh.Query) -> None:
+        last = self._last
+        if last is None:
+            query.drop()  # type: ignore[no-untyped-call]
+        else:
+            self._writer.call(lambda: _reply_and_drop(query, self.key, last, self._encoding))
+
+
+def _reply_and_drop(query: zenoh.Query, key: str, payload: bytes, encoding: zenoh.Encoding | None) -> None:
+    try:
+        query.reply(key, payload, encoding=encoding, express=True)
+    finally:
+        query.drop()  # type: ignore[no-untyped-call]
+
+
+class _Question:
+    """A Zenoh query, answered by the writing thread."""
+
+    def __init__(self, query: zenoh.Query, key: str, writer: Writer) -> None:
+        self.key = key
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
+        self._query = query
+        self._writer = writer
+
+    def answer(self, payload: bytes) -> None:
+        self._writer.call(lambda: _reply_and_drop(self._query, self.key, payload, None))
+
+    def refuse(self, reason: str) -> None:
+        self._writer.call(lambda: self._refuse(reason))
+
+    def _refuse(self, reason: str) -> None:
+        try:
+            self._query.reply_err(reason.encode())
+        finally:
+            self._query.drop()  # type: ignore[no-untyped-call]
+
+
+def _put_batch(batch: Sequence[tuple[Any, bytes]]) -> None:
+    last = len(batch) - 1
+    for index, (publisher, payload) in enumerate(batch):
+        if index < last:
+            publisher.put_plain(payload)
+        else:
+            publisher.put_express(payload)

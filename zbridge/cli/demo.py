@@ -1,0 +1,178 @@
+"""The demo: simulated robots, a gateway process each, an embedded router, and a live table. Loopback only."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import os
+import socket
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import IO
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.cli import LOCAL_ROUTER
+from zbridge.errors import BusError, PayloadError, ZbridgeError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, Pose, Status
+from zbridge.fleet.topics import KeySpace, split_key
+from zbridge.gateway import until_signal
+from zbridge.metrics import Metrics
+from zbridge.protocol import protocol_names
+
+REFRESH_S = 0.5
+START_S = 20.0
+"""Longest time a simulator may take to start."""
+_RATES = ("pose", "map", "text")
+
+
+class Row(msgspec.Struct):
+    """What the table shows of one robot."""
+
+    status: Status | None = None
+    pose: Pose | None = None
+    counts: Counter[str] = msgspec.field(default_factory=Counter)
+
+
+class Watch:
+    """Collects what the robots publish, for the table."""
+
+    def __init__(self, robots: list[str]) -> None:
+        self.rows = {robot: Row() for robot in robots}
+
+    def take(self, sample: Sample) -> None:
+        """Take one sample from the bus."""
+        split = split_key(sample.key)
+        row = self.rows.get(split[1]) if split else None
+        if split is None or row is None:
+            return
+        row.counts[split[2]] += 1
+        with contextlib.suppress(PayloadError):
+            if split[2] == topics.STATUS.path:
+                row.status = payloads.decode(Status, sample.payload)
+            elif split[2] == topics.POSE.path:
+                row.pose = payloads.decode(Pose, sample.payload)
+
+    def table(self, seconds: float) -> Table:
+        """Draw the table; the counts since the last drawing become rates."""
+        table = Table(title="zbridge demo", expand=False, padding=(0, 0))
+        for title in ("robot", "state", "version", *(f"{name}/s" for name in _RATES), "x m", "y m", "turn"):
+            table.add_column(title, justify="left" if title in ("robot", "state") else "right", no_wrap=True)
+        for robot, row in self.rows.items():
+            state = row.status.state if row.status else "no gateway yet"
+            version = (row.status.version or "") if row.status else ""
+            rates = [f"{row.counts[name] / seconds:.1f}" for name in _RATES]
+            pose = row.pose
+            where = [f"{pose.x:.2f}", f"{pose.y:.2f}", f"{math.degrees(pose.heading):.0f}°"] if pose else ["", "", ""]
+            table.add_row(robot, state, version, *rates, *where)
+            row.counts.clear()
+        return table
+
+
+async def run_demo(seconds: float) -> None:
+    """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError when no robot ever got ready."""
+    robots = {f"{protocol}1": protocol for protocol in protocol_names()}
+    watch = Watch(list(robots))
+    async with contextlib.AsyncExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
+        log = stack.enter_context((folder / "log").open("w+b"))
+        bus, endpoint = await _router()
+        stack.push_async_callback(bus.close)
+        for robot, protocol in robots.items():
+            await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint))
+        bus.subscribe("fleet/*/*", watch.take)
+        print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --connect {endpoint}")  # noqa: T201
+        await until_signal(_show(bus, watch, seconds))
+        silent = [robot for robot, row in watch.rows.items() if row.pose is None]
+        if seconds and silent:
+            last = (folder / "log").read_text(errors="replace")[-2000:]
+            raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words:\n{last}")
+
+
+async def _router() -> tuple[Bus, str]:
+    """Open the embedded router, at Zenoh's usual port where that is free."""
+    for endpoint in (LOCAL_ROUTER, f"tcp/127.0.0.1:{_free_port()}"):
+        try:
+            settings = BusSettings(mode="router", listen=(endpoint,), multicast=False)
+            return await open_bus(settings, Metrics()), endpoint
+        except BusError:
+            continue
+    raise BusError("no port for the embedded router")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextlib.asynccontextmanager
+async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str) -> AsyncIterator[None]:
+    """Run a simulator and its gateway, each a process of its own."""
+    async with _process(log, "simulate", protocol, "--listen", "tcp://127.0.0.1:0", read=True) as simulator:
+        assert simulator.stdout is not None
+        async with asyncio.timeout(START_S):
+            line = (await simulator.stdout.readline()).decode()
+        if "tcp://" not in line:
+            raise ZbridgeError(f"the {protocol} simulator did not start")
+        file = folder / f"{robot}.toml"
+        file.write_text(
+            f'[robot]\nname = "{robot}"\n'
+            f'[device]\nprotocol = "{protocol}"\nconnect = ["{line.split()[-1]}"]\n'
+            f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
+        )
+        async with _process(log, "run", str(file)):
+            yield
+
+
+@contextlib.asynccontextmanager
+async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> AsyncIterator[asyncio.subprocess.Process]:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *("-m", "zbridge", *arguments),
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE if read else asyncio.subprocess.DEVNULL,
+        stderr=log,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.terminate()
+        try:
+            async with asyncio.timeout(3.0):
+                await process.wait()
+        except TimeoutError:
+            process.kill()
+            await process.wait()
+
+
+async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
+    """Drive the robots in circles and draw the table."""
+    drives = [
+        bus.publisher(KeySpace("fleet", robot).key(topics.CMD_DRIVE.path), topics.CMD_DRIVE) for robot in watch.rows
+    ]
+    loop = asyncio.get_running_loop()
+    started = loop.time()
+    with Live(console=Console(), auto_refresh=False) as live:
+        while not seconds or loop.time() - started < seconds:
+            await asyncio.sleep(REFRESH_S)
+            elapsed = loop.time() - started
+            forward = 0.6 if int(elapsed) % 4 < 2 else 0.0
+            for drive in drives:
+                drive.put(payloads.encode(Drive(forward=forward, turn=0.0 if forward else 0.5)))
+            live.update(watch.table(REFRESH_S), refresh=True)
+    for drive in drives:
+        drive.put(payloads.encode(Drive()))

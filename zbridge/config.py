@@ -1,0 +1,163 @@
+"""The configuration of one process: a TOML file, checked whole before anything starts.
+
+Unknown keys are errors; ``${VAR}`` in a string is taken from the environment. Knows no protocol: the
+``options`` tables are checked against what the named protocol declares.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from zbridge.bus import BusSettings
+from zbridge.errors import ConfigError, LinkError
+from zbridge.fleet.topics import is_name
+from zbridge.link import Address
+from zbridge.protocol import Protocol, find_protocol
+
+T = TypeVar("T")
+Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
+
+_VARIABLE = re.compile(r"\$\{(\w+)\}")
+_PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
+
+
+class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[robot]``: how the robot is named on the bus."""
+
+    name: str
+    realm: str = "fleet"
+
+
+class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[device]``: the robot itself. ``connect`` has one address for each of its links."""
+
+    protocol: str
+    connect: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    options: dict[str, Any] = {}
+
+
+class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[control]``: the most a holder may ask for, in seconds."""
+
+    lease_s: Seconds = 3.0
+    deadman_s: Seconds = 2.0
+
+
+class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[metrics]``: where Prometheus finds the counters."""
+
+    listen: str
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole configuration."""
+
+    robot: RobotSettings
+    device: DeviceSettings
+    bus: BusSettings = BusSettings()
+    control: ControlSettings = ControlSettings()
+    metrics: MetricsSettings | None = None
+
+
+class Plan(msgspec.Struct, frozen=True):
+    """A configuration with everything its names refer to: what a gateway is started from."""
+
+    config: Config
+    protocol: Protocol
+    options: Any
+    addresses: tuple[Address, ...]
+    metrics: Address | None = None
+
+
+def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
+    """Read and check a configuration file; raise ConfigError naming file, key, value and what was expected."""
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from error
+    try:
+        return plan(raw, environment)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:
+    """Check a configuration given as a plain map; raise ConfigError naming key, value and what was expected."""
+    raw = _substituted(raw, environment, "")
+    config = _convert(raw, Config, "")
+    for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
+        if not is_name(name):
+            raise ConfigError(f"{key} = {name!r}: expected letters, digits, '_', '.' and '-' only")
+    protocol = find_protocol(config.device.protocol)
+    options = _convert(config.device.options, protocol.options, "device.options.")
+    addresses = tuple(_address("device.connect", text) for text in config.device.connect)
+    if len(addresses) > protocol.links:
+        raise ConfigError(
+            f"device.connect = {list(config.device.connect)}: a {protocol.name} robot has at most {protocol.links} link"
+            f"{'s' if protocol.links > 1 else ''}"
+        )
+    metrics = _address("metrics.listen", f"tcp://{config.metrics.listen}") if config.metrics else None
+    return Plan(config, protocol, options, addresses, metrics)
+
+
+def _address(key: str, text: str) -> Address:
+    try:
+        return Address.parse(text)
+    except LinkError as error:
+        raise ConfigError(f"{key} = {error}") from error
+
+
+def _substituted(value: Any, environment: Mapping[str, str], key: str) -> Any:
+    if isinstance(value, dict):
+        return {name: _substituted(item, environment, f"{key}.{name}" if key else name) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_substituted(item, environment, f"{key}[{index}]") for index, item in enumerate(value)]
+    if isinstance(value, str):
+        return _VARIABLE.sub(lambda match: _variable(match.group(1), environment, key, value), value)
+    return value
+
+
+def _variable(name: str, environment: Mapping[str, str], key: str, text: str) -> str:
+    if name not in environment:
+        raise ConfigError(f"{key} = {text!r}: expected the environment variable {name} to be set")
+    return environment[name]
+
+
+def _convert(raw: Any, kind: type[T], prefix: str) -> T:
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_explain(raw, str(error), prefix)) from error
+
+
+def _explain(raw: Any, text: str, prefix: str) -> str:
+    """Turn msgspec's message into ``key = value: what was expected``."""
+    match = _PATH.search(text)
+    path = (match["path"] or match["index"] or "") if match else ""
+    what = text[: match.start()] if match else text
+    unknown = re.match(r"Object contains unknown field `(.+)`", what)
+    if unknown:
+        path, what = f"{path}.{unknown[1]}" if path else unknown[1], "unknown key"
+    missing = re.match(r"Object missing required field `(.+)`", what)
+    if missing:
+        path, what = f"{path}.{missing[1]}" if path else missing[1], "missing; it is required"
+        return f"{prefix}{path}: {what}"
+    return f"{prefix}{path} = {_value(raw, path)!r}: {what[:1].lower()}{what[1:]}"
+
+
+def _value(raw: Any, path: str) -> Any:
+    for part in re.findall(r"[^.\[\]]+", path):
+        try:
+            raw = raw[int(part)] if isinstance(raw, list) else raw[part]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return None
+    return raw

@@ -1,0 +1,143 @@
+"""Carries one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from zbridge.link import Link
+from zbridge.session.session import Session, State
+
+log = logging.getLogger("zbridge.link")
+
+
+class Conversation:
+    """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state."""
+
+    def __init__(
+        self,
+        session: Session[Any],
+        loop: asyncio.AbstractEventLoop,
+        *,
+        deliver: Callable[[list[Any]], None],
+        changed: Callable[[], None] = lambda: None,
+        tap: Callable[[str, bytes], None] | None = None,
+    ) -> None:
+        self.session = session
+        self.ended: asyncio.Future[None] = loop.create_future()
+        self._loop = loop
+        self._deliver = deliver
+        self._changed = changed
+        self.tap = tap
+        self._link: Link | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._seen = session.state
+        self._malformed_logged = 0
+
+    def __repr__(self) -> str:
+        return f"<Conversation {self.session!r}>"
+
+    def attached(self, link: Link) -> None:
+        """Begin: the link is up."""
+        self._link = link
+        self.session.peer = link.peer
+        self.session.open(self._loop.time())
+        self.pump()
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the link."""
+        session = self.session
+        if self.tap is not None:
+            self.tap("in", data)
+        messages = session.receive(data, self._loop.time())
+        if session.state is not self._seen:
+            self._notify()
+        if messages:
+            self._deliver(messages)
+        if session.traffic.malformed != self._malformed_logged:
+            self._report_malformed()
+        self.pump()
+
+    def lost(self, reason: str) -> None:
+        """Take note that the link is gone."""
+        self._link = None
+        self.session.lost(reason)
+        self.pump()
+
+    def writable(self) -> None:
+        """Go on writing."""
+        self.pump()
+
+    def pump(self) -> None:
+        """Write what may be written now, and set the timer for what may not."""
+        session, link, now = self.session, self._link, self._loop.time()
+        while link is not None and link.ready:
+            frame = session.outgoing(now)
+            if frame is None:
+                break
+            if self.tap is not None:
+                self.tap("out", frame)
+            if log.isEnabledFor(logging.DEBUG):
+                log.debug("> %s %s", session.name, frame[:64].hex(" "))
+            link.write(frame)
+        if session.state is not self._seen:
+            self._notify()
+        if session.state is State.CLOSED:
+            self._end()
+        else:
+            self._set_timer(session.deadline(writing=link is not None and link.ready))
+
+    def close(self, reason: str) -> None:
+        """End the conversation from our side."""
+        self.session.close(reason, self._loop.time())
+        self.pump()
+
+    def abandon(self) -> None:
+        """End the conversation and its link at once, whatever state they are in; idempotent."""
+        self.session.lost("abandoned")
+        self._end()
+
+    def pause(self) -> None:
+        """Read nothing until :meth:`resume`."""
+        if self._link is not None:
+            self._link.pause()
+
+    def resume(self) -> None:
+        """Read again."""
+        if self._link is not None:
+            self._link.resume()
+
+    def _tick(self) -> None:
+        self._timer = None
+        self.session.expire(self._loop.time())
+        self.pump()
+
+    def _set_timer(self, deadline: float | None) -> None:
+        if self._timer is not None:
+            if deadline is not None and self._timer.when() == deadline:
+                return
+            self._timer.cancel()
+            self._timer = None
+        if deadline is not None:
+            self._timer = self._loop.call_at(deadline, self._tick)
+
+    def _notify(self) -> None:
+        self._seen = self.session.state
+        self._changed()
+
+    def _end(self) -> None:
+        self._set_timer(None)
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
+        if not self.ended.done():
+            self.ended.set_result(None)
+
+    def _report_malformed(self) -> None:
+        """Warn at the first, second, fourth ... malformed message: the log stays readable in a flood."""
+        count = self.session.traffic.malformed
+        if count.bit_length() != self._malformed_logged.bit_length():
+            log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
+        self._malformed_logged = count

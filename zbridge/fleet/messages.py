@@ -1,0 +1,214 @@
+"""The fleet messages: what every protocol is translated to and from.
+
+SI units and radians; axes after REP 103: x forward, y left, turns and angles counter-clockwise positive.
+Speeds and drive commands are fractions of full scale, -1 to 1.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+Fraction = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+Floats = npt.NDArray[np.float32]
+Cells = npt.NDArray[np.uint8]
+
+
+class FleetMessage(msgspec.Struct, frozen=True, gc=False, kw_only=True):
+    """What all fleet messages may carry; absent where the device has none.
+
+    stamp_ns: best estimate of when the content was measured, Unix nanoseconds on the gateway's clock.
+    seq: the device's own sequence number. device_ms: the device's own clock, milliseconds.
+    """
+
+    stamp_ns: int | None = None
+    seq: int | None = None
+    device_ms: int | None = None
+
+
+class Scan(FleetMessage, frozen=True, eq=False):
+    """One sweep of a laser scanner. ranges: float32[n], metres, invalid = NaN; angles in radians."""
+
+    angle_min: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+    ranges: Floats
+
+
+class Scanner(FleetMessage, frozen=True):
+    """The geometry of a laser scanner: radians, seconds, metres."""
+
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment_s: float
+    range_min: float
+    range_max: float
+    points: int
+
+
+class Motion(FleetMessage, frozen=True):
+    """How the robot moves: speed -1..1 of full scale, acceleration m/s2, gyro rad/s, temperature degrees C.
+
+    acceleration and gyro are [x, y, z]; unknown = None.
+    """
+
+    speed: float | None = None
+    acceleration: tuple[float, float, float] | None = None
+    gyro: tuple[float, float, float] | None = None
+    temperature: float | None = None
+
+
+class Pose(FleetMessage, frozen=True):
+    """Where the robot is in its own map frame: metres, heading in radians."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class Map(FleetMessage, frozen=True, eq=False):
+    """An occupancy map. cells: uint8[rows, columns], row = y, 0 unknown, 1 free, 2 occupied.
+
+    cell: side of a cell in metres. origin: [x, y] of cell (0, 0) in metres.
+    """
+
+    rows: int
+    columns: int
+    cell: float
+    origin: tuple[float, float]
+    cells: Cells
+
+
+class Reading(FleetMessage, frozen=True):
+    """One value of a named sensor, in the sensor's unit; ``fault`` where the value is not plausible."""
+
+    value: float
+    kind: str | None = None
+    device: int | None = None
+    fault: bool = False
+
+
+class Device(msgspec.Struct, frozen=True):
+    """One entry of the device table."""
+
+    name: str
+    number: int
+    kind: str
+
+
+class Devices(FleetMessage, frozen=True):
+    """What the robot has registered."""
+
+    devices: tuple[Device, ...]
+
+
+class Switch(FleetMessage, frozen=True):
+    """Something that is on or off."""
+
+    on: bool
+
+
+class Text(FleetMessage, frozen=True):
+    """A text for people; ``request`` asks programs on the bus for something."""
+
+    text: str
+    kind: Literal["debug", "chat", "request"] = "debug"
+    sender: str | None = None
+
+
+class Raw(FleetMessage, frozen=True):
+    """A legacy message that no fleet message holds: its packet id and its body."""
+
+    id: int
+    body: bytes = b""
+
+
+class LinkStatus(msgspec.Struct, frozen=True):
+    """One transport connection to the robot."""
+
+    name: str
+    state: str
+    peer: str
+    reason: str | None = None
+
+
+RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]
+
+
+class Status(FleetMessage, frozen=True):
+    """Whether the robot can be used, and what was agreed with it."""
+
+    state: RobotState
+    reason: str | None = None
+    protocol: str | None = None
+    dialect: str | None = None
+    version: str | None = None
+    features: tuple[str, ...] = ()
+    links: tuple[LinkStatus, ...] = ()
+
+
+class Refusal(msgspec.Struct, frozen=True):
+    """A command that was not carried out, and how often."""
+
+    who: str | None
+    command: str
+    reason: str
+    count: int
+
+
+class Control(FleetMessage, frozen=True):
+    """Who drives, and what was refused lately."""
+
+    state: Literal["free", "held", "stopped"]
+    holder: str | None = None
+    priority: int | None = None
+    expires_in_s: float | None = None
+    refusals: tuple[Refusal, ...] = ()
+
+
+class Drive(FleetMessage, frozen=True):
+    """Move: fractions of full scale, -1..1; ``light`` None leaves it as it is."""
+
+    forward: Fraction = 0.0
+    left: Fraction = 0.0
+    turn: Fraction = 0.0
+    light: bool | None = None
+
+    @property
+    def moving(self) -> bool:
+        """Tell motion from neutral."""
+        return bool(self.forward or self.left or self.turn)
+
+
+class Motor(FleetMessage, frozen=True):
+    """One motor: rad/s, or metres for a linear motor."""
+
+    value: float
+
+
+class Mode(FleetMessage, frozen=True):
+    """Who moves the robot: nobody, a person, or the robot itself."""
+
+    mode: Literal["none", "manual", "autonomous"]
+
+
+class Stop(FleetMessage, frozen=True):
+    """Stand still now."""
+
+
+class SensorSetting(FleetMessage, frozen=True):
+    """Settings of one sensor: any of enable, one value by index, or all values."""
+
+    enable: bool | None = None
+    index: int | None = None
+    value: float | None = None
+    values: tuple[float, ...] | None = None
+
+
+class Query(FleetMessage, frozen=True):
+    """A question without fields."""

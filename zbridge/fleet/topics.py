@@ -1,0 +1,205 @@
+"""Every key below ``<realm>/<robot>/``, declared once: its path, its message, and its class of delivery.
+
+Names in keys: bytes outside ``[A-Za-z0-9_.-]`` become ``%XX``; an empty name is ``%``. Sans-IO.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from enum import Enum
+from functools import lru_cache
+from urllib.parse import unquote
+
+import msgspec
+
+from zbridge.fleet.messages import (
+    Control,
+    Devices,
+    Drive,
+    FleetMessage,
+    Map,
+    Mode,
+    Motion,
+    Motor,
+    Pose,
+    Query,
+    Raw,
+    Reading,
+    Scan,
+    Scanner,
+    SensorSetting,
+    Status,
+    Stop,
+    Switch,
+    Text,
+)
+
+
+class Delivery(Enum):
+    """The classes of the design's key table; :data:`QOS` says what each means on the bus."""
+
+    STREAM = "stream"
+    STATE = "state"
+    COMMAND = "command"
+    QUERY = "query"
+
+
+class Congestion(Enum):
+    """What a full transmission queue does to a message."""
+
+    DROP = "drop"
+    BLOCK = "block"
+
+
+class Priority(Enum):
+    """The bus priorities in use."""
+
+    DATA = "data"
+    DATA_HIGH = "data high"
+    REAL_TIME = "real time"
+
+
+class QoS(msgspec.Struct, frozen=True):
+    """How the bus treats a class of messages."""
+
+    priority: Priority
+    congestion: Congestion
+    express: bool = False
+    keeps_last: bool = False
+
+
+class Topic(msgspec.Struct, frozen=True):
+    """One key of a robot: ``path`` below ``<realm>/<robot>/``."""
+
+    path: str
+    message: type[FleetMessage]
+    delivery: Delivery
+
+    @property
+    def qos(self) -> QoS:
+        """How the bus treats this topic; a drive is dropped under congestion, the next one comes soon."""
+        return _DRIVE_QOS if self.message is Drive else QOS[self.delivery]
+
+
+Family = Callable[[str], Topic]
+"""Topics that share all but the last chunk: ``SENSOR("front left")``."""
+
+QOS = {
+    Delivery.STREAM: QoS(Priority.DATA, Congestion.DROP),
+    Delivery.STATE: QoS(Priority.DATA_HIGH, Congestion.BLOCK, keeps_last=True),
+    Delivery.COMMAND: QoS(Priority.REAL_TIME, Congestion.BLOCK, express=True),
+    Delivery.QUERY: QoS(Priority.REAL_TIME, Congestion.BLOCK, express=True),
+}
+_DRIVE_QOS = QoS(Priority.REAL_TIME, Congestion.DROP, express=True)
+
+_NAME = re.compile(r"[A-Za-z0-9_.-]+")
+_ESCAPED = re.compile(rb"[^A-Za-z0-9_.-]")
+
+
+def is_name(name: str) -> bool:
+    """Tell whether ``name`` can stand in a key as it is."""
+    return _NAME.fullmatch(name) is not None
+
+
+def escape(name: str) -> str:
+    """Write any name as one key chunk, reversibly."""
+    if not name:
+        return "%"
+    return _ESCAPED.sub(lambda match: b"%%%02X" % match.group()[0], name.encode("utf-8", "surrogateescape")).decode()
+
+
+def unescape(chunk: str) -> str:
+    """Read a name back from its key chunk."""
+    return "" if chunk == "%" else unquote(chunk, errors="surrogateescape")
+
+
+def _family(prefix: str, message: type[FleetMessage], delivery: Delivery) -> Family:
+    @lru_cache(maxsize=1024)
+    def topic(name: str) -> Topic:
+        return Topic(f"{prefix}/{escape(name)}", message, delivery)
+
+    return topic
+
+
+SCAN = Topic("scan", Scan, Delivery.STREAM)
+MOTION = Topic("motion", Motion, Delivery.STREAM)
+POSE = Topic("pose", Pose, Delivery.STREAM)
+TEXT = Topic("text", Text, Delivery.STREAM)
+SENSOR = _family("sensor", Reading, Delivery.STREAM)
+RAW = _family("raw", Raw, Delivery.STREAM)
+
+STATUS = Topic("status", Status, Delivery.STATE)
+CONTROL = Topic("control", Control, Delivery.STATE)
+SCANNER = Topic("scanner", Scanner, Delivery.STATE)
+MAP = Topic("map", Map, Delivery.STATE)
+LIDAR = Topic("lidar", Switch, Delivery.STATE)
+CAMERA = Topic("camera", Switch, Delivery.STATE)
+DEVICES = Topic("devices", Devices, Delivery.STATE)
+
+CMD_DRIVE = Topic("@cmd/drive", Drive, Delivery.COMMAND)
+CMD_STOP = Topic("@cmd/stop", Stop, Delivery.COMMAND)
+CMD_MODE = Topic("@cmd/mode", Mode, Delivery.COMMAND)
+CMD_LIGHT = Topic("@cmd/light", Switch, Delivery.COMMAND)
+CMD_LIDAR = Topic("@cmd/lidar", Switch, Delivery.COMMAND)
+CMD_CAMERA = Topic("@cmd/camera", Switch, Delivery.COMMAND)
+CMD_TEXT = Topic("@cmd/text", Text, Delivery.COMMAND)
+CMD_SCAN = Topic("@cmd/scan", Scan, Delivery.COMMAND)
+CMD_MOTOR = _family("@cmd/motor", Motor, Delivery.COMMAND)
+CMD_SENSOR = _family("@cmd/sensor", SensorSetting, Delivery.COMMAND)
+CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND)
+
+RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
+RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
+
+_TOPICS = {
+    topic.path: topic
+    for topic in (
+        *(SCAN, MOTION, POSE, TEXT, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
+        *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
+        *(RPC_MAP, RPC_POSE),
+    )
+}
+_FAMILIES = {
+    "sensor": SENSOR,
+    "raw": RAW,
+    "@cmd/motor": CMD_MOTOR,
+    "@cmd/sensor": CMD_SENSOR,
+    "@cmd/raw": CMD_RAW,
+}
+
+
+def find(path: str) -> Topic | None:
+    """Find the topic of a path below ``<realm>/<robot>/``, None where the design knows none."""
+    topic = _TOPICS.get(path)
+    if topic is None:
+        prefix, _, name = path.rpartition("/")
+        family = _FAMILIES.get(prefix)
+        topic = family(unescape(name)) if family and name else None
+    return topic
+
+
+class KeySpace(msgspec.Struct, frozen=True):
+    """The keys of one robot."""
+
+    realm: str
+    robot: str
+
+    def key(self, path: str) -> str:
+        """Write the full key of a path."""
+        return f"{self.realm}/{self.robot}/{path}"
+
+    def path(self, key: str) -> str:
+        """Read the path back from a full key of this robot."""
+        return key.removeprefix(f"{self.realm}/{self.robot}/")
+
+    def alive(self, who: str) -> str:
+        """Write the key of a liveliness token."""
+        return self.key(f"@alive/{who}")
+
+
+def split_key(key: str) -> tuple[str, str, str] | None:
+    """Split a full key into realm, robot and path; None where it has fewer chunks."""
+    realm, _, rest = key.partition("/")
+    robot, _, path = rest.partition("/")
+    return (realm, robot, path) if path else None

@@ -1,0 +1,84 @@
+"""One gateway process: the bus, the claim on the robot, its device side, and the counters' endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+from collections.abc import Coroutine
+from typing import Any
+
+from zbridge.bus import Bus, open_bus
+from zbridge.claim import Claim
+from zbridge.config import Plan
+from zbridge.device import Device
+from zbridge.errors import BusError
+from zbridge.exporter import serve_metrics
+from zbridge.fleet.topics import KeySpace
+from zbridge.metrics import Metrics
+from zbridge.session.control import Authority
+from zbridge.session.manager import SessionManager
+
+log = logging.getLogger("zbridge.gateway")
+
+RETRY_S = 1.0
+"""Seconds between attempts to open the bus."""
+
+
+class Gateway:
+    """A gateway from its plan to its end."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self.metrics = Metrics()
+        self.sessions = SessionManager()
+
+    def __repr__(self) -> str:
+        return f"<Gateway {self._plan.config.robot.name}>"
+
+    async def run(self) -> None:
+        """Serve the robot until cancelled; leave it standing still and the bus in order."""
+        robot = self._plan.config.robot
+        bus = await self._open_bus()
+        claim = Claim(bus, KeySpace(robot.realm, robot.name))
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                if self._plan.metrics is not None:
+                    await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+                await claim.take()
+                await self._device(bus).run()
+        finally:
+            claim.release()
+            await bus.close()
+
+    def _device(self, bus: Bus) -> Device:
+        plan, config = self._plan, self._plan.config
+        return Device(
+            plan.protocol.robot(plan.options, len(plan.addresses)),
+            plan.addresses,
+            protocol=plan.protocol.name,
+            keys=KeySpace(config.robot.realm, config.robot.name),
+            bus=bus,
+            authority=Authority(config.control.deadman_s),
+            manager=self.sessions,
+            metrics=self.metrics,
+        )
+
+    async def _open_bus(self) -> Bus:
+        while True:
+            try:
+                return await open_bus(self._plan.config.bus, self.metrics)
+            except BusError as error:
+                log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
+                await asyncio.sleep(RETRY_S)
+
+
+async def until_signal(work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends or SIGTERM or SIGINT comes; then cancel it and wait for it to tidy up."""
+    task = asyncio.ensure_future(work)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, task.cancel)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task

@@ -1,0 +1,58 @@
+"""Keeps the sessions of one process: their table, and when to try a lost peer again. Sans-IO."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from zbridge.session.session import Session, Snapshot
+
+REMEMBERED = 32
+"""Ended sessions that the table still shows."""
+
+
+class Backoff:
+    """Delays between attempts: doubling from ``first_s`` to ``most_s``, each with +-25 % jitter, for ever."""
+
+    def __init__(self, first_s: float = 0.5, most_s: float = 10.0, rng: random.Random | None = None) -> None:
+        self._first_s = first_s
+        self._most_s = most_s
+        self._next_s = first_s
+        self._rng = rng or random.Random()
+
+    def __repr__(self) -> str:
+        return f"<Backoff next {self._next_s:g} s>"
+
+    def delay_s(self) -> float:
+        """Give the next delay in seconds."""
+        delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
+        return delay_s * self._rng.uniform(0.75, 1.25)
+
+    def reset(self) -> None:
+        """Begin anew: the last attempt worked."""
+        self._next_s = self._first_s
+
+
+class SessionManager:
+    """The sessions of one process, of every protocol and both roles."""
+
+    def __init__(self) -> None:
+        self._live: list[Session[Any]] = []
+        self._ended: list[Snapshot] = []
+
+    def __repr__(self) -> str:
+        return f"<SessionManager {len(self._live)} live, {len(self._ended)} ended>"
+
+    def add(self, session: Session[Any]) -> None:
+        """Take a new session into the table."""
+        self._live.append(session)
+
+    def remove(self, session: Session[Any]) -> None:
+        """Move an ended session to the remembered ones."""
+        if session in self._live:
+            self._live.remove(session)
+            self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]
+
+    def snapshots(self) -> tuple[Snapshot, ...]:
+        """Show every session, the live ones first."""
+        return (*(session.snapshot() for session in self._live), *self._ended)

@@ -1,0 +1,24 @@
+"""Version negotiation: the highest version both sides list. Sans-IO."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+_VERSION = re.compile(r"\d{1,9}(\.\d{1,9})*")
+
+
+def parse_versions(listed: str) -> tuple[str, ...]:
+    """Read a comma-separated version list; entries that are no dotted numbers are left out."""
+    entries = (entry.strip() for entry in listed.split(","))
+    return tuple(entry for entry in entries if _VERSION.fullmatch(entry))
+
+
+def agree(ours: Iterable[str], theirs: Iterable[str]) -> str | None:
+    """Choose the highest common version, compared number by number; None where there is none."""
+    common = set(ours) & set(theirs)
+    return max(common, key=_numbers, default=None)
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in version.split("."))

@@ -1,0 +1,124 @@
+"""What a session still has to write: one frame at a time, spaced, the newest motion first. Sans-IO.
+
+Fragile peers take one read as one packet, so a frame is handed out only when ``gap_s`` has passed since
+the one before. Frames that come once wait in a bounded queue. Frames that stand (a drive command that is
+repeated while the robot moves, a stop that is repeated for a second) have a named slot each, and a newer
+one replaces what stands there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from zbridge.errors import Refused
+
+LIMIT = 64
+"""Frames that may wait; one more is refused."""
+
+
+class _Standing:
+    """The frames of one slot: sent as a group, then again every ``period_s`` until ``until``."""
+
+    __slots__ = ("due", "frames", "period_s", "position", "until", "urgent")
+
+    def __init__(self, frames: tuple[bytes, ...], due: float, period_s: float, until: float, urgent: bool) -> None:
+        self.frames = frames
+        self.position = 0
+        self.due = due
+        self.period_s = period_s
+        self.until = until
+        self.urgent = urgent
+
+    def step(self, now: float) -> bytes:
+        frame = self.frames[self.position]
+        self.position += 1
+        if self.position == len(self.frames):
+            self.position = 0
+            self.due = now + self.period_s
+        return frame
+
+    @property
+    def over(self) -> bool:
+        return self.due > self.until or self.due == math.inf
+
+
+class Outbox:
+    """Frames on their way out. ``gap_s``: least time between two writes, seconds."""
+
+    def __init__(self, gap_s: float, limit: int = LIMIT) -> None:
+        self.gap_s = gap_s
+        self._limit = limit
+        self._queue: deque[bytes] = deque()
+        self._standing: dict[str, _Standing] = {}
+        self._free_at = -math.inf
+        self._turn_of_queue = False
+
+    def __repr__(self) -> str:
+        return f"<Outbox {len(self._queue)} waiting, standing {sorted(self._standing)}>"
+
+    def __len__(self) -> int:
+        return len(self._queue)
+
+    def put(self, frame: bytes) -> None:
+        """Queue a frame that is sent once; raise Refused when too many wait."""
+        if len(self._queue) >= self._limit:
+            raise Refused(f"busy: {self._limit} packets wait for the robot")
+        self._queue.append(frame)
+
+    def stand(
+        self,
+        slot: str,
+        frames: tuple[bytes, ...],
+        now: float,
+        *,
+        period_s: float = math.inf,
+        until: float = math.inf,
+        urgent: bool = False,
+    ) -> None:
+        """Let ``frames`` stand in ``slot``: sent as soon as may be, then every ``period_s`` until ``until``.
+
+        What stood there is forgotten, sent or not. Urgent frames go before all others.
+        """
+        self._standing[slot] = _Standing(frames, now, period_s, until, urgent)
+
+    def clear(self, slot: str) -> None:
+        """Forget what stands in ``slot``."""
+        self._standing.pop(slot, None)
+
+    def take(self, now: float) -> bytes | None:
+        """Take the frame to write now, None when there is none or the gap has not passed."""
+        if now < self._free_at:
+            return None
+        slot = self._due_slot(now)
+        if slot is None:
+            if not self._queue:
+                return None
+            frame = self._queue.popleft()
+            self._turn_of_queue = False
+        else:
+            standing = self._standing[slot]
+            frame = standing.step(now)
+            if standing.over:
+                del self._standing[slot]
+            self._turn_of_queue = True
+        self._free_at = now + self.gap_s
+        return frame
+
+    def deadline(self) -> float | None:
+        """Tell when :meth:`take` will have something, None when nothing waits or stands."""
+        if self._queue:
+            return self._free_at
+        if not self._standing:
+            return None
+        return max(self._free_at, min(standing.due for standing in self._standing.values()))
+
+    def _due_slot(self, now: float) -> str | None:
+        """Pick a due slot; urgent ones first, the others take turns with the queue."""
+        due = [slot for slot, standing in self._standing.items() if standing.due <= now]
+        urgent = next((slot for slot in due if self._standing[slot].urgent), None)
+        if urgent is not None or not due:
+            return urgent
+        if self._queue and self._turn_of_queue:
+            return None
+        return min(due, key=lambda slot: self._standing[slot].due)

@@ -1,0 +1,242 @@
+"""One conversation with a peer, in either role: bytes in, messages out, frames to write, timers. Sans-IO.
+
+A driver (:mod:`zbridge.device`, a simulator, a test) calls ``open`` when the transport is up, ``receive``
+with what was read, ``lost`` when the transport is gone; after each call it writes ``outgoing(now)`` until that
+is None, and calls ``expire(now)`` at ``deadline()``. A protocol contributes the framing function, the
+decoding of a frame, the encoding of a message, and its handshake.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from enum import Enum
+from typing import Generic, TypeVar
+
+import msgspec
+
+from zbridge.errors import ProtocolError
+from zbridge.session.outbox import Outbox
+from zbridge.wire.frames import FrameBuffer, FrameEnd
+
+M = TypeVar("M")
+
+LINGER_S = 0.5
+"""Longest time a closing session waits for its last frames to be written."""
+
+
+class Role(Enum):
+    """Which side of a legacy protocol we play."""
+
+    HQ = "hq"
+    ROBOT = "robot"
+
+
+class State(Enum):
+    """Where a session stands; it only ever moves down this list."""
+
+    CONNECTING = "connecting"
+    HANDSHAKING = "handshaking"
+    ESTABLISHED = "established"
+    CLOSING = "closing"
+    CLOSED = "closed"
+
+
+class Limits(msgspec.Struct, frozen=True):
+    """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes."""
+
+    frame_bytes: int
+    handshake_s: float
+    gap_s: float = 0.0
+
+
+class Traffic(msgspec.Struct):
+    """What one session has carried, and what of it was not usable."""
+
+    frames_in: int = 0
+    frames_out: int = 0
+    bytes_in: int = 0
+    bytes_out: int = 0
+    malformed: int = 0
+
+
+class Snapshot(msgspec.Struct, frozen=True):
+    """A session as the session table shows it."""
+
+    name: str
+    peer: str
+    role: Role
+    state: State
+    reason: str | None
+    version: str | None
+    features: tuple[str, ...]
+    transport: str
+    traffic: Traffic
+
+
+class Session(ABC, Generic[M]):
+    """The part of a conversation that all protocols share."""
+
+    role: Role
+    frame_end: FrameEnd
+
+    def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
+        self.limits = limits
+        self.name = name
+        self.peer = peer
+        self.state = State.CONNECTING
+        self.reason: str | None = None
+        self.version: str | None = None
+        self.features: tuple[str, ...] = ()
+        self.transport = "tcp"
+        self.traffic = Traffic()
+        self.last_malformed: str | None = None
+        self.outbox = Outbox(limits.gap_s)
+        self._frames = FrameBuffer(type(self).frame_end, limits.frame_bytes)
+        self._limit_at = math.inf
+
+    def __repr__(self) -> str:
+        reason = f" ({self.reason})" if self.reason else ""
+        return f"<{type(self).__name__} {self.name or self.peer} {self.state.value}{reason}>"
+
+    # What a protocol contributes
+
+    @abstractmethod
+    def encode(self, message: M) -> bytes:
+        """Write a message as one frame; raise EncodeError where it cannot be."""
+
+    @abstractmethod
+    def decode(self, frame: bytes) -> M:
+        """Read one frame; raise ProtocolError where it is none of this protocol's messages."""
+
+    def opened(self, now: float) -> None:
+        """Take the first step of the handshake."""
+
+    @abstractmethod
+    def accept(self, message: M, now: float) -> bool:
+        """Take one message; False keeps it for the session itself."""
+
+    def overdue(self) -> str:
+        """Say why a handshake that was never finished probably was not."""
+        return f"no handshake within {self.limits.handshake_s:g} s"
+
+    # What a driver calls
+
+    def open(self, now: float) -> None:
+        """Begin: the transport is up."""
+        self.state = State.HANDSHAKING
+        self._limit_at = now + self.limits.handshake_s
+        self.opened(now)
+
+    def receive(self, data: bytes, now: float) -> list[M]:
+        """Take bytes in any cut; return the messages for the translator.
+
+        A frame whose body is malformed is counted and skipped: the stream is still in step. A frame that
+        cannot be one ends the session, after the messages before it.
+        """
+        messages: list[M] = []
+        if self.over:
+            return messages
+        traffic, decode, accept = self.traffic, self.decode, self.accept
+        traffic.bytes_in += len(data)
+        frames = 0
+        try:
+            for frame in self._frames.feed(data):
+                frames += 1
+                try:
+                    message = decode(frame)
+                    if accept(message, now):
+                        messages.append(message)
+                except ProtocolError as error:
+                    self.malformed(str(error))
+                if self.over:
+                    break
+        except ProtocolError as error:
+            self.malformed(str(error))
+            self.fail(f"broken stream: {error}")
+        traffic.frames_in += frames
+        return messages
+
+    def malformed(self, what: str) -> None:
+        """Count one message of the peer that could not be used."""
+        self.traffic.malformed += 1
+        self.last_malformed = what
+
+    def outgoing(self, now: float) -> bytes | None:
+        """Take the next frame to write now; None when nothing may be written yet."""
+        if self.state is State.CLOSED:
+            return None
+        frame = self.outbox.take(now)
+        if frame is not None:
+            self.traffic.frames_out += 1
+            self.traffic.bytes_out += len(frame)
+        elif self.state is State.CLOSING and not self.outbox:
+            self.state = State.CLOSED
+        return frame
+
+    def deadline(self, *, writing: bool = True) -> float | None:
+        """Tell when :meth:`expire` and :meth:`outgoing` want to be called next.
+
+        ``writing`` False leaves out what only waits to be written: the link takes nothing now.
+        """
+        if self.state is State.CLOSED:
+            return None
+        outbox = self.outbox.deadline() if writing else None
+        earliest = self._limit_at if outbox is None else min(outbox, self._limit_at)
+        return None if earliest == math.inf else earliest
+
+    def expire(self, now: float) -> None:
+        """Let the timers that are due take effect."""
+        if now < self._limit_at:
+            return
+        self._limit_at = math.inf
+        if self.state is State.HANDSHAKING:
+            self.fail(self.overdue())
+        elif self.state is State.CLOSING:
+            self.state = State.CLOSED
+
+    def close(self, reason: str, now: float) -> None:
+        """End the conversation from our side once the frames that wait are written."""
+        if not self.over:
+            self.state, self.reason = State.CLOSING, reason
+            self._limit_at = now + LINGER_S
+
+    def lost(self, reason: str) -> None:
+        """Take note that the transport is gone; the first reason stands."""
+        self.fail(reason)
+
+    def fail(self, reason: str) -> None:
+        """End the conversation at once."""
+        if self.state is not State.CLOSED:
+            self.reason = self.reason or reason
+            self.state = State.CLOSED
+
+    # What a protocol's own code calls
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to be expected of this session."""
+        return self.state in (State.CLOSING, State.CLOSED)
+
+    def establish(self, version: str, features: tuple[str, ...]) -> None:
+        """End the handshake with what was agreed."""
+        self.state, self.version, self.features = State.ESTABLISHED, version, features
+        self._limit_at = math.inf
+
+    def send(self, message: M) -> None:
+        """Queue a message that is sent once; raises Refused when too many wait, EncodeError."""
+        self.outbox.put(self.encode(message))
+
+    def snapshot(self) -> Snapshot:
+        """Show the session as it is now."""
+        return Snapshot(
+            name=self.name,
+            peer=self.peer,
+            role=self.role,
+            state=self.state,
+            reason=self.reason,
+            version=self.version,
+            features=self.features,
+            transport=self.transport,
+            traffic=msgspec.structs.replace(self.traffic),
+        )

@@ -1,0 +1,204 @@
+"""The binary codec: a message declaration compiled once into functions between bytes and message. Sans-IO.
+
+Little endian throughout; every legacy protocol of this project is.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar, get_args, get_type_hints
+
+import msgspec
+import numpy as np
+
+from zbridge.errors import EncodeError, ProtocolError
+from zbridge.wire.fields import CountedArray, CountedBytes, CountedText, Message, Remainder, Scalar, WireType
+
+M = TypeVar("M", bound=Message)
+
+Decode = Callable[[bytes, int], tuple[Any, int]]
+"""``decode(data, position)``: the value there and the position behind it."""
+Encode = Callable[[Any], bytes]
+
+
+class BinaryCodec(Generic[M]):
+    """Turns the bytes of one message class into messages and back.
+
+    ``decode(data, start)`` reads the body ``data[start:]`` whole; it raises ProtocolError where the bytes
+    are too few, too many or lie about a count. ``encode(message)`` raises EncodeError for values the
+    wire types cannot carry.
+    """
+
+    decode: Callable[[bytes, int], M]
+    encode: Callable[[M], bytes]
+
+    def __init__(self, message: type[M]) -> None:
+        self.message = message
+        fields = _declared(message)
+        scalars = _all_scalars(fields)
+        if scalars is None:
+            self._steps = [_Step(field) for field in fields]
+            self.decode, self.encode = self._decode_steps, self._encode_steps
+        else:
+            self._fixed = struct.Struct("<" + scalars)
+            self._names = [field.name for field in fields]
+            self.decode = _fixed_decoder(message, self._fixed)
+            self.encode = self._encode_fixed
+
+    def _encode_fixed(self, message: M) -> bytes:
+        values = [getattr(message, name) for name in self._names]
+        try:
+            return self._fixed.pack(*values)
+        except (struct.error, OverflowError) as error:
+            raise EncodeError(f"{self.message.__name__} {values}: {error}") from error
+
+    def _decode_steps(self, data: bytes, start: int) -> M:
+        values = []
+        position, end = start, len(data)
+        for step in self._steps:
+            if step.optional and position == end:
+                break
+            try:
+                value, position = step.decode(data, position)
+            except (struct.error, ValueError) as error:
+                raise ProtocolError(f"{self.message.__name__}.{step.name}: {error}") from error
+            values.append(value)
+        if position != end:
+            raise ProtocolError(f"{self.message.__name__}: {end - position} bytes too many")
+        return self.message(*values)
+
+    def _encode_steps(self, message: M) -> bytes:
+        parts = []
+        for step in self._steps:
+            value = getattr(message, step.name)
+            if value is None:
+                break
+            try:
+                parts.append(step.encode(value))
+            except (struct.error, OverflowError, UnicodeEncodeError) as error:
+                raise EncodeError(f"{self.message.__name__}.{step.name}: {error}") from error
+        return b"".join(parts)
+
+
+class _Field(msgspec.Struct, frozen=True):
+    name: str
+    wire: WireType
+    optional: bool
+
+
+class _Step:
+    """One field of a message whose length is not fixed."""
+
+    def __init__(self, field: _Field) -> None:
+        self.name = field.name
+        self.optional = field.optional
+        self.decode, self.encode = _CODERS[type(field.wire)](field.wire)
+
+
+def _declared(message: type[Message]) -> list[_Field]:
+    hints = get_type_hints(message, include_extras=True)
+    return [
+        _field(field.name, hints[field.name], field.default is not msgspec.NODEFAULT)
+        for field in msgspec.structs.fields(message)
+    ]
+
+
+def _field(name: str, hint: Any, has_default: bool) -> _Field:
+    for candidate in (hint, *get_args(hint)):
+        for extra in getattr(candidate, "__metadata__", ()):
+            if isinstance(extra, WireType):
+                return _Field(name, extra, has_default)
+    raise TypeError(f"{name}: {hint} is no wire type")
+
+
+def _all_scalars(fields: Sequence[_Field]) -> str | None:
+    codes = [field.wire.code for field in fields if isinstance(field.wire, Scalar) and not field.optional]
+    return "".join(codes) if len(codes) == len(fields) else None
+
+
+def _fixed_decoder(message: type[M], layout: struct.Struct) -> Callable[[bytes, int], M]:
+    unpack, size = layout.unpack_from, layout.size
+
+    def decode(data: bytes, start: int) -> M:
+        if len(data) - start != size:
+            raise ProtocolError(f"{message.__name__} of {len(data) - start} bytes, expected {size}")
+        return message(*unpack(data, start))
+
+    return decode
+
+
+def _scalar(wire: Scalar) -> tuple[Decode, Encode]:
+    layout = struct.Struct("<" + wire.code)
+
+    def decode(data: bytes, position: int) -> tuple[Any, int]:
+        return layout.unpack_from(data, position)[0], position + layout.size
+
+    return decode, layout.pack
+
+
+def _counted(count_code: str, item_size: int) -> tuple[Callable[[bytes, int], tuple[int, int]], struct.Struct]:
+    count = struct.Struct("<" + count_code)
+
+    def span(data: bytes, position: int) -> tuple[int, int]:
+        (items,) = count.unpack_from(data, position)
+        first = position + count.size
+        if items < 0 or first + items * item_size > len(data):
+            raise ProtocolError(f"count {items} does not fit the {len(data) - first} bytes that follow")
+        return first, first + items * item_size
+
+    return span, count
+
+
+def _counted_bytes(wire: CountedBytes) -> tuple[Decode, Encode]:
+    span, count = _counted(wire.count_code, 1)
+
+    def decode(data: bytes, position: int) -> tuple[bytes, int]:
+        first, end = span(data, position)
+        return data[first:end], end
+
+    def encode(value: bytes) -> bytes:
+        return count.pack(len(value)) + value
+
+    return decode, encode
+
+
+def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
+    decode_bytes, encode_bytes = _counted_bytes(CountedBytes(wire.count_code))
+
+    def decode(data: bytes, position: int) -> tuple[str, int]:
+        raw, end = decode_bytes(data, position)
+        # A byte that is not ASCII shows as \xNN: people see the rest of the text, and nobody's session ends.
+        return raw.decode("ascii", "backslashreplace"), end
+
+    def encode(value: str) -> bytes:
+        return encode_bytes(value.encode("ascii"))
+
+    return decode, encode
+
+
+def _counted_array(wire: CountedArray) -> tuple[Decode, Encode]:
+    dtype = np.dtype(wire.dtype)
+    span, count = _counted(wire.count_code, dtype.itemsize)
+
+    def decode(data: bytes, position: int) -> tuple[Any, int]:
+        first, end = span(data, position)
+        return np.frombuffer(data, dtype, (end - first) // dtype.itemsize, first), end
+
+    def encode(value: Any) -> bytes:
+        return count.pack(len(value)) + np.ascontiguousarray(value, dtype).tobytes()
+
+    return decode, encode
+
+
+def _remainder(wire: Remainder) -> tuple[Decode, Encode]:
+    return (lambda data, position: (data[position:], len(data))), bytes
+
+
+_CODERS: dict[type[Any], Callable[[Any], tuple[Decode, Encode]]] = {
+    Scalar: _scalar,
+    CountedText: _counted_text,
+    CountedBytes: _counted_bytes,
+    CountedArray: _counted_array,
+    Remainder: _remainder,
+}

@@ -1,0 +1,55 @@
+"""Cuts a byte stream into frames with a protocol's pure framing function, in bounded memory. Sans-IO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from zbridge.errors import ProtocolError
+
+FrameEnd = Callable[[bytes, int], int]
+"""``frame_end(data, start)``: the offset just behind the frame that begins at ``start``, as far as ``data`` tells.
+
+An offset beyond ``len(data)`` says that at least so many bytes are needed. It is always greater than
+``start``. Raises ProtocolError where no frame can begin like this.
+"""
+
+
+class FrameBuffer:
+    """Keeps the incomplete frame between reads; never holds more than ``limit`` bytes of it."""
+
+    __slots__ = ("_frame_end", "_limit", "_needed", "_rest")
+
+    def __init__(self, frame_end: FrameEnd, limit: int) -> None:
+        self._frame_end = frame_end
+        self._limit = limit
+        self._rest = bytearray()
+        self._needed = 0
+
+    def __len__(self) -> int:
+        return len(self._rest)
+
+    def __repr__(self) -> str:
+        return f"<FrameBuffer {len(self._rest)} of {self._needed} bytes, limit {self._limit}>"
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """Yield every frame that ``data`` completes; raise ProtocolError at a frame that cannot be.
+
+        The frames before a broken one are yielded first. After an error the buffer is of no further use.
+        """
+        if self._rest:
+            self._rest += data
+            if len(self._rest) < self._needed:
+                return
+            data = bytes(self._rest)
+            self._rest.clear()
+        frame_end, start, size = self._frame_end, 0, len(data)
+        while start < size:
+            end = frame_end(data, start)
+            if end - start > self._limit:
+                raise ProtocolError(f"frame of {end - start} bytes exceeds {self._limit}")
+            if end > size:
+                self._rest += data[start:]
+                self._needed = end - start
+                return
+            yield data[start:end]
+            start = end

@@ -1,0 +1,195 @@
+"""A bus inside one process, for tests: the same interface, key matching as Zenoh's, no threads, no delays.
+
+Handlers are called on the spot. Publishers keep what was put, so that a test may look at it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from zbridge.bus.interface import Answer, Entry, Handle, Publisher, Question, Sample
+from zbridge.fleet.topics import Topic
+
+H = TypeVar("H", bound=Handle)
+
+
+def matches(key_expr: str, key: str) -> bool:
+    """Tell whether a key expression matches a key; chunks that begin with ``@`` only match an equal chunk."""
+    return _match(key_expr.split("/"), key.split("/"))
+
+
+def _match(expression: list[str], chunks: list[str]) -> bool:
+    if not expression:
+        return not chunks
+    head, rest = expression[0], expression[1:]
+    if head == "**":
+        if _match(rest, chunks):
+            return True
+        return bool(chunks) and not chunks[0].startswith("@") and _match(expression, chunks[1:])
+    if not chunks:
+        return False
+    wild = head == "*" and not chunks[0].startswith("@")
+    return (wild or head == chunks[0]) and _match(rest, chunks[1:])
+
+
+class FakeBus:
+    """One of several sessions on a shared fake bus: ``FakeBus()`` makes the first, ``join()`` another."""
+
+    def __init__(self, zid: str = "1", shared: _Shared | None = None) -> None:
+        self._zid = zid
+        self._shared = shared or _Shared()
+        self._relief: list[Callable[[], None]] = []
+        self._connected: list[Callable[[bool], None]] = []
+        self._handles: list[Handle] = []
+        self.up = True
+        self.takes = True
+
+    def __repr__(self) -> str:
+        return f"<FakeBus {self._zid}>"
+
+    @property
+    def zid(self) -> str:
+        """The id of this session."""
+        return self._zid
+
+    def join(self, zid: str) -> FakeBus:
+        """Open another session on the same bus."""
+        return FakeBus(zid, self._shared)
+
+    def values(self, key_expr: str) -> list[bytes]:
+        """Give every payload that was put on matching keys, in order."""
+        return [sample.payload for sample in self._shared.history if matches(key_expr, sample.key)]
+
+    def connection(self, up: bool) -> None:
+        """Play the loss or the return of the bus."""
+        self.up = up
+        for handler in tuple(self._connected):
+            handler(up)
+
+    def relieve(self) -> None:
+        """Take what was too much before."""
+        self.takes = True
+        for handler in tuple(self._relief):
+            handler()
+
+    # The interface
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
+
+    def put_all(self, batch: Sequence[Entry]) -> bool:
+        for publisher, payload in batch:
+            publisher.put(payload)
+        return self.takes
+
+    def on_relief(self, handler: Callable[[], None]) -> None:
+        self._relief.append(handler)
+
+    def subscribe(
+        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+    ) -> Handle:
+        entry = (key_expr, handler)
+        self._shared.subscribers.append(entry)
+        if history:
+            for key, payload in tuple(self._shared.last.items()):
+                if matches(key_expr, key):
+                    handler(Sample(key, payload))
+        return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
+
+    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+        entry = (key, handler)
+        self._shared.queryables.append(entry)
+        return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        questions = []
+        for key, handler in tuple(self._shared.queryables):
+            if matches(key_expr, key):
+                questions.append(question := FakeQuestion(key, payload))
+                handler(question)
+        kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
+        return [reply for question in questions for reply in question.replies] + kept
+
+    def announce(self, key: str) -> Handle:
+        self._shared.tokens.append(key)
+        return self._keep(_FakeHandle(lambda: self._shared.tokens.remove(key)))
+
+    async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
+        return sorted({token for token in self._shared.tokens if matches(key_expr, token)})
+
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
+        publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
+        handler(any(matches(key_expr, key) for key_expr, _ in self._shared.subscribers))
+        return publisher, self._keep(_FakeHandle(lambda: None))
+
+    def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
+        self._connected.append(handler)
+        handler(self.up)
+        return self._keep(_FakeHandle(lambda: self._connected.remove(handler)))
+
+    async def close(self) -> None:
+        handles, self._handles = self._handles, []
+        for handle in handles:
+            handle.close()
+
+    def _keep(self, handle: H) -> H:
+        self._handles.append(handle)
+        return handle
+
+
+class _Shared:
+    """What all sessions of one fake bus see."""
+
+    def __init__(self) -> None:
+        self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
+        self.queryables: list[tuple[str, Callable[[Question], None]]] = []
+        self.tokens: list[str] = []
+        self.last: dict[str, bytes] = {}
+        self.history: list[Sample] = []
+
+
+class _FakeHandle:
+    def __init__(self, undo: Callable[[], None]) -> None:
+        self._undo: Callable[[], None] | None = undo
+
+    def close(self) -> None:
+        undo, self._undo = self._undo, None
+        if undo is not None:
+            undo()
+
+
+class _FakePublisher(_FakeHandle):
+    def __init__(self, key: str, shared: _Shared, *, keeps_last: bool) -> None:
+        super().__init__(self._forget)
+        self.key = key
+        self._shared = shared
+        self._keeps_last = keeps_last
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+        sample = Sample(self.key, payload, attachment)
+        self._shared.history.append(sample)
+        if self._keeps_last:
+            self._shared.last[self.key] = payload
+        for key_expr, handler in tuple(self._shared.subscribers):
+            if matches(key_expr, self.key):
+                handler(sample)
+
+    def _forget(self) -> None:
+        self._shared.last.pop(self.key, None)
+
+
+class FakeQuestion:
+    """A query whose answers a test may look at."""
+
+    def __init__(self, key: str, payload: bytes = b"") -> None:
+        self.key = key
+        self.payload = payload
+        self.attachment: bytes | None = None
+        self.replies: list[Answer] = []
+
+    def answer(self, payload: bytes) -> None:
+        self.replies.append(Answer(self.key, payload))
+
+    def refuse(self, reason: str) -> None:
+        self.replies.append(Answer(self.key, b"", reason))

@@ -23,14 +23,12 @@ class Conversation:
         *,
         deliver: Callable[[list[Any]], None],
         changed: Callable[[], None] = lambda: None,
-        tap: Callable[[str, bytes], None] | None = None,
     ) -> None:
         self.session = session
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._deliver = deliver
         self._changed = changed
-        self.tap = tap
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._seen = session.state
@@ -49,8 +47,6 @@ class Conversation:
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
         session = self.session
-        if self.tap is not None:
-            self.tap("in", data)
         messages = session.receive(data, self._loop.time())
         if session.state is not self._seen:
             self._notify()
@@ -77,10 +73,6 @@ class Conversation:
             frame = session.outgoing(now)
             if frame is None:
                 break
-            if self.tap is not None:
-                self.tap("out", frame)
-            if log.isEnabledFor(logging.DEBUG):
-                log.debug("> %s %s", session.name, frame[:64].hex(" "))
             link.write(frame)
         if session.state is not self._seen:
             self._notify()

@@ -24,7 +24,7 @@ from zbridge.protocol import Robot
 from zbridge.questions import Questions
 from zbridge.session.control import Authority
 from zbridge.session.manager import Backoff, SessionManager
-from zbridge.session.session import Session, State
+from zbridge.session.session import Session, State, Tap
 
 log = logging.getLogger("zbridge.device")
 
@@ -32,6 +32,7 @@ HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
 STOP_REPEAT_S = 1.0
 """Seconds for which a stop is repeated."""
+_LOGGED = 64
 _CONTROL_S = 0.05
 """Least time between two publications of ``control`` while refusals come in."""
 
@@ -45,14 +46,37 @@ _STATES: dict[State, RobotState] = {
 
 
 class _Endpoint:
-    """One configured address of the robot, and the conversation there when there is one."""
+    """One configured address of the robot, the conversation there when there is one, and who watches it."""
 
     def __init__(self, name: str, address: Address) -> None:
+        self.watchers: dict[str, Publisher] = {}
         self.name = name
         self.address = address
         self.state: RobotState = "offline"
         self.reason: str | None = "not yet connected"
         self.conversation: Conversation | None = None
+
+    def watch(self, direction: str, publisher: Publisher, *, watched: bool) -> None:
+        """Show raw frames of one direction from now on, or no more."""
+        if watched:
+            self.watchers[direction] = publisher
+        else:
+            self.watchers.pop(direction, None)
+        if self.conversation is not None:
+            self.conversation.session.tap = self.tap
+
+    @property
+    def tap(self) -> Tap | None:
+        """What shows the frames to whoever wants to see them; None while nobody does."""
+        debugging = log.isEnabledFor(logging.DEBUG)
+        return self._show if self.watchers or debugging else None
+
+    def _show(self, direction: str, frame: bytes) -> None:
+        if log.isEnabledFor(logging.DEBUG):
+            log.debug("%s %s %s", "<" if direction == "in" else ">", self.name, frame[:_LOGGED].hex(" "))
+        publisher = self.watchers.get(direction)
+        if publisher is not None:
+            publisher.put(frame)
 
     def status(self) -> LinkStatus:
         return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
@@ -107,6 +131,9 @@ class Device:
         self._bus.watch_connected(self._on_bus)
         for topic in (topics.RPC_MAP, topics.RPC_POSE):
             self._bus.answer(self._keys.key(topic.path), self._on_question)
+        for endpoint in self._endpoints:
+            for direction in ("in", "out"):
+                self._watch_frames(endpoint, direction)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._beat())
             for index, endpoint in enumerate(self._endpoints):
@@ -152,6 +179,7 @@ class Device:
         """Hold one conversation to its end; tell why it ended and whether it was ever established."""
         session = self._robot.session(index, str(endpoint.address))
         session.name = endpoint.name
+        session.tap = endpoint.tap
         conversation = Conversation(
             session, self._loop, deliver=self._deliver, changed=lambda: self._on_session(endpoint, session)
         )
@@ -221,6 +249,15 @@ class Device:
             for endpoint in self._endpoints:
                 if endpoint.conversation is not None:
                     endpoint.conversation.pause()
+
+    def _watch_frames(self, endpoint: _Endpoint, direction: str) -> None:
+        """Publish the raw frames of one direction while somebody listens."""
+        key = self._keys.key(f"@wire/{endpoint.name}/{direction}")
+
+        def listened(anybody: bool) -> None:
+            endpoint.watch(direction, publisher, watched=anybody)
+
+        publisher = self._bus.frames(key, listened)
 
     def _publish(self, topic: Topic, message: FleetMessage) -> None:
         publisher = self._publishers.get(topic.path) or self._declare(topic)

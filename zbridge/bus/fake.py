@@ -5,6 +5,7 @@ Handlers are called on the spot. Publishers keep what was put, so that a test ma
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -118,10 +119,11 @@ class FakeBus:
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         return sorted({token for token in self._shared.tokens if matches(key_expr, token)})
 
-    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
+    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
-        handler(any(matches(key_expr, key) for key_expr, _ in self._shared.subscribers))
-        return publisher, self._keep(_FakeHandle(lambda: None))
+        if any(matches(key_expr, key) for key_expr, _ in self._shared.subscribers):
+            asyncio.get_running_loop().call_soon(listened, True)
+        return publisher
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         self._connected.append(handler)

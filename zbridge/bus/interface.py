@@ -119,8 +119,8 @@ class Bus(Protocol):
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         """List the liveliness tokens that exist."""
 
-    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
-        """Declare a stream key and be told whether anybody listens to it."""
+    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
+        """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Be told when the first connection to the bus is made and when the last one is gone."""

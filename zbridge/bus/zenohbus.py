@@ -181,13 +181,16 @@ class ZenohBus:
         )
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
-    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> tuple[Publisher, Handle]:
-        """Declare a stream key and be told whether anybody listens to it."""
+    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
+        """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
         loop = self._loop
         plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-        listener = plain.declare_matching_listener(lambda status: loop.call_soon_threadsafe(handler, status.matching))
-        publisher = self._keep(_PlainPublisher(key, plain, None))
-        return publisher, self._keep(_Declared(listener))
+
+        def changed(status: zenoh.MatchingStatus) -> None:
+            loop.call_soon_threadsafe(listened, status.matching)
+
+        self._keep(_Declared(plain.declare_matching_listener(changed)))
+        return self._keep(_PlainPublisher(key, plain, None))
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Be told when the first connection to the bus is made and when the last one is gone."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from enum import Enum
 from typing import Generic, TypeVar
 
@@ -20,6 +21,9 @@ from zbridge.session.outbox import Outbox
 from zbridge.wire.frames import FrameBuffer, FrameEnd
 
 M = TypeVar("M")
+
+Tap = Callable[[str, bytes], None]
+"""``tap("in" or "out", frame)``: is shown every frame while it is set."""
 
 LINGER_S = 0.5
 """Longest time a closing session waits for its last frames to be written."""
@@ -92,6 +96,7 @@ class Session(ABC, Generic[M]):
         self.traffic = Traffic()
         self.last_malformed: str | None = None
         self.outbox = Outbox(limits.gap_s)
+        self.tap: Tap | None = None
         self._frames = FrameBuffer(type(self).frame_end, limits.frame_bytes)
         self._limit_at = math.inf
 
@@ -137,12 +142,14 @@ class Session(ABC, Generic[M]):
         messages: list[M] = []
         if self.over:
             return messages
-        traffic, decode, accept = self.traffic, self.decode, self.accept
+        traffic, decode, accept, tap = self.traffic, self.decode, self.accept, self.tap
         traffic.bytes_in += len(data)
         frames = 0
         try:
             for frame in self._frames.feed(data):
                 frames += 1
+                if tap is not None:
+                    tap("in", frame)
                 try:
                     message = decode(frame)
                     if accept(message, now):
@@ -170,6 +177,8 @@ class Session(ABC, Generic[M]):
         if frame is not None:
             self.traffic.frames_out += 1
             self.traffic.bytes_out += len(frame)
+            if self.tap is not None:
+                self.tap("out", frame)
         elif self.state is State.CLOSING and not self.outbox:
             self.state = State.CLOSED
         return frame

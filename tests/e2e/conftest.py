@@ -1,0 +1,139 @@
+"""Real processes, real sockets, real Zenoh, all on loopback; every process is ended by its id."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgpack
+import pytest
+import zenoh
+
+T = TypeVar("T")
+WAIT_S = 10.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def until(condition: Callable[[], T], timeout_s: float = WAIT_S, what: str = "condition") -> T:
+    """Wait until ``condition()`` is true and give its value."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.01)
+    raise AssertionError(f"{what} not within {timeout_s} s")
+
+
+def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "zbridge", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        **popen,
+    )
+
+
+def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
+    """End a process by its id; give what it printed."""
+    if process.poll() is None:
+        process.send_signal(number)
+    try:
+        output, _ = process.communicate(timeout=5)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        output, _ = process.communicate()
+    return output
+
+
+class Fleet:
+    """A Zenoh session of the test, and what it saw."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.seen: dict[str, list[dict[str, Any]]] = {}
+        self._subscriber = session.declare_subscriber("fleet/**", self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        fields = msgpack.unpackb(sample.payload.to_bytes())
+        self.seen.setdefault(str(sample.key_expr), []).append({**fields, "at": time.monotonic()})
+
+    def last(self, path: str) -> dict[str, Any]:
+        return (self.seen.get(f"fleet/{path}") or [{}])[-1]
+
+    def get(self, key: str, timeout_s: float = 3.0) -> list[Any]:
+        """Plain get: the decoded replies, error texts as strings."""
+        return [
+            msgpack.unpackb(reply.ok.payload.to_bytes()) if reply.ok else reply.err.payload.to_string()
+            for reply in self.session.get(key, timeout=timeout_s)
+        ]
+
+    def put(self, path: str, **fields: Any) -> None:
+        self.session.put(f"fleet/{path}", msgpack.packb(fields), congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def tokens(self, key: str = "fleet/*/@alive/gateway") -> list[str]:
+        return [str(reply.ok.key_expr) for reply in self.session.liveliness().get(key, timeout=2) if reply.ok]
+
+    def state(self, robot: str) -> str | None:
+        return self.last(f"{robot}/status").get("state")
+
+
+class Bench:
+    """Everything a test starts."""
+
+    def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
+        self.folder = folder
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self._stack = stack
+        self.fleet = Fleet(self._stack.enter_context(self.router()))
+
+    def router(self) -> zenoh.Session:
+        config = zenoh.Config()
+        config.insert_json5("mode", '"router"')
+        config.insert_json5("listen/endpoints", f'["{self.endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        return zenoh.open(config)
+
+    def zbridge(self, *arguments: str, **popen: Any) -> subprocess.Popen[str]:
+        process = start(*arguments, **popen)
+        self._stack.callback(end, process, signal.SIGKILL)
+        return process
+
+    def simulator(self, port: int, protocol: str = "tcpudp", *more: str) -> subprocess.Popen[str]:
+        process = self.zbridge("simulate", protocol, "--listen", f"tcp://127.0.0.1:{port}", *more)
+        assert process.stdout is not None
+        assert "listening" in process.stdout.readline()
+        return process
+
+    def configuration(self, robot: str, port: int, more: str = "") -> Path:
+        file = self.folder / f"{robot}.toml"
+        file.write_text(
+            f'[robot]\nname = "{robot}"\n'
+            f'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{port}"]\n'
+            f'[bus]\nconnect = ["{self.endpoint}"]\nmulticast = false\n{more}'
+        )
+        return file
+
+    def gateway(self, robot: str, port: int, more: str = "") -> subprocess.Popen[str]:
+        return self.zbridge("run", str(self.configuration(robot, port, more)))
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with contextlib.ExitStack() as stack:
+        yield Bench(tmp_path, stack)

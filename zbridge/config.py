@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from zbridge.bus import BusSettings
 from zbridge.errors import ConfigError, LinkError
@@ -97,7 +98,10 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
         if not is_name(name):
             raise ConfigError(f"{key} = {name!r}: expected letters, digits, '_', '.' and '-' only")
-    protocol = find_protocol(config.device.protocol)
+    try:
+        protocol = find_protocol(config.device.protocol)
+    except ConfigError as error:
+        raise ConfigError(f"device.{error}") from error
     options = _convert(config.device.options, protocol.options, "device.options.")
     addresses = tuple(_address("device.connect", text) for text in config.device.connect)
     if len(addresses) > protocol.links:
@@ -136,28 +140,60 @@ def _convert(raw: Any, kind: type[T], prefix: str) -> T:
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(_explain(raw, str(error), prefix)) from error
+        raise ConfigError(prefix + _explain(raw, kind, str(error))) from error
 
 
-def _explain(raw: Any, text: str, prefix: str) -> str:
+def _explain(raw: Any, kind: type[Any], text: str) -> str:
     """Turn msgspec's message into ``key = value: what was expected``."""
     match = _PATH.search(text)
     path = (match["path"] or match["index"] or "") if match else ""
     what = text[: match.start()] if match else text
-    unknown = re.match(r"Object contains unknown field `(.+)`", what)
-    if unknown:
-        path, what = f"{path}.{unknown[1]}" if path else unknown[1], "unknown key"
-    missing = re.match(r"Object missing required field `(.+)`", what)
-    if missing:
-        path, what = f"{path}.{missing[1]}" if path else missing[1], "missing; it is required"
-        return f"{prefix}{path}: {what}"
-    return f"{prefix}{path} = {_value(raw, path)!r}: {what[:1].lower()}{what[1:]}"
+    if unknown := re.match(r"Object contains unknown field `(.+)`", what):
+        known = ", ".join(_field_names(_type_at(kind, path)))
+        key = f"{path}.{unknown[1]}" if path else unknown[1]
+        return f"{key} = {_value(raw, key)!r}: unknown key; expected one of {known}"
+    if missing := re.match(r"Object missing required field `(.+)`", what):
+        return f"{path}.{missing[1]}: missing, it is required" if path else f"{missing[1]}: missing, it is required"
+    if what.startswith("Invalid enum value"):
+        at = _type_at(kind, path)
+        members = at.types if isinstance(at, inspect.UnionType) else (at,)
+        literals = [value for member in members if isinstance(member, inspect.LiteralType) for value in member.values]
+        what = f"expected one of {', '.join(map(repr, literals))}"
+    return f"{path} = {_value(raw, path)!r}: {what[:1].lower()}{what[1:]}"
+
+
+def _parts(path: str) -> list[str]:
+    return re.findall(r"[^.\[\]]+", path)
 
 
 def _value(raw: Any, path: str) -> Any:
-    for part in re.findall(r"[^.\[\]]+", path):
+    for part in _parts(path):
         try:
             raw = raw[int(part)] if isinstance(raw, list) else raw[part]
         except (KeyError, IndexError, TypeError, ValueError):
             return None
     return raw
+
+
+def _type_at(kind: type[Any], path: str) -> inspect.Type:
+    """Find the type that a path of a configuration is declared with."""
+    at = _plain_type(inspect.type_info(kind))
+    for part in _parts(path):
+        if isinstance(at, inspect.StructType):
+            fields = {field.encode_name: field.type for field in at.fields}
+            at = _plain_type(fields.get(part, inspect.AnyType()))
+        elif isinstance(at, inspect.VarTupleType | inspect.ListType):
+            at = _plain_type(at.item_type)
+    return at
+
+
+def _plain_type(at: inspect.Type) -> inspect.Type:
+    """Look through ``X | None``."""
+    if isinstance(at, inspect.UnionType):
+        types = [member for member in at.types if not isinstance(member, inspect.NoneType)]
+        return types[0] if len(types) == 1 else at
+    return at
+
+
+def _field_names(at: inspect.Type) -> list[str]:
+    return [field.encode_name for field in at.fields] if isinstance(at, inspect.StructType) else []

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import msgspec
 
 from zbridge.fleet.topics import Topic
+
+Endpoint = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]+/[^ ]+$")]
+"""Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
 
 
 class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -22,8 +25,8 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The ``[bus]`` table of a configuration."""
 
     mode: Literal["peer", "client", "router"] | None = None
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ()
+    connect: tuple[Endpoint, ...] = ()
+    listen: tuple[Endpoint, ...] = ()
     multicast: bool = True
     stream: Literal["drop", "block"] = "drop"
     tls: Tls | None = None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -25,6 +26,8 @@ from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
 from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
+
+_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
@@ -64,7 +67,7 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zeno
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise BusError(f"{key} = {value!r}: {error}") from error
+            raise BusError(f"{key} = {value!r}: {_ORIGIN.sub('', str(error))}") from error
     return config
 
 
@@ -74,7 +77,7 @@ async def open_zenoh(settings: BusSettings, metrics: Metrics, *, wait_for_peers:
     try:
         session = await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
-        raise BusError(str(error).split("  at ")[0]) from error
+        raise BusError(_ORIGIN.sub("", str(error))) from error
     return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
 
 
@@ -238,7 +241,7 @@ class ZenohBus:
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
-            raise BusError(str(error)) from error
+            raise BusError(_ORIGIN.sub("", str(error))) from error
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(done, timeout_s + 0.5)
         return list(replies)

@@ -33,6 +33,11 @@ from zbridge.protocol import protocol_names
 REFRESH_S = 0.5
 START_S = 20.0
 """Longest time a simulator may take to start."""
+REALM = "fleet"
+FIGURE_S = 2.0
+"""Seconds the robots go straight on, then turn, then go straight on."""
+NEUTRAL = payloads.encode(Drive())
+_OWN_DRIVES = (payloads.encode(Drive(forward=0.6)), payloads.encode(Drive(turn=0.5)), NEUTRAL)
 _RATES = ("pose", "map", "text")
 
 
@@ -90,7 +95,7 @@ async def run_demo(seconds: float) -> None:
         stack.push_async_callback(bus.close)
         for robot, protocol in robots.items():
             await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint))
-        bus.subscribe("fleet/*/*", watch.take)
+        bus.subscribe(f"{REALM}/*/*", watch.take)
         print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --connect {endpoint}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
         silent = [robot for robot, row in watch.rows.items() if row.pose is None]
@@ -160,19 +165,27 @@ async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> Async
 
 
 async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
-    """Drive the robots in circles and draw the table."""
-    drives = [
-        bus.publisher(KeySpace("fleet", robot).key(topics.CMD_DRIVE.path), topics.CMD_DRIVE) for robot in watch.rows
-    ]
+    """Draw the table, and drive the robots about until somebody else does."""
+    drives = {
+        robot: bus.publisher(KeySpace(REALM, robot).key(topics.CMD_DRIVE.path), topics.CMD_DRIVE)
+        for robot in watch.rows
+    }
+
+    def leave_alone(sample: Sample) -> None:
+        split = split_key(sample.key)
+        if split is not None and sample.payload not in _OWN_DRIVES:
+            drives.pop(split[1], None)
+
+    for robot in drives:
+        bus.subscribe(KeySpace(REALM, robot).key(topics.CMD_DRIVE.path), leave_alone)
     loop = asyncio.get_running_loop()
     started = loop.time()
     with Live(console=Console(), auto_refresh=False) as live:
         while not seconds or loop.time() - started < seconds:
             await asyncio.sleep(REFRESH_S)
-            elapsed = loop.time() - started
-            forward = 0.6 if int(elapsed) % 4 < 2 else 0.0
-            for drive in drives:
-                drive.put(payloads.encode(Drive(forward=forward, turn=0.0 if forward else 0.5)))
+            figure = _OWN_DRIVES[int((loop.time() - started) / FIGURE_S) % 2]
+            for drive in drives.values():
+                drive.put(figure)
             live.update(watch.table(REFRESH_S), refresh=True)
-    for drive in drives:
-        drive.put(payloads.encode(Drive()))
+    for drive in drives.values():
+        drive.put(NEUTRAL)

@@ -1,6 +1,7 @@
 """The command line: ``zbridge run``, ``check``, ``init``, ``simulate``, ``demo``, ``ls``, ``echo``, ``stop``.
 
-Only this package imports typer and rich. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
+Only this package imports typer and rich, and this module does not: a gateway runs for months, and carries none
+of the command line's libraries. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
 """
 
 from __future__ import annotations
@@ -10,172 +11,52 @@ import logging
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Any, NoReturn
 
-import typer
-
-from zbridge.bus import BusSettings
-from zbridge.config import Plan, load
+from zbridge.config import load
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.gateway import Gateway, until_signal
-from zbridge.link import Address
-from zbridge.protocol import Simulation, find_protocol, protocol_names
 
-app = typer.Typer(
-    help=__doc__.splitlines()[0] if __doc__ else None,
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
-
-File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
-Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
-Connect = Annotated[
-    list[str],
-    typer.Option(
-        help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
-        envvar="ZBRIDGE_CONNECT",
-        show_default=False,
-    ),
-]
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
+"""Where commands look for a router, and the demo opens one."""
 
 
 def main() -> None:
     """Run the command line; errors of zbridge's own become one line on stderr."""
     try:
-        app()
+        match sys.argv[1:]:
+            case ["run", file] if not file.startswith("-"):
+                run_gateway(Path(file))
+            case _:
+                from zbridge.cli.app import app
+
+                app()
     except ConfigError as error:
-        _exit(2, error)
+        give_up(2, error)
     except ZbridgeError as error:
-        _exit(1, error)
+        give_up(1, error)
 
 
-def run_only(protocol: str) -> NoReturn:
+def run_only(protocol: str) -> None:
     """Run ``python -m gateways.<protocol> FILE``: a gateway of that protocol and no other."""
-    _log(verbose=False)
-    if len(sys.argv) != 2:
-        _exit(2, f"usage: python -m gateways.{protocol} FILE")
     try:
-        plan = load(Path(sys.argv[1]))
-        if plan.protocol.name != protocol:
-            raise ConfigError(f"{sys.argv[1]}: device.protocol = {plan.protocol.name!r}: expected {protocol!r}")
-        _run_gateway(plan)
+        if len(sys.argv) != 2:
+            raise ConfigError(f"usage: python -m gateways.{protocol} FILE")
+        run_gateway(Path(sys.argv[1]), only=protocol)
     except ConfigError as error:
-        _exit(2, error)
-    sys.exit(0)
+        give_up(2, error)
 
 
-@app.command()
-def run(file: File, verbose: Verbose = False) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT."""
-    _log(verbose=verbose)
-    _run_gateway(load(file))
-
-
-@app.command()
-def check(file: File) -> None:
-    """Check a configuration and say what it would do."""
+def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -> None:
+    """Run the gateway of a configuration until SIGTERM or SIGINT."""
+    set_up_log(verbose=verbose)
     plan = load(file)
-    robot, device = plan.config.robot, plan.config.device
-    typer.echo(
-        f"{file}: ok: {robot.realm}/{robot.name}, {device.protocol} at "
-        f"{', '.join(map(str, plan.addresses))}, bus as {plan.config.bus.effective_mode}"
-    )
+    if only is not None and plan.protocol.name != only:
+        raise ConfigError(f"{file}: device.protocol = {plan.protocol.name!r}: expected {only!r}")
+    run_loop(until_signal(Gateway(plan).run()))
 
 
-@app.command()
-def init(
-    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    name: Annotated[str, typer.Option(help="the robot's name on the bus")] = "r1",
-) -> None:
-    """Print a commented configuration to start from."""
-    typer.echo(find_protocol(protocol).template.replace("{name}", name), nl=False)
-
-
-@app.command()
-def simulate(
-    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    listen: Annotated[str, typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one")],
-    seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
-    verbose: Verbose = False,
-) -> None:
-    """Be a robot to play with, until SIGTERM or SIGINT."""
-    _log(verbose=verbose)
-    simulated = find_protocol(protocol)
-    simulation = Simulation(
-        Address.parse(listen),
-        seed,
-        lambda address: print(f"listening on {address}", flush=True),  # noqa: T201
-    )
-    _run(until_signal(simulated.simulate(simulation)))
-
-
-@app.command()
-def demo(
-    seconds: Annotated[float, typer.Option(help="end after so many seconds; 0: until interrupted")] = 0.0,
-) -> None:
-    """Show a simulated robot, its gateway, a router and a live table; loopback only."""
-    from zbridge.cli.demo import run_demo
-
-    _log(verbose=False, level=logging.WARNING)
-    _run(run_demo(seconds))
-
-
-@app.command()
-def ls(
-    connect: Connect = [],  # noqa: B006
-    realm: Realm = "fleet",
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
-) -> None:
-    """List the robots on the bus."""
-    from zbridge.cli import bus
-
-    _run(bus.list_robots(client_settings(connect), realm, as_json=json))
-
-
-@app.command()
-def echo(
-    key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
-    connect: Connect = [],  # noqa: B006
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
-    count: Annotated[int, typer.Option(help="end after so many messages; 0: until interrupted")] = 0,
-) -> None:
-    """Print what comes on a key, decoded."""
-    from zbridge.cli import bus
-
-    _run(until_signal(bus.echo(client_settings(connect), key, as_json=json, count=count)))
-
-
-@app.command()
-def stop(
-    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
-    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
-    connect: Connect = [],  # noqa: B006
-    realm: Realm = "fleet",
-) -> None:
-    """Stop a robot, or all of them; open to everyone who can write the key."""
-    from zbridge.cli import bus
-
-    if bool(robot) == everything:
-        _exit(2, "name one ROBOT, or give --all")
-    if not _run(bus.stop(client_settings(connect), realm, robot or None)):
-        raise typer.Exit(1)
-
-
-def client_settings(connect: list[str]) -> BusSettings:
-    """Choose how a command joins the bus: the given endpoints, else multicast and the local router."""
-    if connect:
-        return BusSettings(connect=tuple(connect), multicast=False)
-    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,))
-
-
-def _run_gateway(plan: Plan) -> None:
-    _run(until_signal(Gateway(plan).run()))
-
-
-def _run(work: Coroutine[Any, Any, Any]) -> Any:
+def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
     """Run a coroutine on uvloop where the platform has it."""
     try:
         import uvloop
@@ -184,7 +65,8 @@ def _run(work: Coroutine[Any, Any, Any]) -> Any:
     return uvloop.run(work)
 
 
-def _log(*, verbose: bool, level: int = logging.INFO) -> None:
+def set_up_log(*, verbose: bool, level: int = logging.INFO) -> None:
+    """Log to stderr; ``verbose`` shows every frame."""
     logging.basicConfig(
         level=logging.DEBUG if verbose else level,
         format="%(asctime)s %(levelname)-7s %(name)s: %(message)s",
@@ -192,6 +74,7 @@ def _log(*, verbose: bool, level: int = logging.INFO) -> None:
     )
 
 
-def _exit(code: int, text: object) -> NoReturn:
-    typer.echo(f"zbridge: {text}", err=True)
+def give_up(code: int, text: object) -> NoReturn:
+    """End the process with one line on stderr."""
+    print(f"zbridge: {text}", file=sys.stderr)  # noqa: T201
     sys.exit(code)

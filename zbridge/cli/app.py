@@ -1,0 +1,139 @@
+"""Put robots that speak legacy protocols on a Zenoh bus, see them there, and stop them."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zbridge.bus import BusSettings
+from zbridge.cli import LOCAL_ROUTER, give_up, run_gateway, run_loop, set_up_log
+from zbridge.config import load
+from zbridge.gateway import until_signal
+from zbridge.link import Address
+from zbridge.protocol import Simulation, find_protocol, protocol_names
+
+app = typer.Typer(
+    help=__doc__,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
+Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
+Connect = Annotated[
+    list[str],
+    typer.Option(
+        help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
+        envvar="ZBRIDGE_CONNECT",
+        show_default=False,
+    ),
+]
+
+
+@app.command()
+def run(file: File, verbose: Verbose = False) -> None:
+    """Run a gateway in the foreground until SIGTERM or SIGINT."""
+    run_gateway(file, verbose=verbose)
+
+
+@app.command()
+def check(file: File) -> None:
+    """Check a configuration and say what it would do."""
+    plan = load(file)
+    robot, device = plan.config.robot, plan.config.device
+    typer.echo(
+        f"{file}: ok: {robot.realm}/{robot.name}, {device.protocol} at "
+        f"{', '.join(map(str, plan.addresses))}, bus as {plan.config.bus.effective_mode}"
+    )
+
+
+@app.command()
+def init(
+    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    name: Annotated[str, typer.Option(help="the robot's name on the bus")] = "r1",
+) -> None:
+    """Print a commented configuration to start from."""
+    typer.echo(find_protocol(protocol).template.replace("{name}", name), nl=False)
+
+
+@app.command()
+def simulate(
+    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    listen: Annotated[str, typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one")],
+    seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
+    verbose: Verbose = False,
+) -> None:
+    """Be a robot to play with, until SIGTERM or SIGINT."""
+    set_up_log(verbose=verbose)
+    simulated = find_protocol(protocol)
+    simulation = Simulation(
+        Address.parse(listen),
+        seed,
+        lambda address: print(f"listening on {address}", flush=True),  # noqa: T201
+    )
+    run_loop(until_signal(simulated.simulate(simulation)))
+
+
+@app.command()
+def demo(
+    seconds: Annotated[float, typer.Option(help="end after so many seconds; 0: until interrupted")] = 0.0,
+) -> None:
+    """Show a simulated robot, its gateway, a router and a live table; loopback only."""
+    from zbridge.cli.demo import run_demo
+
+    set_up_log(verbose=False, level=logging.WARNING)
+    run_loop(run_demo(seconds))
+
+
+@app.command()
+def ls(
+    connect: Connect = [],
+    realm: Realm = "fleet",
+    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
+) -> None:
+    """List the robots on the bus."""
+    from zbridge.cli import bus
+
+    run_loop(bus.list_robots(client_settings(connect), realm, as_json=json))
+
+
+@app.command()
+def echo(
+    key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
+    connect: Connect = [],
+    json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
+    count: Annotated[int, typer.Option(help="end after so many messages; 0: until interrupted")] = 0,
+) -> None:
+    """Print what comes on a key, decoded."""
+    from zbridge.cli import bus
+
+    run_loop(until_signal(bus.echo(client_settings(connect), key, as_json=json, count=count)))
+
+
+@app.command()
+def stop(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
+    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    connect: Connect = [],
+    realm: Realm = "fleet",
+) -> None:
+    """Stop a robot, or all of them; open to everyone who can write the key."""
+    from zbridge.cli import bus
+
+    if bool(robot) == everything:
+        give_up(2, "name one ROBOT, or give --all")
+    if not run_loop(bus.stop(client_settings(connect), realm, robot or None)):
+        raise typer.Exit(1)
+
+
+def client_settings(connect: list[str]) -> BusSettings:
+    """Choose how a command joins the bus: the given endpoints, else multicast and the local router."""
+    if connect:
+        return BusSettings(connect=tuple(connect), multicast=False)
+    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,))

@@ -13,11 +13,12 @@ from typing import ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from gateways.tcpudp.settings import Feature
+from zbridge.errors import EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
-MAX_FRAME = 4 * 2**20
-"""Bytes of the longest packet that is taken: a map of 2048 x 2048."""
+MAX_FRAME = 4 * 2**20 + 64
+"""Bytes of the longest packet that is taken: a map of 2048 x 2048 with its header."""
 HEADER = struct.Struct("<iBB")
 SERVER_ID = 1
 """The ``id`` byte of every packet from the robot."""
@@ -37,18 +38,6 @@ class Carrier(Enum):
     TCP = "tcp"
     UDP = "udp"
     UDP_IF_AGREED = "udp*"
-
-
-class Feature(Enum):
-    """The flags of the settings block, in their order on the wire."""
-
-    UDP = "udp"
-    CAM = "cam"
-    JOYSTICK = "joystick"
-    CHAT = "chat"
-    LIDAR = "lidar"
-    LIDAR_SIM = "lidar_sim"
-    SLAM_MAP = "slam_map"
 
 
 class Packet(Message, frozen=True):
@@ -105,38 +94,19 @@ class DebugMessage(Packet, frozen=True):
 
 @packet(2, "serverSettings", Sender.ROBOT)
 class ServerSettings(Packet, frozen=True):
-    """The robot speaks first. What its newest listed version does not have is missing at the end.
-
-    slam_map_size and slam_map_interval are in the robot's length unit.
-    """
+    """The robot speaks first. ``block`` is the settings block of the newest version listed."""
 
     client_id: U8
     versions: Text
-    udp: Bool
-    cam: Bool
-    joystick: Bool
-    chat: Bool
-    lidar: Bool
-    lidar_sim: Bool | None = None
-    slam_map: Bool | None = None
-    slam_map_size: I32 | None = None
-    slam_map_interval: I32 | None = None
-    tail: Rest = b""
+    block: Rest
 
 
 @packet(3, "clientSettings", Sender.HQ)
 class ClientSettings(Packet, frozen=True):
-    """The HQ's answer."""
+    """The HQ's answer. ``block`` is the settings block of the newest version listed."""
 
     versions: Text
-    udp: Bool
-    cam: Bool
-    joystick: Bool
-    chat: Bool
-    lidar: Bool
-    lidar_sim: Bool | None = None
-    slam_map: Bool | None = None
-    tail: Rest = b""
+    block: Rest
 
 
 @packet(4, "serverStartUDP", Sender.ROBOT)
@@ -233,9 +203,9 @@ class ClientGetSLAMMap(Packet, frozen=True):
 
 @packet(53, "servertSLAMMap", Sender.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMap(Packet, frozen=True):
-    """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y; empty: no map yet."""
+    """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. None or empty: no map yet."""
 
-    cells: Blob
+    cells: Blob | None = None
 
 
 @packet(54, "clientGetPosition", Sender.HQ, needs=_MAPPING)
@@ -252,6 +222,19 @@ class ServerPosition(Packet, frozen=True):
     heading_deg: F32
 
 
+@packet(56, "servertSLAMMapPart", Sender.ROBOT, Carrier.UDP_IF_AGREED)
+class ServerSLAMMapPart(Packet, frozen=True):
+    """Cells ``start`` to ``end`` (exclusive) of the map; sent by robots that list "1.4", one a second."""
+
+    start: I32
+    end: I32
+    cells: Rest
+
+    def check(self) -> None:
+        if self.start < 0 or self.end - self.start != len(self.cells):
+            raise ProtocolError(f"map part {self.start} to {self.end} with {len(self.cells)} cells")
+
+
 @packet(60, "serverGetSimulatedLidarData", Sender.ROBOT)
 class ServerGetSimulatedLidarData(Packet, frozen=True):
     """The robot asks for simulated lidar data."""
@@ -262,6 +245,12 @@ class ClientSimulatedLidarData(Packet, frozen=True, eq=False):
     """float32[360] ranges in the robot's length unit, index = degree."""
 
     ranges: F32Array
+
+
+_MAP_ID, _POSITION_ID = ServerSLAMMap.spec.id, ServerPosition.spec.id
+_POSITION_BYTES = HEADER.size + 12
+_MAP_OF_8 = 8
+"""The only count with which twelve bytes of body are a map."""
 
 
 class OpaquePacket(Packet, frozen=True):
@@ -287,12 +276,35 @@ def encode_packet(message: Packet, sender_id: int) -> bytes:
         packet_id, body = message.id, message.body
     else:
         packet_id, body = message.spec.id, message.spec.codec.encode(message)
-    return HEADER.pack(2 + len(body), sender_id, packet_id) + body
+    try:
+        return HEADER.pack(2 + len(body), sender_id, packet_id) + body
+    except struct.error as error:
+        raise EncodeError(f"packet {packet_id} from {sender_id}: {error}") from error
+
+
+def read_header(frame: bytes) -> tuple[int, int]:
+    """Read the ``id`` byte and the packet id of one whole packet; raise ProtocolError where its length lies."""
+    if len(frame) < HEADER.size:
+        raise ProtocolError(f"packet of {len(frame)} bytes, expected at least {HEADER.size}")
+    length, sender_id, packet_id = HEADER.unpack_from(frame)
+    if length + 4 != len(frame):
+        raise ProtocolError(f"length {length} in a packet of {len(frame)} bytes")
+    return sender_id, packet_id
 
 
 def decode_packet(frame: bytes) -> Packet:
-    """Read a packet, header included; raise ProtocolError for a body that is not what its id says."""
-    spec = PACKETS.get(frame[5])
+    """Read one whole packet; raise ProtocolError for a header or a body that is not what it says."""
+    return decode_body(read_header(frame)[1], frame)
+
+
+def decode_body(packet_id: int, frame: bytes) -> Packet:
+    """Read the body of a packet whose header is read already.
+
+    Some robots answer 54 with id 53 and three floats ("The gateway as HQ"): that is a position.
+    """
+    if packet_id == _MAP_ID and len(frame) == _POSITION_BYTES and int.from_bytes(frame[6:10], "little") != _MAP_OF_8:
+        packet_id = _POSITION_ID
+    spec = PACKETS.get(packet_id)
     if spec is None:
-        return OpaquePacket(frame[5], frame[HEADER.size :])
+        return OpaquePacket(packet_id, frame[HEADER.size :])
     return spec.codec.decode(frame, HEADER.size)

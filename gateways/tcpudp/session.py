@@ -14,15 +14,16 @@ from gateways.tcpudp.messages import (
     SERVER_ID,
     ClientSettings,
     DebugMessage,
-    Feature,
     OpaquePacket,
     Packet,
     Sender,
     ServerSettings,
-    decode_packet,
+    decode_body,
     encode_packet,
     frame_end,
+    read_header,
 )
+from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, Settings13, read_settings
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.session.negotiation import agree, parse_versions
 from zbridge.session.session import Limits, Role, Session
@@ -34,16 +35,7 @@ LISTED = "1.1,1.2,1.3"
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
 HANDSHAKE_S = 5.0
-ANNOUNCED = ClientSettings(
-    versions=LISTED,
-    udp=False,
-    cam=False,
-    joystick=False,
-    chat=False,
-    lidar=False,
-    lidar_sim=True,
-    slam_map=False,
-)
+ANNOUNCED = Settings13(lidar_sim=True)
 """What deployed HQ programs of version 1.3 announce (UDP aside): robots are known to take it."""
 
 
@@ -63,11 +55,12 @@ class _TcpUdpSession(Session[Packet]):
         return encode_packet(message, self.sender_id)
 
     def decode(self, frame: bytes) -> Packet:
-        self.check_sender(frame[4])
-        spec = PACKETS.get(frame[5])
+        sender_id, packet_id = read_header(frame)
+        self.check_sender(sender_id)
+        spec = PACKETS.get(packet_id)
         if spec is not None and spec.sender is self.sender:
-            raise ProtocolError(f"{spec.name} ({spec.id}) from the wrong side")
-        return decode_packet(frame)
+            raise ProtocolError(f"{spec.name} ({packet_id}) from the wrong side")
+        return decode_body(packet_id, frame)
 
     def check_sender(self, sender_id: int) -> None:
         """Raise ProtocolError for an ``id`` byte the peer may not use."""
@@ -89,7 +82,7 @@ class HqSession(_TcpUdpSession):
     def __init__(self, limits: Limits, *, force: Iterable[Feature | int] = ()) -> None:
         super().__init__(limits)
         self.sender_id = 0
-        self.settings: ServerSettings | None = None
+        self.settings: Settings | None = None
         self._force = frozenset(force)
         self._usable: frozenset[Feature | int] = self._force
 
@@ -133,38 +126,39 @@ class HqSession(_TcpUdpSession):
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
 
-    def _take_settings(self, settings: ServerSettings, now: float) -> None:
+    def _take_settings(self, message: ServerSettings, now: float) -> None:
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
-        self.settings, self.sender_id = settings, settings.client_id
-        version = agree(VERSIONS, parse_versions(settings.versions))
+        self.settings = read_settings(message.versions, message.block, ROBOT_BLOCKS)
+        self.sender_id = message.client_id
+        version = agree(VERSIONS, parse_versions(message.versions))
         if version is None:
-            self.refuse_versions(settings.versions, now)
+            self.refuse_versions(message.versions, now)
             return
-        announced = tuple(feature for feature in Feature if getattr(settings, feature.value))
-        self._usable = self._force.union(announced)
-        self.send(ANNOUNCED)
-        self.establish(version, tuple(feature.value for feature in announced))
+        self._usable = self._force.union(self.settings.features)
+        self.send(ClientSettings(LISTED, ANNOUNCED.encode()))
+        self.establish(version, tuple(feature.value for feature in self.settings.features))
 
 
 class RobotSession(_TcpUdpSession):
-    """We play the robot towards an HQ. ``settings`` is what we announce, client id included."""
+    """We play the robot towards an HQ: what we announce, and the id we give it."""
 
     role = Role.ROBOT
     sender = Sender.ROBOT
     sender_id = SERVER_ID
 
-    def __init__(self, limits: Limits, settings: ServerSettings) -> None:
+    def __init__(self, limits: Limits, settings: Settings, client_id: int) -> None:
         super().__init__(limits)
         self.settings = settings
-        self.client: ClientSettings | None = None
+        self.client_id = client_id
+        self.client: Settings | None = None
 
     def opened(self, now: float) -> None:
-        self.send(self.settings)
+        self.send(ServerSettings(self.client_id, LISTED, self.settings.encode()))
 
     def check_sender(self, sender_id: int) -> None:
-        if sender_id not in (0, self.settings.client_id):
-            raise ProtocolError(f"packet with id {sender_id}, this client's is {self.settings.client_id}")
+        if sender_id not in (0, self.client_id):
+            raise ProtocolError(f"packet with id {sender_id}, this client's is {self.client_id}")
 
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientSettings):
@@ -174,13 +168,12 @@ class RobotSession(_TcpUdpSession):
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         return True
 
-    def _take_settings(self, client: ClientSettings, now: float) -> None:
+    def _take_settings(self, message: ClientSettings, now: float) -> None:
         if self.client is not None:
             raise ProtocolError("clientSettings a second time")
-        self.client = client
-        version = agree(VERSIONS, parse_versions(client.versions))
+        self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
+        version = agree(VERSIONS, parse_versions(message.versions))
         if version is None:
-            self.refuse_versions(client.versions, now)
+            self.refuse_versions(message.versions, now)
         else:
-            features = tuple(feature.value for feature in Feature if getattr(client, feature.value))
-            self.establish(version, features)
+            self.establish(version, tuple(feature.value for feature in self.client.features))

@@ -30,10 +30,10 @@ from gateways.tcpudp.messages import (
     ServerGetSimulatedLidarData,
     ServerLidarStatus,
     ServerPosition,
-    ServerSettings,
     ServerSLAMMap,
 )
-from gateways.tcpudp.session import LISTED, RobotSession, limits
+from gateways.tcpudp.session import RobotSession, limits
+from gateways.tcpudp.settings import RobotSettings13
 from zbridge.conversation import Conversation
 from zbridge.errors import Refused
 from zbridge.link import Address, Link, listen
@@ -59,6 +59,16 @@ LIDAR_RANGE_M = 4.0
 _DEGREES = np.radians(np.arange(360.0))
 _POSE_EVERY, _MAP_EVERY, _ASK_EVERY = 5, 50, 50
 CLIENTS = range(2, 256)
+SETTINGS = RobotSettings13(
+    cam=True,
+    joystick=True,
+    chat=True,
+    lidar=True,
+    lidar_sim=True,
+    slam_map=True,
+    slam_map_size=SIDE * CELL,
+    slam_map_interval=CELL,
+)
 
 
 class Vehicle:
@@ -171,7 +181,7 @@ class Simulator:
         client_id = next((free for free in CLIENTS if free not in self._peers), None)
         if client_id is None:
             return None
-        session = RobotSession(limits(0.0), _settings(client_id))
+        session = RobotSession(limits(0.0), SETTINGS, client_id)
         session.name = f"hq {client_id}"
         conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
         conversation.ended.add_done_callback(lambda _: self._peers.pop(client_id, None))
@@ -237,22 +247,6 @@ class _Peer:
     def writable(self) -> None:
         if self._conversation is not None:
             self._conversation.writable()
-
-
-def _settings(client_id: int) -> ServerSettings:
-    return ServerSettings(
-        client_id=client_id,
-        versions=LISTED,
-        udp=False,
-        cam=True,
-        joystick=True,
-        chat=True,
-        lidar=True,
-        lidar_sim=True,
-        slam_map=True,
-        slam_map_size=SIDE * CELL,
-        slam_map_interval=CELL,
-    )
 
 
 def _send(conversation: Conversation, message: Packet) -> None:

@@ -26,17 +26,16 @@ from gateways.tcpudp.messages import (
     ClientMoveAI,
     ClientSimulatedLidarData,
     DebugMessage,
-    Feature,
     OpaquePacket,
     Packet,
     ServerCamMode,
     ServerGetSimulatedLidarData,
     ServerLidarStatus,
     ServerPosition,
-    ServerSettings,
     ServerSLAMMap,
 )
 from gateways.tcpudp.session import HqSession, limits
+from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
@@ -115,16 +114,17 @@ class TcpUdpRobot(Robot):
     def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn the x-major cells (index = x * side + y) into rows of y, cells that are not 0, 1, 2 into unknown."""
         settings = self._session.settings if self._session is not None else None
-        side = _side(len(message.cells), settings)
+        values = message.cells or b""
+        side = _side(len(values), settings)
         cell = self._cell_m(settings)
-        cells = np.frombuffer(message.cells.translate(_CELLS), np.uint8).reshape(side, side).T
+        cells = np.frombuffer(values.translate(_CELLS), np.uint8).reshape(side, side).T
         half = -side * cell / 2
         origin = self.options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
 
-    def _cell_m(self, settings: ServerSettings | None) -> float:
-        interval = settings.slam_map_interval if settings is not None else None
-        return interval * self._unit_m if interval is not None and interval > 0 else self.options.map_cell_m
+    def _cell_m(self, settings: Settings | None) -> float:
+        interval = settings.slam_map_interval if isinstance(settings, RobotSettings13) else 0
+        return interval * self._unit_m if interval > 0 else self.options.map_cell_m
 
     def _text(self, message: DebugMessage, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.TEXT, Text(message.text, "debug", stamp_ns=stamp_ns)),)
@@ -139,12 +139,11 @@ class TcpUdpRobot(Robot):
         return ((topics.CAMERA, _switch(message.mode, stamp_ns)),)
 
     def _raw(self, message: Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
+        """Pass on what no fleet message holds, as it came."""
         if isinstance(message, OpaquePacket):
             raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
-        elif isinstance(message, ChatMessage):
-            raw = Raw(message.spec.id, message.body, stamp_ns=stamp_ns)
         else:
-            return ()
+            raw = Raw(message.spec.id, message.spec.codec.encode(message), stamp_ns=stamp_ns)
         return ((topics.RAW(NAME), raw),)
 
     # Commands to packets
@@ -235,13 +234,15 @@ def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float
     ranges = np.asarray(scan.ranges, np.float32)
     values = ranges[indices[covered]]
     usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
-    polar[covered] = np.where(usable, values / unit_m, 0)
+    with np.errstate(over="ignore"):
+        lengths = values / np.float32(unit_m)
+    polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
     return polar
 
 
-def _side(cells: int, settings: ServerSettings | None) -> int:
+def _side(cells: int, settings: Settings | None) -> int:
     """Find the side of a square map: size / interval where that fits the body, else the root of its length."""
-    if settings is not None and settings.slam_map_size and settings.slam_map_interval:
+    if isinstance(settings, RobotSettings13) and settings.slam_map_interval > 0:
         announced = settings.slam_map_size // settings.slam_map_interval
         if announced > 0 and announced * announced == cells:
             return announced

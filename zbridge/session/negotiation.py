@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 _VERSION = re.compile(r"\d{1,9}(\.\d{1,9})*")
 
@@ -18,6 +18,13 @@ def agree(ours: Iterable[str], theirs: Iterable[str]) -> str | None:
     """Choose the highest common version, compared number by number; None where there is none."""
     common = set(ours) & set(theirs)
     return max(common, key=_numbers, default=None)
+
+
+def newest(listed: Iterable[str], known: Collection[str]) -> str | None:
+    """Choose the newest known version that is not newer than the newest listed; None where there is none."""
+    limit = max(map(_numbers, listed), default=None)
+    fitting = [version for version in known if limit is not None and _numbers(version) <= limit]
+    return max(fitting, key=_numbers, default=None)
 
 
 def _numbers(version: str) -> tuple[int, ...]:

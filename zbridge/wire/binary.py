@@ -37,6 +37,8 @@ class BinaryCodec(Generic[M]):
         self.message = message
         fields = _declared(message)
         scalars = _all_scalars(fields)
+        if any(field.optional for field in fields[:-1]):
+            raise TypeError(f"{message.__name__}: only the last field may be missing")
         if scalars is None:
             self._steps = [_Step(field) for field in fields]
             self.decode, self.encode = self._decode_steps, self._encode_steps
@@ -66,17 +68,19 @@ class BinaryCodec(Generic[M]):
             values.append(value)
         if position != end:
             raise ProtocolError(f"{self.message.__name__}: {end - position} bytes too many")
-        return self.message(*values)
+        message = self.message(*values)
+        message.check()
+        return message
 
     def _encode_steps(self, message: M) -> bytes:
         parts = []
         for step in self._steps:
             value = getattr(message, step.name)
-            if value is None:
+            if value is None and step.optional:
                 break
             try:
                 parts.append(step.encode(value))
-            except (struct.error, OverflowError, UnicodeEncodeError) as error:
+            except (struct.error, OverflowError, UnicodeEncodeError, TypeError, AttributeError) as error:
                 raise EncodeError(f"{self.message.__name__}.{step.name}: {error}") from error
         return b"".join(parts)
 
@@ -98,17 +102,14 @@ class _Step:
 
 def _declared(message: type[Message]) -> list[_Field]:
     hints = get_type_hints(message, include_extras=True)
-    return [
-        _field(field.name, hints[field.name], field.default is not msgspec.NODEFAULT)
-        for field in msgspec.structs.fields(message)
-    ]
+    return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
 
 
-def _field(name: str, hint: Any, has_default: bool) -> _Field:
+def _field(name: str, hint: Any) -> _Field:
     for candidate in (hint, *get_args(hint)):
         for extra in getattr(candidate, "__metadata__", ()):
             if isinstance(extra, WireType):
-                return _Field(name, extra, has_default)
+                return _Field(name, extra, optional=type(None) in get_args(hint))
     raise TypeError(f"{name}: {hint} is no wire type")
 
 

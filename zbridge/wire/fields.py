@@ -5,8 +5,8 @@
         y: F32
         heading_deg: F32
 
-A field declared ``Bool | None = None`` may be missing at the end of a body; nothing but such fields, or
-a ``Rest``, may follow it. Sans-IO; a codec turns the declaration into bytes.
+The last field may be declared ``Blob | None = None``: then it may be missing. A message may define ``check()``,
+which raises ProtocolError for decoded values that do not go together. Sans-IO; a codec makes the bytes.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ import numpy.typing as npt
 
 class Message(msgspec.Struct, frozen=True, gc=False):
     """A typed legacy value; its fields are declared with the wire types of this module."""
+
+    def check(self) -> None:
+        """Raise ProtocolError where decoded values do not go together."""
 
 
 class Scalar(msgspec.Struct, frozen=True):

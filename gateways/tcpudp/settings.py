@@ -1,0 +1,86 @@
+"""The settings blocks of each version: what a peer announces, declared flag by flag. Sans-IO.
+
+Source: "Settings and version negotiation" of the protocol page. The block follows the newest version its
+sender lists, and older readers ignore the tail.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from zbridge.errors import ProtocolError
+from zbridge.session.negotiation import newest, parse_versions
+from zbridge.wire import I32, BinaryCodec, Bool, Message
+
+
+class Feature(Enum):
+    """The flags of a settings block, in their order on the wire."""
+
+    UDP = "udp"
+    CAM = "cam"
+    JOYSTICK = "joystick"
+    CHAT = "chat"
+    LIDAR = "lidar"
+    LIDAR_SIM = "lidar_sim"
+    SLAM_MAP = "slam_map"
+
+
+class Settings(Message, frozen=True):
+    """Version 1.1."""
+
+    udp: Bool = False
+    cam: Bool = False
+    joystick: Bool = False
+    chat: Bool = False
+    lidar: Bool = False
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """The flags that are set."""
+        return tuple(feature for feature in Feature if getattr(self, feature.value, False))
+
+    def encode(self) -> bytes:
+        """Write the block."""
+        return _CODECS[type(self)].encode(self)
+
+
+class Settings12(Settings, frozen=True):
+    """Version 1.2."""
+
+    lidar_sim: Bool = False
+
+
+class Settings13(Settings12, frozen=True):
+    """Version 1.3, from an HQ."""
+
+    slam_map: Bool = False
+
+
+class RobotSettings13(Settings13, frozen=True):
+    """Version 1.3, from a robot; size and interval of the map in the robot's unit of length."""
+
+    slam_map_size: I32 = 0
+    slam_map_interval: I32 = 0
+
+
+_CODECS = {block: BinaryCodec(block) for block in (Settings, Settings12, Settings13, RobotSettings13)}
+
+HQ_BLOCKS: dict[str, type[Settings]] = {"1.1": Settings, "1.2": Settings12, "1.3": Settings13}
+"""The settings block an HQ sends, by the newest version it lists."""
+ROBOT_BLOCKS: dict[str, type[Settings]] = {"1.1": Settings, "1.2": Settings12, "1.3": RobotSettings13}
+"""The settings block a robot sends, by the newest version it lists; "1.4" is sent with the block of 1.3."""
+
+
+def read_settings(versions: str, block: bytes, blocks: dict[str, type[Settings]]) -> Settings:
+    """Read a settings block by the versions its sender lists; raise ProtocolError where it is too short.
+
+    Of a version newer than all that are known, the newest known block is read and the tail ignored.
+    """
+    version = newest(parse_versions(versions), known=blocks)
+    if version is None:
+        return Settings()
+    codec = _CODECS[blocks[version]]
+    size = len(codec.encode(blocks[version]()))
+    if len(block) < size:
+        raise ProtocolError(f"settings of version {version} with {len(block)} bytes, expected {size}")
+    return codec.decode(block[:size], 0)

@@ -20,6 +20,8 @@ from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Messag
 MAX_FRAME = 4 * 2**20 + 64
 """Bytes of the longest packet that is taken: a map of 2048 x 2048 with its header."""
 HEADER = struct.Struct("<iBB")
+_HEADER_SIZE = HEADER.size
+_LENGTH = struct.Struct("<i").unpack_from
 SERVER_ID = 1
 """The ``id`` byte of every packet from the robot."""
 
@@ -262,9 +264,9 @@ class OpaquePacket(Packet, frozen=True):
 
 def frame_end(data: bytes, start: int) -> int:
     """Find where the packet at ``start`` ends ("Framing"): ``int32 length | u8 id | u8 packet id | body``."""
-    if len(data) - start < HEADER.size:
-        return start + HEADER.size
-    length = int.from_bytes(data[start : start + 4], "little", signed=True)
+    if len(data) - start < _HEADER_SIZE:
+        return start + _HEADER_SIZE
+    length: int = _LENGTH(data, start)[0]
     if length < 2:
         raise ProtocolError(f"length {length}, expected at least 2")
     return start + 4 + length
@@ -298,7 +300,7 @@ def decode_packet(frame: bytes) -> Packet:
 
 
 def decode_body(packet_id: int, frame: bytes) -> Packet:
-    """Read the body of a packet whose header is read already.
+    """Read the body of a packet whose header was checked: by ``frame_end`` in a stream, by ``read_header`` else.
 
     Some robots answer 54 with id 53 and three floats ("The gateway as HQ"): that is a position.
     """
@@ -307,4 +309,4 @@ def decode_body(packet_id: int, frame: bytes) -> Packet:
     spec = PACKETS.get(packet_id)
     if spec is None:
         return OpaquePacket(packet_id, frame[HEADER.size :])
-    return spec.codec.decode(frame, HEADER.size)
+    return spec.codec.decode(frame, _HEADER_SIZE)

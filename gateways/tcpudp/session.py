@@ -21,7 +21,6 @@ from gateways.tcpudp.messages import (
     decode_body,
     encode_packet,
     frame_end,
-    read_header,
 )
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, Settings13, read_settings
 from zbridge.errors import EncodeError, ProtocolError, Refused
@@ -44,27 +43,33 @@ def limits(gap_s: float) -> Limits:
     return Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S, gap_s=gap_s)
 
 
+def packets_of(sender: Sender) -> frozenset[int]:
+    """List the ids of the packets that only one side sends."""
+    return frozenset(spec.id for spec in PACKETS.values() if spec.sender is sender)
+
+
 class _TcpUdpSession(Session[Packet]):
     """What both roles share: framing, and the ``id`` byte of what they send."""
 
     frame_end = staticmethod(frame_end)
-    sender: Sender
     sender_id: int
+    """The ``id`` byte of what we send."""
+    peer_ids: tuple[int, ...]
+    """The ``id`` bytes the peer may use."""
+    own_packets: frozenset[int]
+    """The packet ids only our side sends."""
 
     def encode(self, message: Packet) -> bytes:
         return encode_packet(message, self.sender_id)
 
     def decode(self, frame: bytes) -> Packet:
-        sender_id, packet_id = read_header(frame)
-        self.check_sender(sender_id)
-        spec = PACKETS.get(packet_id)
-        if spec is not None and spec.sender is self.sender:
-            raise ProtocolError(f"{spec.name} ({packet_id}) from the wrong side")
+        """Read a packet of the stream; ``frame_end`` has checked its length."""
+        sender_id, packet_id = frame[4], frame[5]
+        if sender_id not in self.peer_ids:
+            raise ProtocolError(f"packet with id {sender_id}, expected {' or '.join(map(str, self.peer_ids))}")
+        if packet_id in self.own_packets:
+            raise ProtocolError(f"{PACKETS[packet_id].name} ({packet_id}) from the wrong side")
         return decode_body(packet_id, frame)
-
-    def check_sender(self, sender_id: int) -> None:
-        """Raise ProtocolError for an ``id`` byte the peer may not use."""
-        raise NotImplementedError
 
     def refuse_versions(self, listed: str, now: float) -> None:
         """Tell the peer and the operator that no version is common, and close."""
@@ -77,7 +82,8 @@ class HqSession(_TcpUdpSession):
     """We play HQ towards a robot. ``force``: features and packet ids to use although it does not announce them."""
 
     role = Role.HQ
-    sender = Sender.HQ
+    own_packets = packets_of(Sender.HQ)
+    peer_ids = (SERVER_ID,)
 
     def __init__(self, limits: Limits, *, force: Iterable[Feature | int] = ()) -> None:
         super().__init__(limits)
@@ -85,10 +91,6 @@ class HqSession(_TcpUdpSession):
         self.settings: Settings | None = None
         self._force = frozenset(force)
         self._usable: frozenset[Feature | int] = self._force
-
-    def check_sender(self, sender_id: int) -> None:
-        if sender_id != SERVER_ID:
-            raise ProtocolError(f"packet with id {sender_id}, a robot's is {SERVER_ID}")
 
     def overdue(self) -> str:
         return (
@@ -144,21 +146,18 @@ class RobotSession(_TcpUdpSession):
     """We play the robot towards an HQ: what we announce, and the id we give it."""
 
     role = Role.ROBOT
-    sender = Sender.ROBOT
+    own_packets = packets_of(Sender.ROBOT)
     sender_id = SERVER_ID
 
     def __init__(self, limits: Limits, settings: Settings, client_id: int) -> None:
         super().__init__(limits)
         self.settings = settings
         self.client_id = client_id
+        self.peer_ids = (0, client_id)
         self.client: Settings | None = None
 
     def opened(self, now: float) -> None:
         self.send(ServerSettings(self.client_id, LISTED, self.settings.encode()))
-
-    def check_sender(self, sender_id: int) -> None:
-        if sender_id not in (0, self.client_id):
-            raise ProtocolError(f"packet with id {sender_id}, this client's is {self.client_id}")
 
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientSettings):

@@ -154,10 +154,10 @@ class Session(ABC, Generic[M]):
                     message = decode(frame)
                     if accept(message, now):
                         messages.append(message)
+                    elif self.over:
+                        break
                 except ProtocolError as error:
                     self.malformed(str(error))
-                if self.over:
-                    break
         except ProtocolError as error:
             self.malformed(str(error))
             self.fail(f"broken stream: {error}")

@@ -38,7 +38,7 @@ from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
+from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.protocol import Outcome, Robot, Telemetry
 
@@ -51,7 +51,7 @@ STOP_REPEAT_S = 0.1
 SCAN_POINTS = 360
 """Points deployed robots take in simulated lidar data, one a degree."""
 _MOTION = "motion"
-_CELLS = bytes(value if value <= 2 else 0 for value in range(256))
+_OCCUPIED = 2
 
 ForcedFeature = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
 PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -117,7 +117,7 @@ class TcpUdpRobot(Robot):
         values = message.cells or b""
         side = _side(len(values), settings)
         cell = self._cell_m(settings)
-        cells = np.frombuffer(values.translate(_CELLS), np.uint8).reshape(side, side).T
+        cells = _known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T
         half = -side * cell / 2
         origin = self.options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
@@ -250,6 +250,11 @@ def _side(cells: int, settings: Settings | None) -> int:
     if side * side != cells:
         raise ProtocolError(f"map of {cells} cells is not square")
     return side
+
+
+def _known_cells(cells: Cells) -> Cells:
+    """Take cells that are none of 0, 1, 2 as unknown."""
+    return cells if cells.size == 0 or cells.max() <= _OCCUPIED else np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def _switch(mode: int, stamp_ns: int) -> Switch:

@@ -39,7 +39,7 @@ def encode(message: FleetMessage) -> bytes:
     array = _ARRAYS.get(type(message))
     if array is not None:
         name, dtype = array
-        values[name] = np.ascontiguousarray(values[name], dtype).data.cast("B")
+        values[name] = np.ascontiguousarray(values[name], dtype).reshape(-1).view(np.uint8).data
     return pack(values)
 
 
@@ -87,7 +87,10 @@ def _with_array(message: type[FleetMessage], values: dict[str, Any], name: str, 
         rows, columns = values.get("rows"), values.get("columns")
         if not (_is_count(rows) and _is_count(columns) and rows * columns == array.size):
             raise PayloadError(f"Map.cells: {array.size} cells do not fill {rows} rows x {columns} columns")
-        array = array.reshape(rows, columns)
+        try:
+            array = array.reshape(rows, columns)
+        except (ValueError, OverflowError) as error:
+            raise PayloadError(f"Map.cells: {rows} rows x {columns} columns: {error}") from error
     return {**values, name: array}
 
 

@@ -109,7 +109,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
             f"device.connect = {list(config.device.connect)}: a {protocol.name} robot has at most {protocol.links} link"
             f"{'s' if protocol.links > 1 else ''}"
         )
-    metrics = _address("metrics.listen", f"tcp://{config.metrics.listen}") if config.metrics else None
+    metrics = _metrics_address(config.metrics.listen) if config.metrics else None
     return Plan(config, protocol, options, addresses, metrics)
 
 
@@ -118,6 +118,13 @@ def _address(key: str, text: str) -> Address:
         return Address.parse(text)
     except LinkError as error:
         raise ConfigError(f"{key} = {error}") from error
+
+
+def _metrics_address(text: str) -> Address:
+    try:
+        return Address.parse(f"tcp://{text}")
+    except LinkError as error:
+        raise ConfigError(f"metrics.listen = {text!r}: expected host:port") from error
 
 
 def _substituted(value: Any, environment: Mapping[str, str], key: str) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zbridge.link import Link
+from zbridge.metrics import Count
 from zbridge.session.session import Session, State
 
 log = logging.getLogger("zbridge.link")
@@ -23,6 +24,7 @@ class Conversation:
         *,
         deliver: Callable[[list[Any]], None],
         changed: Callable[[], None] = lambda: None,
+        malformed: Count | None = None,
     ) -> None:
         self.session = session
         self.ended: asyncio.Future[None] = loop.create_future()
@@ -32,6 +34,7 @@ class Conversation:
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._seen = session.state
+        self._malformed = malformed or Count()
         self._malformed_logged = 0
 
     def __repr__(self) -> str:
@@ -48,9 +51,9 @@ class Conversation:
         """Take bytes from the link."""
         session = self.session
         messages = session.receive(data, self._loop.time())
-        if session.state is not self._seen:
+        if session.state is not self._seen and not session.over:
             self._notify()
-        if messages:
+        if messages:  # what came before the end of a session is delivered before the end is told
             self._deliver(messages)
         if session.traffic.malformed != self._malformed_logged:
             self._report_malformed()
@@ -130,6 +133,7 @@ class Conversation:
     def _report_malformed(self) -> None:
         """Warn at the first, second, fourth ... malformed message: the log stays readable in a flood."""
         count = self.session.traffic.malformed
+        self._malformed.value += count - self._malformed_logged
         if count.bit_length() != self._malformed_logged.bit_length():
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count

@@ -116,6 +116,7 @@ class Device:
         self._questions = Questions(self._loop)
         self._published = metrics.count("published")
         self._untranslatable = metrics.count("untranslatable")
+        self._malformed = metrics.count("malformed")
         self._refused = metrics.count("refused")
         self._commands = metrics.count("commands")
 
@@ -181,7 +182,11 @@ class Device:
         session.name = endpoint.name
         session.tap = endpoint.tap
         conversation = Conversation(
-            session, self._loop, deliver=self._deliver, changed=lambda: self._on_session(endpoint, session)
+            session,
+            self._loop,
+            deliver=self._deliver,
+            changed=lambda: self._on_session(endpoint, session),
+            malformed=self._malformed,
         )
         self._set_state(endpoint, "connecting", None)
         endpoint.conversation = conversation
@@ -230,22 +235,26 @@ class Device:
         stamp_ns = self._clock_ns()
         translate, encode, publishers = self._robot.telemetry, payloads.encode, self._publishers
         batch: list[Entry] = []
+        flowing, published = True, 0
         for message in messages:
             try:
                 for topic, telemetry in translate(message, stamp_ns):
                     payload = encode(telemetry)
+                    published += 1
                     publisher = publishers.get(topic.path) or self._declare(topic)
                     if topic.delivery is Delivery.STREAM:
                         batch.append((publisher, payload))
-                    else:
-                        publisher.put(payload)
+                    elif not publisher.put(payload):
+                        flowing = False
                     if self._questions:
                         self._questions.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._keys.robot, error)
-        self._published.value += len(batch)
+        self._published.value += published
         if batch and not self._bus.put_all(batch):
+            flowing = False
+        if not flowing:
             for endpoint in self._endpoints:
                 if endpoint.conversation is not None:
                     endpoint.conversation.pause()
@@ -309,11 +318,12 @@ class Device:
         topic = topics.find(path)
         if topic is None or topic.delivery is not Delivery.COMMAND:
             raise Refused("no such command")
+        if topic is topics.CMD_STOP:  # whatever its payload
+            self._halt("stop")
+            return
         now = self._loop.time()
         command = payloads.decode(topic.message, sample.payload)
-        if topic is topics.CMD_STOP:
-            self._halt("stop")
-        elif isinstance(command, Drive):
+        if isinstance(command, Drive):
             self._drive(topic, command, now)
         else:
             self._require_ready()

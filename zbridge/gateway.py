@@ -78,7 +78,15 @@ async def until_signal(work: Coroutine[Any, Any, None]) -> None:
     """Run a coroutine until it ends or SIGTERM or SIGINT comes; then cancel it and wait for it to tidy up."""
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
+    asked: list[int] = []
+
+    def end(number: int) -> None:
+        """Cancel once: a second signal must not cut the tidying up short."""
+        if not asked:
+            task.cancel()
+        asked.append(number)
+
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, task.cancel)
+        loop.add_signal_handler(number, end, number)
     with contextlib.suppress(asyncio.CancelledError):
         await task

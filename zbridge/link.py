@@ -133,8 +133,11 @@ class TcpLink(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # uvloop's is none by inheritance
         self._transport.set_write_buffer_limits(high=_WRITE_BYTES)
-        host, port = transport.get_extra_info("peername")[:2]
-        self.peer = str(Address(host, port))
+        peer = transport.get_extra_info("peername")
+        if peer is None:  # reset before we came to look; connection_lost follows
+            self._transport.abort()
+            return
+        self.peer = str(Address(*peer[:2]))
         _tune(transport.get_extra_info("socket"))
         self._receiver.attached(self)
 

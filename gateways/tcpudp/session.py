@@ -31,6 +31,7 @@ VERSIONS = ("1.3",)
 """The versions that are spoken."""
 LISTED = "1.1,1.2,1.3"
 """What peers of version 1.3 send, and the only list deployed 1.3 robots take safely."""
+_QUOTED = 80
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
 HANDSHAKE_S = 5.0
@@ -73,7 +74,7 @@ class _TcpUdpSession(Session[Packet]):
 
     def refuse_versions(self, listed: str, now: float) -> None:
         """Tell the peer and the operator that no version is common, and close."""
-        reason = f"no common version: the peer speaks {listed!r}, this gateway {', '.join(VERSIONS)}"
+        reason = f"no common version: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(VERSIONS)}"
         self.send(DebugMessage(reason))
         self.close(reason, now)
 
@@ -131,12 +132,12 @@ class HqSession(_TcpUdpSession):
     def _take_settings(self, message: ServerSettings, now: float) -> None:
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
-        self.settings = read_settings(message.versions, message.block, ROBOT_BLOCKS)
         self.sender_id = message.client_id
         version = agree(VERSIONS, parse_versions(message.versions))
         if version is None:
             self.refuse_versions(message.versions, now)
             return
+        self.settings = read_settings(message.versions, message.block, ROBOT_BLOCKS)
         self._usable = self._force.union(self.settings.features)
         self.send(ClientSettings(LISTED, ANNOUNCED.encode()))
         self.establish(version, tuple(feature.value for feature in self.settings.features))
@@ -170,9 +171,9 @@ class RobotSession(_TcpUdpSession):
     def _take_settings(self, message: ClientSettings, now: float) -> None:
         if self.client is not None:
             raise ProtocolError("clientSettings a second time")
-        self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
         version = agree(VERSIONS, parse_versions(message.versions))
         if version is None:
             self.refuse_versions(message.versions, now)
         else:
+            self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
             self.establish(version, tuple(feature.value for feature in self.client.features))

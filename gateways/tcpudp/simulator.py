@@ -35,7 +35,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession, limits
 from gateways.tcpudp.settings import RobotSettings13
 from zbridge.conversation import Conversation
-from zbridge.errors import Refused
+from zbridge.errors import EncodeError, Refused
 from zbridge.link import Address, Link, listen
 from zbridge.protocol import Simulation
 from zbridge.session.session import State
@@ -119,8 +119,7 @@ class Vehicle:
         """Obey or answer one packet of an HQ."""
         match message:
             case ClientJoystickMove():
-                scale = message.speed * SPEED_M_S
-                self._move(message.y * scale, -message.x * scale, 0.0)
+                self._move(message.y * message.speed * SPEED_M_S, -message.x * message.speed * SPEED_M_S, 0.0)
             case ClientJoystickRotate():
                 self._move(0.0, 0.0, -message.speed * TURN_RAD_S)
             case ClientJoystickStop():
@@ -145,8 +144,10 @@ class Vehicle:
         return ()
 
     def _move(self, forward: float, left: float, turn: float) -> None:
+        """Take a speed over ground and a rate of turn, as far as the motors go."""
         finite = all(math.isfinite(value) for value in (forward, left, turn))
-        self._motion = (forward, left, turn) if finite else (0.0, 0.0, 0.0)
+        scale = max(math.hypot(forward, left) / SPEED_M_S, abs(turn) / TURN_RAD_S, 1.0)
+        self._motion = (forward / scale, left / scale, turn / scale) if finite else (0.0, 0.0, 0.0)
         self._silent_s = 0.0
 
     def _see(self, message: ClientSimulatedLidarData) -> None:
@@ -252,8 +253,8 @@ class _Peer:
 def _send(conversation: Conversation, message: Packet) -> None:
     try:
         conversation.session.send(message)
-    except Refused as refusal:
-        log.debug("%s: not sent, %s", conversation.session.name, refusal)
+    except (Refused, EncodeError) as error:
+        log.debug("%s: not sent, %s", conversation.session.name, error)
 
 
 async def simulate(simulation: Simulation) -> None:

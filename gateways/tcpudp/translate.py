@@ -55,7 +55,9 @@ _OCCUPIED = 2
 
 ForcedFeature = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
 PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
+Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+Angle = Annotated[float, msgspec.Meta(ge=-7, le=7)]
+Length = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,12 +66,12 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
     force: tuple[ForcedFeature | PacketId, ...] = ()
     combine: Literal["exclusive", "both"] = "exclusive"
-    speed_full: Positive = 1.0
-    turn_full: Positive = 1.0
-    length_unit_m: Positive = 0.01
-    heading_offset: float = math.pi / 2
-    map_cell_m: Positive = 0.01
-    map_origin: tuple[float, float] | None = None
+    speed_full: Scale = 1.0
+    turn_full: Scale = 1.0
+    length_unit_m: Scale = 0.01
+    heading_offset: Angle = math.pi / 2
+    map_cell_m: Scale = 0.01
+    map_origin: tuple[Length, Length] | None = None
 
 
 class TcpUdpRobot(Robot):
@@ -169,7 +171,7 @@ class TcpUdpRobot(Robot):
         packets: list[Packet] = []
         if translation:
             speed = min(1.0, translation) * self.options.speed_full
-            packets.append(ClientJoystickMove(-command.left / translation, command.forward / translation, speed))
+            packets.append(ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed))
         if command.turn:
             packets.append(ClientJoystickRotate(-command.turn * self.options.turn_full))
         if len(packets) == 2 and self.options.combine == "exclusive":
@@ -223,16 +225,15 @@ def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float
     polar = np.zeros(SCAN_POINTS, np.float32)
     if count == 0 or not scan.angle_increment or not math.isfinite(scan.angle_increment + scan.angle_min):
         return polar
-    turn = 2 * math.pi
+    step = abs(scan.angle_increment)
+    circle = 2 * math.pi / step
     offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
-    if scan.angle_increment > 0:
-        indices = np.rint(np.mod(offsets, turn) / scan.angle_increment).astype(np.int64)
-        indices[np.isclose(np.mod(offsets, turn), turn)] = 0
-    else:
-        indices = np.rint(np.mod(-offsets, turn) / -scan.angle_increment).astype(np.int64)
-    covered = indices < count
+    nearest = np.rint(np.mod(math.copysign(1.0, scan.angle_increment) * offsets, 2 * math.pi) / step)
+    nearest = np.where(nearest >= circle - 0.5, 0.0, nearest)  # the point behind the last one is the first
+    covered = nearest < count
+    indices = nearest[covered].astype(np.int64)
     ranges = np.asarray(scan.ranges, np.float32)
-    values = ranges[indices[covered]]
+    values = ranges[indices]
     usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
     with np.errstate(over="ignore"):
         lengths = values / np.float32(unit_m)

@@ -168,7 +168,7 @@ class _FakePublisher(_FakeHandle):
         self._shared = shared
         self._keeps_last = keeps_last
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         sample = Sample(self.key, payload, attachment)
         self._shared.history.append(sample)
         if self._keeps_last:
@@ -176,6 +176,7 @@ class _FakePublisher(_FakeHandle):
         for key_expr, handler in tuple(self._shared.subscribers):
             if matches(key_expr, self.key):
                 handler(sample)
+        return True
 
     def _forget(self) -> None:
         self._shared.last.pop(self.key, None)

@@ -72,8 +72,8 @@ class Publisher(Protocol):
 
     key: str
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
-        """Publish now, as the key's class of delivery says; never blocks the event loop."""
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        """Publish as the key's class of delivery says, without blocking; False asks to pause the source."""
 
     def close(self) -> None:
         """Give the key up; idempotent."""

@@ -1,4 +1,4 @@
-"""The thread that writes what may block, so that the event loop never does. Knows no zenoh."""
+"""A thread that writes what may block, so that the event loop never does. Knows no zenoh."""
 
 from __future__ import annotations
 
@@ -11,56 +11,58 @@ from zbridge.metrics import Metrics
 
 log = logging.getLogger("zbridge.bus")
 
-CALLS = 4096
-"""Calls that may wait; one more is dropped and counted."""
-BACKLOG = 20_000
-"""Messages that may wait in batches before their source is asked to pause."""
+BACKLOG = 4096
+"""How much may wait: each message counts one, and one more for every KiB of a large one."""
 
 Call = Callable[[], None]
 
 
 class Writer:
-    """Carries out calls in order. States wait by key and the newest wins; batches wait behind both.
+    """Carries out calls in order, within :data:`BACKLOG`.
 
-    ``relieved`` is called, on the writing thread, when a source that was asked to pause may go on.
+    Where that is not enough, a ``lossless`` writer asks to pause the source, and calls ``relieved`` (on its own
+    thread) when it may go on; any other forgets the oldest call and counts it: the newest wins.
     """
 
-    def __init__(self, name: str, metrics: Metrics, relieved: Call) -> None:
+    def __init__(self, name: str, metrics: Metrics, *, lossless: bool, relieved: Call) -> None:
+        self._lossless = lossless
         self._relieved = relieved
-        self._states: dict[str, Call] = {}
-        self._calls: deque[Call] = deque()
-        self._batches: deque[tuple[Call, int]] = deque()
+        self._latest: dict[str, Call] = {}
+        self._jobs: deque[tuple[Call, int]] = deque()
         self._backlog = 0
         self._full = False
         self._stopping = False
         self._wake = threading.Condition()
         self._dropped = metrics.count("bus_out_dropped", writer=name)
+        self._replaced = metrics.count("bus_out_replaced", writer=name)
         self._thread = threading.Thread(target=self._run, name=f"zbridge-{name}", daemon=True)
         self._thread.start()
 
-    def state(self, key: str, put: Call) -> None:
-        """Write a state; one of the same key that still waits is forgotten."""
+    def put(self, call: Call, size: int = 1) -> bool:
+        """Carry out a call of ``size`` messages; False asks to pause the source."""
         with self._wake:
-            self._states[key] = put
-            self._wake.notify()
-
-    def call(self, call: Call) -> None:
-        """Carry out a call; dropped and counted when too many wait."""
-        with self._wake:
-            if len(self._calls) >= CALLS:
-                self._dropped.value += 1
-                return
-            self._calls.append(call)
-            self._wake.notify()
-
-    def batch(self, call: Call, size: int) -> bool:
-        """Carry out a call that writes ``size`` messages; False asks to pause the source."""
-        with self._wake:
-            self._batches.append((call, size))
+            if self._stopping:
+                self._dropped.value += size
+                return True
+            self._jobs.append((call, size))
             self._backlog += size
-            self._full = self._full or self._backlog > BACKLOG
+            if self._lossless:
+                self._full = self._full or self._backlog > BACKLOG
+            else:
+                self._forget_oldest()
             self._wake.notify()
             return not self._full
+
+    def replace(self, key: str, call: Call, size: int = 1) -> bool:
+        """Carry out a call unless a newer one of the same key comes first; a lossless writer does every one."""
+        if self._lossless:
+            return self.put(call, size)
+        with self._wake:
+            if key in self._latest:
+                self._replaced.value += 1
+            self._latest[key] = call
+            self._wake.notify()
+            return True
 
     def stop(self, timeout_s: float = 0.5) -> None:
         """Finish what waits, for at most ``timeout_s`` seconds."""
@@ -69,28 +71,33 @@ class Writer:
             self._wake.notify()
         self._thread.join(timeout_s)
 
+    def _forget_oldest(self) -> None:
+        while self._backlog > BACKLOG and len(self._jobs) > 1:
+            _, size = self._jobs.popleft()
+            self._backlog -= size
+            self._dropped.value += size
+
     def _run(self) -> None:
         while True:
             with self._wake:
-                while not (self._calls or self._states or self._batches or self._stopping):
+                while not (self._jobs or self._latest or self._stopping):
                     self._wake.wait()
-                if not (self._calls or self._states or self._batches):
+                if not (self._jobs or self._latest):
                     return
-                calls = [*self._calls, *self._states.values()]
-                self._calls.clear()
-                self._states.clear()
-                batch = self._batches.popleft() if self._batches else None
-            for call in calls:
-                self._carry_out(call)
-            if batch is not None:
-                self._carry_out(batch[0])
-                self._written(batch[1])
+                latest = list(self._latest.values())
+                self._latest.clear()
+                job = self._jobs.popleft() if self._jobs else None
+            for call in latest:
+                self._carry_out(call, 1)
+            if job is not None:
+                self._carry_out(*job)
+                self._written(job[1])
 
-    def _carry_out(self, call: Call) -> None:
+    def _carry_out(self, call: Call, size: int) -> None:
         try:
             call()
         except Exception as error:
-            self._dropped.value += 1
+            self._dropped.value += size
             log.debug("not written to the bus: %s", error)
 
     def _written(self, size: int) -> None:

@@ -29,6 +29,8 @@ H = TypeVar("H", bound=Handle)
 
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
+PATIENCE_US = 20_000
+"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
@@ -50,6 +52,10 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zeno
         "connect/endpoints": settings.connect,
         "scouting/multicast/enabled": settings.multicast,
         "open/return_conditions/connect_scouted": wait_for_peers,
+        # A pool of 28 MB in every process, for payloads a robot does not have.
+        "transport/shared_memory/enabled": False,
+        # A stream is dropped when the bus stands still, not when a thread of it is late by a millisecond.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
     }
     if settings.listen:
         values["listen/endpoints"] = settings.listen
@@ -96,8 +102,9 @@ class ZenohBus:
         self._loop = loop
         self._inbox = Inbox(loop, metrics)
         self._relief: list[Callable[[], None]] = []
-        self._writer = Writer("bus-writer", metrics, self._relieve)
-        self._streams = Writer("stream-writer", metrics, self._relieve) if stream == "block" else None
+        self._lossless = stream == "block"
+        self._writer = Writer("states", metrics, lossless=self._lossless, relieved=self._relieve)
+        self._streams = Writer("streams", metrics, lossless=self._lossless, relieved=self._relieve)
         self._handles: list[Handle] = []
 
     def __repr__(self) -> str:
@@ -115,17 +122,14 @@ class ZenohBus:
         if qos.keeps_last:
             return self._keep(_StatePublisher(self._session, key, options, self._writer))
         if topic.delivery is Delivery.STREAM:
-            return self._keep(_StreamPublisher(self._session, key, options, blocks=self._streams is not None))
+            return self._keep(_StreamPublisher(self._session, key, options, self._streams, blocks=self._lossless))
         plain = self._session.declare_publisher(key, express=qos.express, **options)
         blocks = qos.congestion is Congestion.BLOCK
         return self._keep(_PlainPublisher(key, plain, self._writer if blocks else None))
 
     def put_all(self, batch: Sequence[Entry]) -> bool:
         """Publish stream messages in order: the last one express, which takes the others with it."""
-        if self._streams is None:
-            _put_batch(batch)
-            return True
-        return self._streams.batch(lambda: _put_batch(batch), len(batch))
+        return self._streams.put(lambda: _put_batch(batch), len(batch))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
         """Call ``handler`` when a source that was asked to pause may go on."""
@@ -211,8 +215,7 @@ class ZenohBus:
 
     def _leave(self, handles: list[Handle]) -> None:
         for writer in (self._streams, self._writer):
-            if writer is not None:
-                writer.stop()
+            writer.stop()
         with contextlib.suppress(zenoh.ZError):
             for handle in reversed(handles):
                 handle.close()
@@ -290,18 +293,21 @@ class _PlainPublisher(_Declared):
         self._put = publisher.put
         self._writer = writer
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
-        if self._writer is None:
-            self._put(payload, attachment=attachment)
-        else:
-            self._writer.call(lambda: self._put(payload, attachment=attachment))
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        if self._writer is not None:
+            return self._writer.put(lambda: self._put(payload, attachment=attachment))
+        self._put(payload, attachment=attachment)
+        return True
 
 
 class _StreamPublisher:
     """Writes a stream key, plain or express: express is what makes a batch leave at once."""
 
-    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], *, blocks: bool) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer, *, blocks: bool
+    ) -> None:
         self.key = key
+        self._writer = writer
         if blocks:
             options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
         self._publishers = (
@@ -311,8 +317,8 @@ class _StreamPublisher:
         self.put_plain = self._publishers[0].put
         self.put_express = self._publishers[1].put
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
-        self.put_express(payload, attachment=attachment)
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        return self._writer.put(lambda: self.put_express(payload, attachment=attachment))
 
     def close(self) -> None:
         publishers, self._publishers = self._publishers, ()  # type: ignore[assignment]
@@ -338,9 +344,11 @@ class _StatePublisher:
         )
         self._queryable = session.declare_queryable(key, self._reply)
 
-    def put(self, payload: bytes, attachment: bytes | None = None) -> None:
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last = payload
-        self._writer.state(self.key, lambda: self._publisher.put(payload, attachment=attachment))
+        return self._writer.replace(
+            self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 1024
+        )
 
     def close(self) -> None:
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
@@ -351,7 +359,7 @@ class _StatePublisher:
         if last is None:
             query.drop()  # type: ignore[no-untyped-call]
         else:
-            self._writer.call(lambda: _reply_and_drop(query, self.key, last, self._encoding))
+            self._writer.put(lambda: _reply_and_drop(query, self.key, last, self._encoding))
 
 
 def _reply_and_drop(query: zenoh.Query, key: str, payload: bytes, encoding: zenoh.Encoding | None) -> None:
@@ -372,10 +380,10 @@ class _Question:
         self._writer = writer
 
     def answer(self, payload: bytes) -> None:
-        self._writer.call(lambda: _reply_and_drop(self._query, self.key, payload, None))
+        self._writer.put(lambda: _reply_and_drop(self._query, self.key, payload, None))
 
     def refuse(self, reason: str) -> None:
-        self._writer.call(lambda: self._refuse(reason))
+        self._writer.put(lambda: self._refuse(reason))
 
     def _refuse(self, reason: str) -> None:
         try:

@@ -113,7 +113,7 @@ def _fields(sample: Sample) -> dict[str, Any]:
         return payloads.unpack(sample.payload)
     message: FleetMessage = payloads.decode(topic.message, sample.payload)
     fields = msgspec.structs.asdict(message)
-    return {name: value for name, value in fields.items() if value is not None}
+    return {name: value for name, value in fields.items() if value is not None and value is not msgspec.UNSET}
 
 
 def _short(value: Any) -> str:

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET, UnsetType
 
 Fraction = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 Floats = npt.NDArray[np.float32]
@@ -18,15 +19,15 @@ Cells = npt.NDArray[np.uint8]
 
 
 class FleetMessage(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """What all fleet messages may carry; absent where the device has none.
+    """What all fleet messages may carry; UNSET, and absent from the payload, where the device has none.
 
     stamp_ns: best estimate of when the content was measured, Unix nanoseconds on the gateway's clock.
     seq: the device's own sequence number. device_ms: the device's own clock, milliseconds.
     """
 
-    stamp_ns: int | None = None
-    seq: int | None = None
-    device_ms: int | None = None
+    stamp_ns: int | UnsetType = UNSET
+    seq: int | UnsetType = UNSET
+    device_ms: int | UnsetType = UNSET
 
 
 class Scan(FleetMessage, frozen=True, eq=False):

@@ -6,23 +6,19 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeGuard, TypeVar
+from functools import cache
+from typing import Any, TypeVar
 
 import msgpack
 import msgspec
 import numpy as np
 
 from zbridge.errors import PayloadError
-from zbridge.fleet.messages import FleetMessage, Map, Scan
+from zbridge.fleet.messages import FleetMessage, Floats, Map
 
 F = TypeVar("F", bound=FleetMessage)
 
 ENCODING = "application/msgpack"
-
-_OPTIONAL = FleetMessage.__struct_fields__
-_ARRAYS: dict[type[FleetMessage], tuple[str, str]] = {Scan: ("ranges", "<f4"), Map: ("cells", "|u1")}
-
-_pack = msgpack.Packer(default=msgspec.structs.asdict).pack
 
 
 def schema(message: type[FleetMessage]) -> str:
@@ -30,43 +26,39 @@ def schema(message: type[FleetMessage]) -> str:
     return f"zbridge.{message.__name__}.v1"
 
 
-def encode(message: FleetMessage) -> bytes:
-    """Encode a fleet message as the MessagePack map its key carries."""
-    values: dict[str, Any] = msgspec.structs.asdict(message)
-    for name in _OPTIONAL:
-        if values[name] is None:
-            del values[name]
-    array = _ARRAYS.get(type(message))
-    if array is not None:
-        name, dtype = array
-        values[name] = np.ascontiguousarray(values[name], dtype).reshape(-1).view(np.uint8).data
-    return pack(values)
+def _array_bytes(value: Any) -> memoryview:
+    """Give the bytes of an array: float32 little endian for numbers with a fraction, else uint8."""
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"{type(value).__name__} has no place in a payload")
+    dtype = "<f4" if value.dtype.kind == "f" else "|u1"
+    return np.ascontiguousarray(value, dtype).reshape(-1).view(np.uint8).data
+
+
+encode = msgspec.msgpack.Encoder(enc_hook=_array_bytes).encode
+"""``encode(message)``: the MessagePack map its key carries."""
 
 
 def decode(message: type[F], payload: bytes) -> F:
     """Decode a payload as ``message``; raise PayloadError naming the field and what was expected.
 
-    Unknown fields are ignored and missing optional ones take their default. ``ranges`` becomes a read-only
-    float32[n], ``cells`` a read-only uint8[rows, columns].
+    An empty payload is an empty map, unknown fields are ignored and missing optional ones take their default.
+    ``ranges`` becomes a read-only float32[n], ``cells`` a read-only uint8[rows, columns].
     """
-    values = unpack(payload)
-    array = _ARRAYS.get(message)
-    if array is not None:
-        values = _with_array(message, values, *array)
     try:
-        return msgspec.convert(values, message, dec_hook=_keep_array)
-    except (msgspec.ValidationError, ValueError) as error:
+        decoded: F = _shaped(_decoder(message).decode(payload or _EMPTY))
+    except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message.__name__}: {error}") from error
+    return decoded
 
 
 def pack(values: dict[str, Any]) -> bytes:
     """Pack a plain map as a payload."""
-    payload: bytes = _pack(values)
+    payload: bytes = msgpack.packb(values)
     return payload
 
 
 def unpack(payload: bytes) -> dict[str, Any]:
-    """Unpack any fleet payload into a plain map; an empty payload is an empty map."""
+    """Unpack any payload into a plain map; an empty payload is an empty map."""
     if not payload:
         return {}
     try:
@@ -78,25 +70,26 @@ def unpack(payload: bytes) -> dict[str, Any]:
     return values
 
 
-def _with_array(message: type[FleetMessage], values: dict[str, Any], name: str, dtype: str) -> dict[str, Any]:
-    raw = values.get(name)
-    if not isinstance(raw, bytes) or len(raw) % np.dtype(dtype).itemsize:
-        raise PayloadError(f"{message.__name__}.{name}: bin of {dtype} was expected")
-    array = np.frombuffer(raw, dtype)
-    if message is Map:
-        rows, columns = values.get("rows"), values.get("columns")
-        if not (_is_count(rows) and _is_count(columns) and rows * columns == array.size):
-            raise PayloadError(f"Map.cells: {array.size} cells do not fill {rows} rows x {columns} columns")
-        try:
-            array = array.reshape(rows, columns)
-        except (ValueError, OverflowError) as error:
-            raise PayloadError(f"Map.cells: {rows} rows x {columns} columns: {error}") from error
-    return {**values, name: array}
+_EMPTY = b"\x80"
 
 
-def _is_count(value: Any) -> TypeGuard[int]:
-    return isinstance(value, int) and value >= 0
+@cache
+def _decoder(message: type[FleetMessage]) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(message, dec_hook=_array)
 
 
-def _keep_array(kind: type[Any], value: Any) -> Any:
-    return value
+def _array(kind: Any, value: Any) -> Any:
+    """Read the array a field is declared as."""
+    dtype = np.dtype("<f4") if kind == Floats else np.dtype("|u1")
+    if not isinstance(value, bytes) or len(value) % dtype.itemsize:
+        raise ValueError(f"bin of {dtype.name} was expected")
+    return np.frombuffer(value, dtype)
+
+
+def _shaped(message: Any) -> Any:
+    if not isinstance(message, Map):
+        return message
+    rows, columns, cells = message.rows, message.columns, message.cells
+    if rows < 0 or columns < 0 or rows * columns != cells.size:
+        raise ValueError(f"{cells.size} cells do not fill {rows} rows x {columns} columns")
+    return msgspec.structs.replace(message, cells=cells.reshape(rows, columns))

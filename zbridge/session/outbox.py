@@ -20,15 +20,14 @@ LIMIT = 64
 class _Standing:
     """The frames of one slot: sent as a group, then again every ``period_s`` until ``until``."""
 
-    __slots__ = ("due", "frames", "period_s", "position", "until", "urgent")
+    __slots__ = ("due", "frames", "period_s", "position", "until")
 
-    def __init__(self, frames: tuple[bytes, ...], due: float, period_s: float, until: float, urgent: bool) -> None:
+    def __init__(self, frames: tuple[bytes, ...], due: float, period_s: float, until: float) -> None:
         self.frames = frames
         self.position = 0
         self.due = due
         self.period_s = period_s
         self.until = until
-        self.urgent = urgent
 
     def step(self, now: float) -> bytes:
         frame = self.frames[self.position]
@@ -50,6 +49,7 @@ class Outbox:
         self.gap_s = gap_s
         self._limit = limit
         self._queue: deque[bytes] = deque()
+        self._urgent: deque[bytes] = deque(maxlen=limit)
         self._standing: dict[str, _Standing] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False
@@ -58,7 +58,7 @@ class Outbox:
         return f"<Outbox {len(self._queue)} waiting, standing {sorted(self._standing)}>"
 
     def __len__(self) -> int:
-        return len(self._queue)
+        return len(self._urgent) + len(self._queue)
 
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when too many wait."""
@@ -78,9 +78,17 @@ class Outbox:
     ) -> None:
         """Let ``frames`` stand in ``slot``: sent as soon as may be, then every ``period_s`` until ``until``.
 
-        What stood there is forgotten, sent or not. Urgent frames go before all others.
+        What stood there is forgotten, sent or not; of two groups of the same length the newer goes on where
+        the older was, so that every place of the group has its turn. Urgent frames go before all others, and
+        once whatever replaces them.
         """
-        self._standing[slot] = _Standing(frames, now, period_s, until, urgent)
+        old = self._standing.get(slot)
+        new = self._standing[slot] = _Standing(frames, now, period_s, until)
+        if urgent:
+            self._urgent.extend(frame for frame in frames if frame not in self._urgent)
+            new.due = now + period_s
+        elif old is not None and len(old.frames) == len(frames):
+            new.position = old.position
 
     def clear(self, slot: str) -> None:
         """Forget what stands in ``slot``."""
@@ -90,35 +98,34 @@ class Outbox:
         """Take the frame to write now, None when there is none or the gap has not passed."""
         if now < self._free_at:
             return None
+        frame = self._urgent.popleft() if self._urgent else self._next(now)
+        if frame is not None:
+            self._free_at = now + self.gap_s
+        return frame
+
+    def _next(self, now: float) -> bytes | None:
         slot = self._due_slot(now)
         if slot is None:
-            if not self._queue:
-                return None
-            frame = self._queue.popleft()
             self._turn_of_queue = False
-        else:
-            standing = self._standing[slot]
-            frame = standing.step(now)
-            if standing.over:
-                del self._standing[slot]
-            self._turn_of_queue = True
-        self._free_at = now + self.gap_s
+            return self._queue.popleft() if self._queue else None
+        standing = self._standing[slot]
+        frame = standing.step(now)
+        if standing.over:
+            del self._standing[slot]
+        self._turn_of_queue = True
         return frame
 
     def deadline(self) -> float | None:
         """Tell when :meth:`take` will have something, None when nothing waits or stands."""
-        if self._queue:
+        if self._urgent or self._queue:
             return self._free_at
         if not self._standing:
             return None
         return max(self._free_at, min(standing.due for standing in self._standing.values()))
 
     def _due_slot(self, now: float) -> str | None:
-        """Pick a due slot; urgent ones first, the others take turns with the queue."""
+        """Pick a due slot; slots take turns with the queue."""
         due = [slot for slot, standing in self._standing.items() if standing.due <= now]
-        urgent = next((slot for slot in due if self._standing[slot].urgent), None)
-        if urgent is not None or not due:
-            return urgent
-        if self._queue and self._turn_of_queue:
+        if not due or (self._queue and self._turn_of_queue):
             return None
         return min(due, key=lambda slot: self._standing[slot].due)

@@ -128,7 +128,9 @@ class Session(ABC, Generic[M]):
     # What a driver calls
 
     def open(self, now: float) -> None:
-        """Begin: the transport is up."""
+        """Begin: the transport is up. A session that was ended before stays so."""
+        if self.state is not State.CONNECTING:
+            return
         self.state = State.HANDSHAKING
         self._limit_at = now + self.limits.handshake_s
         self.opened(now)

@@ -120,11 +120,15 @@ def _all_scalars(fields: Sequence[_Field]) -> str | None:
 
 def _fixed_decoder(message: type[M], layout: struct.Struct) -> Callable[[bytes, int], M]:
     unpack, size = layout.unpack_from, layout.size
+    checks = message.check is not Message.check
 
     def decode(data: bytes, start: int) -> M:
         if len(data) - start != size:
             raise ProtocolError(f"{message.__name__} of {len(data) - start} bytes, expected {size}")
-        return message(*unpack(data, start))
+        decoded = message(*unpack(data, start))
+        if checks:
+            decoded.check()
+        return decoded
 
     return decode
 
@@ -145,7 +149,7 @@ def _counted(count_code: str, item_size: int) -> tuple[Callable[[bytes, int], tu
         (items,) = count.unpack_from(data, position)
         first = position + count.size
         if items < 0 or first + items * item_size > len(data):
-            raise ProtocolError(f"count {items} does not fit the {len(data) - first} bytes that follow")
+            raise ValueError(f"count {items} does not fit the {len(data) - first} bytes that follow")
         return first, first + items * item_size
 
     return span, count

@@ -15,7 +15,7 @@ import msgspec
 
 from zbridge.errors import LinkError
 
-READ_BYTES = 32 * 1024
+READ_BYTES = 64 * 1024
 """Most bytes taken from a socket before the loop serves others."""
 CONNECT_S = 5.0
 """Longest time a connection attempt may take."""

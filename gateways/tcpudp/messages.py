@@ -249,9 +249,7 @@ class ClientSimulatedLidarData(Packet, frozen=True, eq=False):
     ranges: F32Array
 
 
-_MAP_ID, _POSITION_ID = ServerSLAMMap.spec.id, ServerPosition.spec.id
-_POSITION_BYTES = HEADER.size + 12
-_MAP_OF_8 = 8
+_MAP_OF_12_BYTES = 8
 """The only count with which twelve bytes of body are a map."""
 
 
@@ -296,17 +294,18 @@ def read_header(frame: bytes) -> tuple[int, int]:
 
 def decode_packet(frame: bytes) -> Packet:
     """Read one whole packet; raise ProtocolError for a header or a body that is not what it says."""
-    return decode_body(read_header(frame)[1], frame)
+    return decoder(read_header(frame)[1])(frame, HEADER.size)
 
 
-def decode_body(packet_id: int, frame: bytes) -> Packet:
-    """Read the body of a packet whose header was checked: by ``frame_end`` in a stream, by ``read_header`` else.
-
-    Some robots answer 54 with id 53 and three floats ("The gateway as HQ"): that is a position.
-    """
-    if packet_id == _MAP_ID and len(frame) == _POSITION_BYTES and int.from_bytes(frame[6:10], "little") != _MAP_OF_8:
-        packet_id = _POSITION_ID
+def decoder(packet_id: int) -> Callable[[bytes, int], Packet]:
+    """Give the function that reads the body of a packet, ``decode(frame, start of the body)``."""
     spec = PACKETS.get(packet_id)
     if spec is None:
-        return OpaquePacket(packet_id, frame[HEADER.size :])
-    return spec.codec.decode(frame, _HEADER_SIZE)
+        return lambda frame, start: OpaquePacket(packet_id, frame[start:])
+    return _decode_map if spec.packet is ServerSLAMMap else spec.codec.decode
+
+
+def _decode_map(frame: bytes, start: int) -> Packet:
+    """Read packet 53; some robots answer 54 with it and three floats: a position ("The gateway as HQ")."""
+    three_floats = len(frame) - start == 12 and int.from_bytes(frame[start : start + 4], "little") != _MAP_OF_12_BYTES
+    return (ServerPosition if three_floats else ServerSLAMMap).spec.codec.decode(frame, start)

@@ -6,9 +6,10 @@ Spoken here: version 1.3 over TCP.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from gateways.tcpudp.messages import (
+    HEADER,
     MAX_FRAME,
     PACKETS,
     SERVER_ID,
@@ -18,7 +19,7 @@ from gateways.tcpudp.messages import (
     Packet,
     Sender,
     ServerSettings,
-    decode_body,
+    decoder,
     encode_packet,
     frame_end,
 )
@@ -44,9 +45,13 @@ def limits(gap_s: float) -> Limits:
     return Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S, gap_s=gap_s)
 
 
-def packets_of(sender: Sender) -> frozenset[int]:
-    """List the ids of the packets that only one side sends."""
-    return frozenset(spec.id for spec in PACKETS.values() if spec.sender is sender)
+Decode = Callable[[bytes, int], Packet]
+
+
+def decoders(own: Sender, peer_ids: Iterable[int]) -> dict[bytes, Decode]:
+    """Tabulate, by ``id`` byte and packet id, how to read what a peer may send to the side ``own``."""
+    packet_ids = [number for number in range(256) if number not in PACKETS or PACKETS[number].sender is not own]
+    return {bytes((peer_id, number)): decoder(number) for peer_id in peer_ids for number in packet_ids}
 
 
 class _TcpUdpSession(Session[Packet]):
@@ -55,22 +60,24 @@ class _TcpUdpSession(Session[Packet]):
     frame_end = staticmethod(frame_end)
     sender_id: int
     """The ``id`` byte of what we send."""
-    peer_ids: tuple[int, ...]
-    """The ``id`` bytes the peer may use."""
-    own_packets: frozenset[int]
-    """The packet ids only our side sends."""
+    _decoders: dict[bytes, Decode]
 
     def encode(self, message: Packet) -> bytes:
         return encode_packet(message, self.sender_id)
 
     def decode(self, frame: bytes) -> Packet:
         """Read a packet of the stream; ``frame_end`` has checked its length."""
-        sender_id, packet_id = frame[4], frame[5]
-        if sender_id not in self.peer_ids:
-            raise ProtocolError(f"packet with id {sender_id}, expected {' or '.join(map(str, self.peer_ids))}")
-        if packet_id in self.own_packets:
-            raise ProtocolError(f"{PACKETS[packet_id].name} ({packet_id}) from the wrong side")
-        return decode_body(packet_id, frame)
+        decode = self._decoders.get(frame[4:6])
+        if decode is None:
+            raise ProtocolError(self._odd(frame[4], frame[5]))
+        return decode(frame, HEADER.size)
+
+    def _odd(self, sender_id: int, packet_id: int) -> str:
+        """Say why the peer may not send a packet like this."""
+        spec = PACKETS.get(packet_id)
+        if spec is not None and spec.sender is _OWN[self.role]:
+            return f"{spec.name} ({packet_id}) from the wrong side"
+        return f"packet {packet_id} with id {sender_id}, which is not the peer's"
 
     def refuse_versions(self, listed: str, now: float) -> None:
         """Tell the peer and the operator that no version is common, and close."""
@@ -79,12 +86,15 @@ class _TcpUdpSession(Session[Packet]):
         self.close(reason, now)
 
 
+_OWN = {Role.HQ: Sender.HQ, Role.ROBOT: Sender.ROBOT}
+
+
 class HqSession(_TcpUdpSession):
     """We play HQ towards a robot. ``force``: features and packet ids to use although it does not announce them."""
 
     role = Role.HQ
-    own_packets = packets_of(Sender.HQ)
-    peer_ids = (SERVER_ID,)
+    handled = frozenset({ServerSettings})
+    _decoders = decoders(Sender.HQ, (SERVER_ID,))
 
     def __init__(self, limits: Limits, *, force: Iterable[Feature | int] = ()) -> None:
         super().__init__(limits)
@@ -147,14 +157,14 @@ class RobotSession(_TcpUdpSession):
     """We play the robot towards an HQ: what we announce, and the id we give it."""
 
     role = Role.ROBOT
-    own_packets = packets_of(Sender.ROBOT)
+    handled = frozenset({ClientSettings})
     sender_id = SERVER_ID
 
     def __init__(self, limits: Limits, settings: Settings, client_id: int) -> None:
         super().__init__(limits)
         self.settings = settings
         self.client_id = client_id
-        self.peer_ids = (0, client_id)
+        self._decoders = decoders(Sender.ROBOT, (0, client_id))
         self.client: Settings | None = None
 
     def opened(self, now: float) -> None:

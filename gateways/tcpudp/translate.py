@@ -255,7 +255,7 @@ def _side(cells: int, settings: Settings | None) -> int:
 
 def _known_cells(cells: Cells) -> Cells:
     """Take cells that are none of 0, 1, 2 as unknown."""
-    return cells if cells.size == 0 or cells.max() <= _OCCUPIED else np.where(cells <= _OCCUPIED, cells, np.uint8(0))
+    return cells if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED else np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def _switch(mode: int, stamp_ns: int) -> Switch:

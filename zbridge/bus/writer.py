@@ -12,7 +12,7 @@ from zbridge.metrics import Metrics
 log = logging.getLogger("zbridge.bus")
 
 BACKLOG = 4096
-"""How much may wait: each message counts one, and one more for every KiB of a large one."""
+"""How much may wait: each message counts one, and one more for every 256 bytes of a state."""
 
 Call = Callable[[], None]
 

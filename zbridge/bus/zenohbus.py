@@ -347,7 +347,7 @@ class _StatePublisher:
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last = payload
         return self._writer.replace(
-            self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 1024
+            self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 256
         )
 
     def close(self) -> None:

@@ -83,6 +83,8 @@ class Session(ABC, Generic[M]):
 
     role: Role
     frame_end: FrameEnd
+    handled: frozenset[type] = frozenset()
+    """The message classes a session keeps for itself after the handshake too."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -119,7 +121,7 @@ class Session(ABC, Generic[M]):
 
     @abstractmethod
     def accept(self, message: M, now: float) -> bool:
-        """Take one message; False keeps it for the session itself."""
+        """Take a message of the handshake, or of a class in ``handled``; False keeps it for the session itself."""
 
     def overdue(self) -> str:
         """Say why a handshake that was never finished probably was not."""
@@ -144,7 +146,8 @@ class Session(ABC, Generic[M]):
         messages: list[M] = []
         if self.over:
             return messages
-        traffic, decode, accept, tap = self.traffic, self.decode, self.accept, self.tap
+        traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
+        open_to_all = self.state is State.ESTABLISHED
         traffic.bytes_in += len(data)
         frames = 0
         try:
@@ -154,10 +157,14 @@ class Session(ABC, Generic[M]):
                     tap("in", frame)
                 try:
                     message = decode(frame)
-                    if accept(message, now):
+                    if open_to_all and type(message) not in handled:
                         messages.append(message)
-                    elif self.over:
+                        continue
+                    if self.accept(message, now):
+                        messages.append(message)
+                    if self.over:
                         break
+                    open_to_all = self.state is State.ESTABLISHED
                 except ProtocolError as error:
                     self.malformed(str(error))
         except ProtocolError as error:

@@ -1,0 +1,209 @@
+"""The fake bus: key matching by Zenoh's rules, samples, last values, queries, tokens."""
+
+import asyncio
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.clock import jumping
+from zbridge.bus import Answer, Question, Sample
+from zbridge.bus.fake import FakeBus, FakeQuestion, matches
+from zbridge.fleet import topics
+
+MATCHES = [
+    ("a/b/c", "a/b/c", True),
+    ("a/b/c", "a/b", False),
+    ("a/b", "a/b/c", False),
+    ("a/*/c", "a/b/c", True),
+    ("a/*/c", "a/c", False),
+    ("a/*/c", "a/b/b/c", False),
+    ("*", "a", True),
+    ("*", "a/b", False),
+    ("**", "a", True),
+    ("**", "a/b/c", True),
+    ("a/**", "a", True),
+    ("a/**", "a/b/c", True),
+    ("a/**", "b", False),
+    ("a/**/c", "a/c", True),
+    ("a/**/c", "a/b/b/c", True),
+    ("a/**/c", "a/b/c/d", False),
+    ("**/c", "a/b/c", True),
+    ("**/c", "c", True),
+    ("a/**/b/**/c", "a/x/b/y/b/c", True),
+    # chunks that begin with @ are matched by nothing but themselves
+    ("fleet/r1/*", "fleet/r1/@cmd", False),
+    ("fleet/r1/**", "fleet/r1/@cmd/drive", False),
+    ("fleet/**", "fleet/r1/@cmd/drive", False),
+    ("**/drive", "fleet/r1/@cmd/drive", False),
+    ("**", "@alive", False),
+    ("fleet/*/@cmd/drive", "fleet/r1/@cmd/drive", True),
+    ("fleet/*/@cmd/**", "fleet/r1/@cmd/drive", True),
+    ("fleet/*/@cmd/**", "fleet/r1/@cmd", True),
+    ("fleet/**/@cmd/*", "fleet/r1/@cmd/drive", True),
+    ("fleet/r1/@cmd/**", "fleet/r1/@cmd/@x", False),
+    ("fleet/r1/@cmd/**", "fleet/r1/@rpc/map", False),
+    ("fleet/*/@alive/*", "fleet/r1/@alive/gateway", True),
+    ("**/@alive/**", "fleet/r1/@alive/gateway", True),
+]
+
+
+@pytest.mark.parametrize(("key_expr", "key", "matching"), MATCHES)
+def test_a_key_expression_matches_as_the_rules_of_zenoh_say(key_expr: str, key: str, matching: bool) -> None:
+    assert matches(key_expr, key) is matching
+    assert zenoh.KeyExpr(key_expr).includes(zenoh.KeyExpr(key)) is matching
+
+
+CHUNK = st.sampled_from(["a", "b", "@a", "@b"])
+
+
+@given(
+    st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join),
+    st.lists(CHUNK, min_size=1, max_size=5).map("/".join),
+)
+def test_a_key_expression_matches_as_zenoh_itself_says(key_expr: str, key: str) -> None:
+    canonical = zenoh.KeyExpr.autocanonize(key_expr)
+    assert matches(str(canonical), key) is canonical.includes(zenoh.KeyExpr(key))
+
+
+def test_a_sample_reaches_every_subscriber_that_matches_on_every_session() -> None:
+    bus = FakeBus()
+    other = bus.join("2")
+    seen: list[tuple[str, Sample]] = []
+    bus.subscribe("fleet/*/pose", lambda sample: seen.append(("star", sample)))
+    other.subscribe("fleet/r1/pose", lambda sample: seen.append(("exact", sample)))
+    other.subscribe("fleet/r2/pose", lambda sample: seen.append(("other", sample)))
+    bus.publisher("fleet/r1/pose", topics.POSE).put(b"p", b"attached")
+    sample = Sample("fleet/r1/pose", b"p", b"attached")
+    assert seen == [("star", sample), ("exact", sample)]
+    assert other.values("fleet/**") == [b"p"]
+
+
+def test_a_closed_subscription_gets_nothing_and_closing_twice_does_no_harm() -> None:
+    bus = FakeBus()
+    seen: list[Sample] = []
+    handle = bus.subscribe("**", seen.append)
+    handle.close()
+    handle.close()
+    bus.publisher("fleet/r1/pose", topics.POSE).put(b"p")
+    assert seen == []
+
+
+def test_a_latecomer_gets_last_values_of_states_only() -> None:
+    bus = FakeBus()
+    bus.publisher("fleet/r1/pose", topics.POSE).put(b"pose")
+    status = bus.publisher("fleet/r1/status", topics.STATUS)
+    status.put(b"one")
+    status.put(b"two")
+    seen: list[Sample] = []
+    bus.join("2").subscribe("fleet/**", seen.append, history=True)
+    assert seen == [Sample("fleet/r1/status", b"two")]
+    without: list[Sample] = []
+    bus.subscribe("fleet/**", without.append)
+    assert without == []
+
+
+@jumping
+async def test_a_query_gets_last_values_until_their_publisher_goes() -> None:
+    bus = FakeBus()
+    publisher = bus.publisher("fleet/r1/status", topics.STATUS)
+    publisher.put(b"one")
+    assert await bus.ask("fleet/*/status") == [Answer("fleet/r1/status", b"one")]
+    publisher.close()
+    assert await bus.ask("fleet/*/status") == []
+
+
+@jumping
+async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> None:
+    bus = FakeBus()
+
+    def answer(question: Question) -> None:
+        question.answer(question.payload + b"!")
+
+    bus.answer("fleet/r1/@rpc/map", answer)
+    handle = bus.answer("fleet/r2/@rpc/map", lambda question: question.refuse("offline"))
+    assert await bus.ask("fleet/*/@rpc/map", b"hi") == [
+        Answer("fleet/r1/@rpc/map", b"hi!"),
+        Answer("fleet/r2/@rpc/map", b"", "offline"),
+    ]
+    handle.close()
+    assert await bus.ask("fleet/r2/@rpc/map") == []
+
+
+@jumping
+async def test_tokens_are_seen_while_they_last() -> None:
+    bus = FakeBus()
+    handle = bus.announce("fleet/r1/@alive/gateway")
+    bus.join("2").announce("fleet/r2/@alive/gateway")
+    assert await bus.alive("fleet/*/@alive/*") == ["fleet/r1/@alive/gateway", "fleet/r2/@alive/gateway"]
+    handle.close()
+    assert await bus.alive("fleet/*/@alive/*") == ["fleet/r2/@alive/gateway"]
+
+
+@jumping
+async def test_a_session_that_leaves_takes_back_what_it_declared_and_nothing_else() -> None:
+    bus = FakeBus()
+    other = bus.join("2")
+    seen: list[Sample] = []
+    other.subscribe("**", seen.append)
+    other.announce("fleet/r1/@alive/hq")
+    other.answer("fleet/r1/@rpc/map", lambda question: question.answer(b""))
+    bus.announce("fleet/r1/@alive/gateway")
+    await other.close()
+    await other.close()
+    bus.publisher("fleet/r1/pose", topics.POSE).put(b"p")
+    assert seen == []
+    assert await bus.ask("fleet/r1/@rpc/map") == []
+    assert await bus.alive("**/@alive/*") == ["fleet/r1/@alive/gateway"]
+
+
+def test_the_loss_and_return_of_the_bus_can_be_played() -> None:
+    bus = FakeBus()
+    seen: list[bool] = []
+    handle = bus.watch_connected(seen.append)
+    bus.connection(False)
+    bus.connection(True)
+    handle.close()
+    bus.connection(False)
+    assert seen == [True, False, True]
+
+
+def test_a_full_bus_asks_for_a_pause_and_relieves_it() -> None:
+    bus = FakeBus()
+    publisher = bus.publisher("fleet/r1/pose", topics.POSE)
+    relieved: list[bool] = []
+    bus.on_relief(lambda: relieved.append(True))
+    assert bus.put_all([(publisher, b"1"), (publisher, b"2")])
+    bus.takes = False
+    assert not bus.put_all([(publisher, b"3")])
+    assert bus.values("fleet/r1/pose") == [b"1", b"2", b"3"]
+    bus.relieve()
+    assert relieved == [True]
+    assert bus.put_all([])
+
+
+@jumping
+async def test_frames_are_wanted_only_while_somebody_listens() -> None:
+    bus = FakeBus()
+    told: list[bool] = []
+    bus.frames("fleet/r1/@wire/robot/in", told.append)
+    await asyncio.sleep(0)
+    assert told == []
+    bus.subscribe("fleet/r1/@wire/**", lambda sample: None)
+    bus.frames("fleet/r1/@wire/robot/in", told.append)
+    await asyncio.sleep(0)
+    assert told == [True]
+
+
+def test_a_question_keeps_its_replies() -> None:
+    question = FakeQuestion("k", b"?")
+    question.answer(b"a")
+    question.refuse("no")
+    assert question.replies == [Answer("k", b"a"), Answer("k", b"", "no")]
+    assert (question.payload, question.attachment) == (b"?", None)
+
+
+def test_sessions_tell_their_ids() -> None:
+    bus = FakeBus("7")
+    assert (bus.zid, bus.join("8").zid, repr(bus)) == ("7", "8", "<FakeBus 7>")

@@ -1,0 +1,207 @@
+"""Configurations: what is accepted, and that every error names file, key, value and what was expected."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zbridge.config import Plan, load, plan
+from zbridge.errors import ConfigError
+from zbridge.link import Address
+from zbridge.protocol import find_protocol, protocol_names
+
+MINIMAL = """
+[robot]
+name = "r1"
+[device]
+protocol = "tcpudp"
+connect = ["tcp://127.0.0.1:11001"]
+"""
+
+
+def minimal(**tables: Any) -> dict[str, Any]:
+    return {
+        "robot": {"name": "r1"},
+        "device": {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:11001"]},
+        **tables,
+    }
+
+
+def device(**fields: Any) -> dict[str, Any]:
+    return minimal(device={"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:11001"], **fields})
+
+
+def loaded(folder: Path, text: str, **environment: str) -> Plan:
+    file = folder / "robot.toml"
+    file.write_text(text, encoding="utf-8")
+    return load(file, environment)
+
+
+def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
+    made = loaded(tmp_path, MINIMAL)
+    assert (made.config.robot.name, made.config.robot.realm) == ("r1", "fleet")
+    assert made.addresses == (Address("127.0.0.1", 11001),)
+    assert made.protocol.name == "tcpudp"
+    assert made.options == made.protocol.options()
+    assert (made.config.control.lease_s, made.config.control.deadman_s) == (3.0, 2.0)
+    assert made.config.bus.effective_mode == "peer"
+    assert made.config.bus.multicast
+    assert made.config.bus.stream == "drop"
+    assert made.metrics is None
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_the_template_of_every_protocol_is_a_configuration(tmp_path: Path, name: str) -> None:
+    made = loaded(tmp_path, find_protocol(name).template.replace("{name}", "r7"))
+    assert made.config.robot.name == "r7"
+    assert made.options == made.protocol.options()
+
+
+def test_every_table_is_read(tmp_path: Path) -> None:
+    made = loaded(
+        tmp_path,
+        MINIMAL
+        + """
+[device.options]
+gap_s = 0.05
+force = ["joystick", 50]
+[bus]
+connect = ["tcp/10.0.0.1:7447"]
+multicast = false
+stream = "block"
+tls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }
+[control]
+deadman_s = 0.5
+[metrics]
+listen = "127.0.0.1:9100"
+""",
+    )
+    assert made.options.gap_s == 0.05
+    assert made.options.force == ("joystick", 50)
+    assert made.config.bus.connect == ("tcp/10.0.0.1:7447",)
+    assert made.config.bus.tls is not None
+    assert made.config.bus.tls.key == "k.pem"
+    assert made.config.control.deadman_s == 0.5
+    assert made.metrics == Address("127.0.0.1", 9100)
+
+
+@pytest.mark.parametrize(
+    ("bus", "mode"),
+    [
+        ({}, "peer"),
+        ({"connect": ["tcp/a:1"]}, "client"),
+        ({"connect": ["tcp/a:1"], "listen": ["tcp/b:2"]}, "peer"),
+        ({"listen": ["tcp/b:2"]}, "peer"),
+        ({"connect": ["tcp/a:1"], "mode": "peer"}, "peer"),
+        ({"mode": "router"}, "router"),
+    ],
+)
+def test_the_mode_of_the_bus_is_client_when_only_connect_is_given(bus: dict[str, Any], mode: str) -> None:
+    assert plan(minimal(bus=bus)).config.bus.effective_mode == mode
+
+
+def test_variables_of_the_environment_are_put_into_strings_wherever_they_stand() -> None:
+    raw = minimal(robot={"name": "r-${N}${N}"}, bus={"connect": ["tcp/${HOST}:7447"]})
+    raw["device"]["connect"] = ["tcp://${HOST}:${PORT}"]
+    made = plan(raw, {"N": "7", "HOST": "robot.test", "PORT": "11001"})
+    assert made.config.robot.name == "r-77"
+    assert made.addresses == (Address("robot.test", 11001),)
+    assert made.config.bus.connect == ("tcp/robot.test:7447",)
+
+
+def test_a_value_of_the_environment_is_not_substituted_again() -> None:
+    with pytest.raises(ConfigError, match="letters"):
+        plan(minimal(robot={"name": "${A}"}), {"A": "${B}", "B": "x"})
+
+
+ERRORS: list[tuple[dict[str, Any], str]] = [
+    ({}, "robot: missing"),
+    ({"robot": {}, "device": {}}, "robot.name: missing"),
+    ({"robot": {"name": "r1"}}, "device: missing"),
+    (minimal(robot={"name": 5}), "robot.name = 5: expected `str`"),
+    (minimal(robot={"name": "a/b"}), "robot.name = 'a/b': expected letters"),
+    (minimal(robot={"name": ""}), "robot.name = '': expected letters"),
+    (minimal(robot={"name": "@r"}), "robot.name = '@r': expected letters"),
+    (minimal(robot={"name": "r1", "realm": "*"}), "robot.realm = '*': expected letters"),
+    (minimal(robot={"name": "r1", "colour": "red"}), "robot.colour = 'red': unknown key"),
+    (minimal(robot=1), "robot = 1: expected `object`"),
+    (minimal(colour="red"), "colour = 'red': unknown key"),
+    (minimal(robot={"name": "${NONE}"}), "robot.name = '${NONE}': expected the environment variable NONE"),
+    (device(connect=["${NONE}"]), "device.connect[0] = '${NONE}': expected the environment variable NONE"),
+    (device(protocol="nope"), "device.protocol = 'nope': expected one of"),
+    (device(connect=[]), "device.connect = []: expected `array` of length >= 1"),
+    (device(connect="tcp://a:1"), "device.connect = 'tcp://a:1': expected `array`"),
+    (device(connect=["tcp://a:1", 5]), "device.connect[1] = 5: expected `str`"),
+    (device(connect=["udp://a:1"]), "device.connect = 'udp://a:1': expected tcp://host:port"),
+    (device(connect=["tcp://a:99999"]), "device.connect = 'tcp://a:99999': "),
+    (device(connect=["tcp://a:1", "tcp://a:2"]), "a tcpudp robot has at most 1 link"),
+    (device(options=5), "device.options = 5: expected `object`"),
+    (device(options={"gap": 1}), "device.options.gap = 1: unknown key"),
+    (device(options={"gap_s": -1}), "device.options.gap_s = -1: expected `float` >= 0"),
+    (device(options={"speed_full": 0.0}), "device.options.speed_full = 0.0: expected `float` > 0"),
+    (device(options={"combine": "all"}), "device.options.combine = 'all': expected one of 'both', 'exclusive'"),
+    (device(options={"force": ["wings"]}), "device.options.force[0] = 'wings': expected one of"),
+    (device(options={"force": [300]}), "device.options.force[0] = 300: expected `int` <= 255"),
+    (device(options={"map_origin": [1.0]}), "device.options.map_origin = [1.0]: expected `array` of length 2"),
+    (minimal(bus={"mode": "mesh"}), "bus.mode = 'mesh': expected one of 'client', 'peer', 'router'"),
+    (minimal(bus={"stream": "lose"}), "bus.stream = 'lose': expected one of 'block', 'drop'"),
+    (minimal(bus={"connect": [1]}), "bus.connect[0] = 1: expected `str`"),
+    (minimal(bus={"connect": ["127.0.0.1:7447"]}), "bus.connect[0] = '127.0.0.1:7447': "),
+    (minimal(bus={"tls": {"ca": 1}}), "bus.tls.ca = 1: expected `str`"),
+    (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
+    (minimal(control={"lease_s": 0}), "control.lease_s = 0: expected `float` > 0"),
+    (minimal(control={"deadman_s": float("nan")}), "control.deadman_s = nan: expected"),
+    (minimal(control={"deadman_s": float("inf")}), "control.deadman_s = inf: expected"),
+    *[
+        (device(options={name: value}), f"device.options.{name} = {value}: expected `float` ")
+        for name in ("speed_full", "turn_full", "length_unit_m", "map_cell_m", "heading_offset")
+        for value in (math.inf, -math.inf, math.nan)
+    ],
+    *[
+        (device(options={"map_origin": [0.0, value]}), f"device.options.map_origin[1] = {value}: expected `float` ")
+        for value in (math.inf, math.nan)
+    ],
+    (minimal(metrics={"listen": "9100"}), "metrics.listen = '9100': expected host:port"),
+    (minimal(metrics={"listen": "tcp://a:1"}), "metrics.listen = 'tcp://a:1': expected host:port"),
+    (minimal(metrics={}), "metrics.listen: missing"),
+]
+
+
+@pytest.mark.parametrize(("raw", "text"), ERRORS, ids=[text for _, text in ERRORS])
+def test_an_error_names_key_value_and_what_was_expected(raw: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        plan(raw, {})
+    assert text in str(caught.value)
+
+
+def test_an_unknown_key_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="expected one of name, realm"):
+        plan(minimal(robot={"nam": "r1"}))
+
+
+def test_an_error_in_a_file_names_the_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"robot\.toml: robot\.name = 'a/b'"):
+        loaded(tmp_path, MINIMAL.replace('"r1"', '"a/b"'))
+
+
+def test_a_file_that_is_no_toml_is_an_error_that_names_it_and_the_place(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"robot\.toml: not TOML: .*line 2"):
+        loaded(tmp_path, "\nname = \n")
+
+
+def test_a_file_that_is_no_text_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "robot.toml"
+    file.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="not TOML"):
+        load(file)
+
+
+def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+        load(tmp_path / "none.toml")
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="directory"):
+        load(tmp_path)

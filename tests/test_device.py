@@ -1,0 +1,1152 @@
+"""The device side with a TCP/UDP robot: a fake bus, a fake link, a clock that jumps, bytes from the protocol page."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import math
+import struct
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import msgpack
+import pytest
+
+from gateways.tcpudp.translate import Options, TcpUdpRobot
+from tests.clock import jumping
+from zbridge.bus import Handle, Question
+from zbridge.bus.fake import FakeBus, FakeQuestion
+from zbridge.conversation import Conversation
+from zbridge.device import HEARTBEAT_S, STOP_REPEAT_S, Device
+from zbridge.errors import LinkError
+from zbridge.fleet import topics
+from zbridge.fleet.topics import KeySpace
+from zbridge.link import Address, FakeLink
+from zbridge.metrics import Metrics
+from zbridge.session.control import Authority
+from zbridge.session.manager import SessionManager
+from zbridge.session.session import State
+
+ADDRESS = Address("robot.test", 11001)
+LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
+# client id 2; cam, joystick, chat, lidar, lidar sim, map yes, UDP no; map size 30, interval 10
+SETTINGS = bytes.fromhex("21000000 01 02 02") + LISTED + bytes.fromhex("00010101010101 1e000000 0a000000")
+PLAIN_SETTINGS = bytes.fromhex("21000000 01 02 02") + LISTED + bytes.fromhex("00000000000000 00000000 00000000")
+# flags of our answer: nothing but LidarSim
+ANSWER = bytes.fromhex("18000000 02 03") + LISTED + bytes.fromhex("00000000000100")
+STOP = bytes.fromhex("02000000 02 0d")
+MOVE_LEFT = bytes.fromhex("0e000000 02 0b 000080bf 00000000 0000803f")
+TURN_LEFT = bytes.fromhex("06000000 02 0c 000000bf")
+POSITION = bytes.fromhex("0e000000 01 37 00001643 000048c2 0000b442")
+MAP = bytes.fromhex("0f000000 01 35 09000000 000102 020200 010001")
+BYE = bytes.fromhex("09000000 01 01 03000000 627965")
+
+DRIVE_LEFT = {"left": 1.0}
+NEUTRAL: dict[str, Any] = {}
+
+
+class TimedLink(FakeLink):
+    """Keeps the time of every write."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, peer: str) -> None:
+        super().__init__(peer)
+        self.times: list[float] = []
+        self._loop = loop
+
+    def write(self, data: bytes) -> None:
+        super().write(data)
+        self.times.append(self._loop.time())
+
+
+class OpenBus(FakeBus):
+    """Lets a test put a question whose answer comes later."""
+
+    def __init__(self) -> None:
+        super().__init__("1")
+        self.answers: dict[str, Callable[[Question], None]] = {}
+
+    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+        self.answers[key] = handler
+        return super().answer(key, handler)
+
+
+class Rig:
+    """A device with everything around it played by the test."""
+
+    def __init__(self, options: Options, deadman_s: float, bus: OpenBus) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.bus = bus
+        self.hq = self.bus.join("2")
+        self.metrics = Metrics()
+        self.manager = SessionManager()
+        self.links: list[TimedLink] = []
+        self.conversations: list[Conversation] = []
+        self.unreachable: str | None = None
+        self.device = Device(
+            TcpUdpRobot(options),
+            (ADDRESS,),
+            protocol="tcpudp",
+            keys=KeySpace("fleet", "r1"),
+            bus=self.bus,
+            authority=Authority(deadman_s),
+            manager=self.manager,
+            metrics=self.metrics,
+            connect=self._connect,
+            clock_ns=lambda: 1234,
+        )
+        self._read = 0
+
+    async def _connect(self, address: Address, conversation: Conversation) -> None:
+        assert address == ADDRESS
+        if self.unreachable:
+            raise LinkError(self.unreachable)
+        link = TimedLink(self.loop, str(address))
+        self.links.append(link)
+        self.conversations.append(conversation)
+        conversation.attached(link)
+
+    @property
+    def link(self) -> TimedLink:
+        return self.links[-1]
+
+    async def settle(self) -> None:
+        """Let what is ready run, without time passing."""
+        for _ in range(10):
+            await asyncio.sleep(0)
+
+    async def establish(self, settings: bytes = SETTINGS) -> None:
+        """Finish the handshake and let the gap pass."""
+        await self.settle()
+        self.sends(settings)
+        await asyncio.sleep(0.1)
+        self.forget_written()
+
+    def sends(self, data: bytes) -> None:
+        """Play the robot sending ``data``."""
+        self.conversations[-1].received(data)
+
+    def goes(self, reason: str = "closed by peer") -> None:
+        """Play the loss of the connection."""
+        self.conversations[-1].lost(reason)
+
+    def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
+        """Play a program on the bus that commands the robot."""
+        payload = fields if isinstance(fields, bytes) else msgpack.packb(fields)
+        self.hq.publisher(f"fleet/r1/@cmd/{name}", topics.CMD_MODE).put(payload)
+
+    def ask(self, name: str) -> FakeQuestion:
+        """Play a program on the bus that asks the robot."""
+        question = FakeQuestion(f"fleet/r1/@rpc/{name}")
+        self.bus.answers[question.key](question)
+        return question
+
+    def values(self, path: str) -> list[dict[str, Any]]:
+        return [msgpack.unpackb(payload) for payload in self.bus.values(f"fleet/r1/{path}")]
+
+    def last(self, path: str) -> dict[str, Any]:
+        return self.values(path)[-1]
+
+    def forget_written(self) -> None:
+        self._read = len(self.link.written)
+
+    def written(self) -> list[bytes]:
+        """What was written since this was asked last."""
+        start, self._read = self._read, len(self.link.written)
+        return self.link.written[start:]
+
+    async def refusals(self) -> list[tuple[str, str, int]]:
+        """What ``control`` shows: command, reason, count."""
+        await asyncio.sleep(0.06)
+        return [(entry["command"], entry["reason"], entry["count"]) for entry in self.last("control")["refusals"]]
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    options: Options | None = None,
+    *,
+    deadman_s: float = 2.0,
+    unreachable: str | None = None,
+    bus: OpenBus | None = None,
+) -> AsyncIterator[Rig]:
+    rig = Rig(options or Options(), deadman_s, bus or OpenBus())
+    rig.unreachable = unreachable
+    task = asyncio.create_task(rig.device.run())
+    try:
+        await rig.settle()
+        yield rig
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+@contextlib.asynccontextmanager
+async def established(options: Options | None = None, *, deadman_s: float = 2.0) -> AsyncIterator[Rig]:
+    async with serving(options, deadman_s=deadman_s) as rig:
+        await rig.establish()
+        yield rig
+
+
+# Handshake and status
+
+
+@jumping
+async def test_the_robot_speaks_first_and_nothing_is_written_before() -> None:
+    async with serving() as rig:
+        await asyncio.sleep(1.0)
+        assert rig.link.written == []
+        assert rig.last("status")["state"] == "handshaking"
+
+
+@jumping
+async def test_the_settings_are_answered_and_the_status_shows_what_was_agreed() -> None:
+    async with serving() as rig:
+        rig.sends(SETTINGS)
+        assert rig.link.written == [ANSWER]
+        status = rig.last("status")
+        assert status["state"] == "established"
+        assert status["reason"] is None
+        assert status["protocol"] == "tcpudp"
+        assert status["version"] == "1.3"
+        assert status["features"] == ["cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
+        assert status["stamp_ns"] == 1234
+        assert status["links"] == [
+            {"name": "robot", "state": "established", "peer": "tcp://robot.test:11001", "reason": None}
+        ]
+
+
+@jumping
+async def test_the_settings_may_come_byte_by_byte() -> None:
+    async with serving() as rig:
+        for byte in SETTINGS:
+            assert rig.link.written == []
+            rig.sends(bytes([byte]))
+        assert rig.link.written == [ANSWER]
+
+
+@jumping
+async def test_the_status_goes_through_every_state_in_order() -> None:
+    async with serving() as rig:
+        await rig.establish()
+        assert [status["state"] for status in rig.values("status")] == [
+            "offline",
+            "connecting",
+            "handshaking",
+            "established",
+        ]
+        assert rig.values("status")[0]["reason"] == "not yet connected"
+
+
+@jumping
+async def test_status_and_control_are_repeated_every_second() -> None:
+    async with established() as rig:
+        status, control = len(rig.values("status")), len(rig.values("control"))
+        await asyncio.sleep(3 * HEARTBEAT_S)
+        assert len(rig.values("status")) == status + 3
+        assert len(rig.values("control")) == control + 3
+
+
+@jumping
+async def test_a_silent_robot_is_left_with_the_reason_that_its_connection_may_be_used_up() -> None:
+    async with serving() as rig:
+        await asyncio.sleep(5.1)
+        offline = [status for status in rig.values("status") if status["state"] == "offline"]
+        assert "one connection may be used up" in offline[-1]["reason"]
+        assert rig.links[0].closed
+
+
+@jumping
+async def test_an_unreachable_robot_shows_as_offline_with_the_reason_and_is_tried_again() -> None:
+    async with serving(unreachable="tcp://robot.test:11001: Connection refused") as rig:
+        assert rig.last("status")["state"] == "offline"
+        assert rig.last("status")["reason"] == "tcp://robot.test:11001: Connection refused"
+        rig.unreachable = None
+        await asyncio.sleep(1.0)
+        await rig.establish()
+        assert rig.last("status")["state"] == "established"
+
+
+@jumping
+async def test_attempts_to_reach_a_robot_come_ever_more_rarely() -> None:
+    async with serving(unreachable="no route") as rig:
+        await asyncio.sleep(60.0)
+        attempts = [status for status in rig.values("status") if status["state"] == "connecting"]
+        assert 7 <= len(attempts) <= 14
+
+
+@jumping
+async def test_a_robot_without_a_common_version_is_told_so_and_left() -> None:
+    async with serving() as rig:
+        rig.sends(
+            bytes.fromhex("19000000 01 02 02 03000000") + b"9.9" + bytes.fromhex("00010101010101 1e000000 0a000000")
+        )
+        status = rig.last("status")
+        assert status["state"] == "offline"
+        assert status["reason"].startswith("no common version: the peer speaks '9.9'")
+        (told,) = rig.link.written
+        text = status["reason"].encode()
+        assert told == (6 + len(text)).to_bytes(4, "little") + b"\x02\x01" + len(text).to_bytes(4, "little") + text
+        await rig.settle()
+        assert rig.link.closed
+
+
+@jumping
+async def test_a_broken_stream_ends_the_session_and_says_why() -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex("00000000 01 37"))
+        await rig.settle()
+        assert rig.last("status")["state"] == "offline"
+        assert "broken stream" in rig.last("status")["reason"]
+        assert rig.links[0].closed
+
+
+@jumping
+async def test_a_malformed_packet_costs_nothing_but_itself() -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex("03000000 01 37 00") + POSITION)
+        assert rig.last("status")["state"] == "established"
+        assert len(rig.values("pose")) == 1
+        assert rig.conversations[0].session.traffic.malformed == 1
+
+
+@jumping
+async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_one() -> None:
+    async with established() as rig:
+        (shown,) = rig.manager.snapshots()
+        assert (shown.name, shown.peer, shown.state) == ("robot", "tcp://robot.test:11001", State.ESTABLISHED)
+        rig.goes()
+        await rig.settle()
+        assert [shown.reason for shown in rig.manager.snapshots()] == ["closed by peer"]
+
+
+# Telemetry: bytes of the protocol page, fields of the fleet messages
+
+
+@pytest.mark.parametrize(
+    ("packet", "path", "fields"),
+    [
+        (BYE, "text", {"text": "bye", "kind": "debug", "sender": None}),
+        ("06000000 01 33 01000000", "lidar", {"on": True}),
+        ("06000000 01 33 02000000", "lidar", {"on": False}),
+        ("06000000 01 1f 01000000", "camera", {"on": True}),
+        ("06000000 01 1f 02000000", "camera", {"on": False}),
+        ("05000000 01 28 aabbcc", "raw/tcpudp", {"id": 40, "body": b"\xaa\xbb\xcc"}),
+        ("03000000 01 46 07", "raw/tcpudp", {"id": 70, "body": b"\x07"}),
+        ("02000000 01 c8", "raw/tcpudp", {"id": 200, "body": b""}),
+        ("02000000 01 3c", "text", {"text": "simulated lidar data", "kind": "request", "sender": None}),
+    ],
+)
+@jumping
+async def test_a_packet_is_published_on_its_key(packet: str | bytes, path: str, fields: dict[str, Any]) -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex(packet) if isinstance(packet, str) else packet)
+        assert rig.last(path) == {**fields, "stamp_ns": 1234}
+
+
+@jumping
+async def test_a_position_is_published_in_metres_and_radians() -> None:
+    async with established() as rig:
+        rig.sends(POSITION)  # 150 cm, -50 cm, 90 degrees
+        pose = rig.last("pose")
+        assert pose["x"] == pytest.approx(1.5)
+        assert pose["y"] == pytest.approx(-0.5)
+        assert pose["heading"] == pytest.approx(math.pi)
+        assert pose["stamp_ns"] == 1234
+
+
+@jumping
+async def test_a_map_is_published_with_rows_of_y() -> None:
+    async with established() as rig:
+        rig.sends(MAP)  # x 0: 0 1 2, x 1: 2 2 0, x 2: 1 0 1
+        shown = rig.last("map")
+        assert (shown["rows"], shown["columns"]) == (3, 3)
+        assert shown["cells"] == bytes([0, 2, 1, 1, 2, 0, 2, 0, 1])
+        assert shown["cell"] == pytest.approx(0.1)
+        assert shown["origin"] == pytest.approx([-0.15, -0.15])
+
+
+@pytest.mark.parametrize("packet", ["06000000 01 35 00000000", "02000000 01 35"])
+@jumping
+async def test_a_robot_that_has_no_map_yet_shows_an_empty_one(packet: str) -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex(packet) + POSITION)
+        assert rig.last("status")["state"] == "established"
+        shown = rig.last("map")
+        assert (shown["rows"], shown["columns"], shown["cells"]) == (0, 0, b"")
+        assert len(rig.values("pose")) == 1
+
+
+@jumping
+async def test_a_position_that_comes_as_packet_53_is_a_pose() -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex("0e000000 01 35 00001643 000048c2 0000b442"))
+        assert (rig.last("pose")["x"], rig.last("pose")["y"]) == pytest.approx((1.5, -0.5))
+
+
+@jumping
+async def test_what_came_before_a_broken_packet_is_published_before_the_robot_is_offline() -> None:
+    async with established() as rig:
+        seen: list[str] = []
+        rig.hq.subscribe("fleet/r1/pose", lambda sample: seen.append("pose"))
+        rig.hq.subscribe("fleet/r1/status", lambda sample: seen.append(msgpack.unpackb(sample.payload)["state"]))
+        rig.sends(POSITION + bytes(6))
+        await rig.settle()
+        assert seen == ["pose", "offline"]
+
+
+@jumping
+async def test_a_latecomer_gets_the_last_map_and_status() -> None:
+    async with established() as rig:
+        rig.sends(MAP)
+        seen: list[str] = []
+        rig.bus.join("3").subscribe("fleet/r1/*", lambda sample: seen.append(sample.key), history=True)
+        assert sorted(seen) == ["fleet/r1/control", "fleet/r1/map", "fleet/r1/status"]
+
+
+@jumping
+async def test_stream_messages_of_one_read_are_all_published_in_order_and_counted() -> None:
+    async with established() as rig:
+        before = rig.metrics.total("published")
+        rig.sends(POSITION + BYE + POSITION)
+        assert len(rig.values("pose")) == 2
+        assert len(rig.values("text")) == 1
+        assert rig.metrics.total("published") == before + 3
+
+
+@pytest.mark.parametrize("packet", [bytes.fromhex("06000000 01 33 01000000"), MAP, BYE, POSITION])
+@jumping
+async def test_states_and_maps_count_as_published_like_everything_else(packet: bytes) -> None:
+    async with established() as rig:
+        before = rig.metrics.total("published")
+        rig.sends(packet)
+        assert rig.metrics.total("published") == before + 1
+
+
+@jumping
+async def test_a_malformed_packet_is_counted() -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex("03000000 01 37 00") * 3 + POSITION)
+        assert rig.metrics.total("malformed") == 3
+
+
+@jumping
+async def test_a_packet_without_meaning_is_counted_and_not_published() -> None:
+    async with established() as rig:
+        rig.sends(bytes.fromhex("0b000000 01 35 05000000 0000000000") + bytes.fromhex("06000000 01 33 07000000"))
+        assert rig.values("map") == []
+        assert rig.values("lidar") == []
+        assert rig.metrics.total("untranslatable") == 2
+        rig.sends(POSITION)
+        assert len(rig.values("pose")) == 1
+
+
+# Commands
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "packet"),
+    [
+        ("drive", {"left": 1.0}, MOVE_LEFT),
+        ("drive", {"forward": 0.6, "left": 0.8}, "0e000000 02 0b cdcc4cbf 9a99193f 0000803f"),
+        ("drive", {"turn": 0.5}, TURN_LEFT),
+        ("drive", {}, STOP),
+        ("stop", {}, STOP),
+        ("mode", {"mode": "none"}, "06000000 02 0a 01000000"),
+        ("mode", {"mode": "manual"}, "06000000 02 0a 02000000"),
+        ("mode", {"mode": "autonomous"}, "06000000 02 0a 03000000"),
+        ("lidar", {"on": True}, "06000000 02 32 01000000"),
+        ("lidar", {"on": False}, "06000000 02 32 02000000"),
+        ("text", {"text": "hi"}, "08000000 02 01 02000000 6869"),
+        ("raw/tcpudp", {"id": 40, "body": b"\x01\x02"}, "04000000 02 28 0102"),
+        ("raw/tcpudp", {"id": 21, "body": b"\x01"}, "03000000 02 15 01"),
+    ],
+)
+@jumping
+async def test_a_command_becomes_its_packet(name: str, fields: dict[str, Any], packet: str | bytes) -> None:
+    async with established() as rig:
+        rig.command(name, fields)
+        assert rig.written() == [bytes.fromhex(packet) if isinstance(packet, str) else packet]
+        assert rig.metrics.total("commands") == 1
+        assert rig.metrics.total("refused") == 0
+
+
+@jumping
+async def test_a_drive_is_repeated_while_the_robot_moves() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(1.1)
+        assert rig.written() == [MOVE_LEFT] * 5
+
+
+@jumping
+async def test_a_newer_drive_replaces_the_one_that_waits_for_the_gap() -> None:
+    async with established() as rig:
+        rig.command("text", {"text": "hi"})
+        rig.command("drive", DRIVE_LEFT)
+        rig.command("drive", {"turn": 0.5})
+        await asyncio.sleep(0.05)
+        assert rig.written()[1:] == [TURN_LEFT]
+
+
+@jumping
+async def test_the_gap_is_kept_between_any_two_packets() -> None:
+    async with established(Options(gap_s=0.02)) as rig:
+        for _ in range(20):
+            rig.command("text", {"text": "hi"})
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.command("stop")
+        await asyncio.sleep(2.0)
+        times = rig.link.times
+        assert len(times) > 30
+        assert min(later - earlier for earlier, later in itertools.pairwise(times)) >= 0.02 - 1e-9
+
+
+@jumping
+async def test_a_stop_goes_before_everything_that_waits() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        for _ in range(30):
+            rig.command("text", {"text": "hi"})
+        rig.forget_written()
+        rig.command("stop")
+        await asyncio.sleep(0.0101)
+        assert rig.written() == [STOP]
+
+
+@pytest.mark.parametrize("payload", [b"", b"stop", b"\x01", b"\xc1", b"\x90", msgpack.packb({"stamp_ns": "now"})])
+@jumping
+async def test_a_stop_stops_the_robot_whatever_its_payload(payload: bytes) -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.command("stop", payload)
+        assert rig.written() == [STOP]
+        assert rig.last("control")["state"] == "stopped"
+        assert rig.metrics.total("refused") == 0
+
+
+@jumping
+async def test_a_stop_leaves_before_neutral_and_motion_that_follow_at_once() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        rig.forget_written()
+        rig.command("stop")
+        rig.command("drive", NEUTRAL)
+        rig.command("drive", {"turn": 0.5})
+        await asyncio.sleep(0.05)
+        assert rig.written() == [STOP, TURN_LEFT]
+
+
+@jumping
+async def test_a_stop_goes_to_a_robot_that_takes_nothing_as_soon_as_it_takes_something() -> None:
+    async with established() as rig:
+        rig.link.ready = False
+        for _ in range(80):
+            rig.command("lidar", {"on": True})
+        rig.command("stop")
+        rig.link.ready = True
+        rig.conversations[-1].writable()
+        assert rig.written() == [STOP]
+
+
+@jumping
+async def test_a_stop_for_a_robot_that_cannot_be_stopped_is_refused_and_motion_is_stopped_all_the_same() -> None:
+    async with serving() as rig:
+        await rig.establish(PLAIN_SETTINGS)
+        rig.command("stop")
+        assert rig.last("control")["state"] == "stopped"
+        ((command, reason, _),) = await rig.refusals()
+        assert (command, "joystick" in reason) == ("stop", True)
+        assert rig.written() == []
+
+
+@jumping
+async def test_a_stop_is_repeated_for_a_second_and_then_nothing_more_is_sent() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        start = rig.loop.time()
+        rig.command("stop")
+        await asyncio.sleep(5.0)
+        stops = rig.written()
+        assert set(stops) == {STOP}
+        assert 10 <= len(stops) <= 11
+        times = rig.link.times[-len(stops) :]
+        assert times[0] == start
+        assert STOP_REPEAT_S - 0.11 <= times[-1] - start <= STOP_REPEAT_S + 1e-6
+
+
+@jumping
+async def test_a_stop_shows_on_control_at_once() -> None:
+    async with established() as rig:
+        rig.command("stop")
+        assert rig.last("control")["state"] == "stopped"
+
+
+@jumping
+async def test_motion_after_a_stop_needs_neutral() -> None:
+    async with established() as rig:
+        rig.command("stop")
+        await asyncio.sleep(2.0)
+        rig.forget_written()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+        ((command, reason, count),) = await rig.refusals()
+        assert (command, count) == ("drive", 1)
+        assert "neutral" in reason
+        rig.command("drive", NEUTRAL)
+        assert rig.written() == [STOP]
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_a_refused_drive_does_not_end_the_stop_that_is_repeated() -> None:
+    async with established() as rig:
+        rig.command("stop")
+        for _ in range(10):
+            rig.command("drive", DRIVE_LEFT)
+            await asyncio.sleep(0.05)
+        assert set(rig.written()) == {STOP}
+
+
+@jumping
+async def test_silence_while_moving_stops_the_robot_after_the_deadman_time() -> None:
+    async with established(deadman_s=0.5) as rig:
+        start = rig.loop.time()
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.49)
+        assert set(rig.written()) == {MOVE_LEFT}
+        await asyncio.sleep(3.0)
+        stops = rig.written()
+        assert set(stops) == {STOP}
+        assert 10 <= len(stops) <= 11
+        assert rig.link.times[-len(stops)] == pytest.approx(start + 0.5)
+        assert rig.link.times[-1] - rig.link.times[-len(stops)] >= STOP_REPEAT_S - 0.11
+        assert rig.last("control")["state"] == "stopped"
+
+
+@jumping
+async def test_fresh_commands_keep_the_robot_moving() -> None:
+    async with established(deadman_s=0.5) as rig:
+        for _ in range(20):
+            rig.command("drive", DRIVE_LEFT)
+            await asyncio.sleep(0.4)
+        assert set(rig.written()) == {MOVE_LEFT}
+
+
+@jumping
+async def test_other_commands_do_not_keep_the_robot_moving() -> None:
+    async with established(deadman_s=0.5) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        for _ in range(4):
+            await asyncio.sleep(0.2)
+            rig.command("text", {"text": "hi"})
+            rig.command("drive", {"left": 9.0})
+        assert rig.last("control")["state"] == "stopped"
+        assert STOP in rig.written()
+
+
+@jumping
+async def test_a_standing_robot_is_not_stopped_by_the_deadman() -> None:
+    async with established(deadman_s=0.5) as rig:
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(5.0)
+        assert rig.last("control")["state"] == "free"
+
+
+@jumping
+async def test_motion_after_the_deadman_needs_neutral() -> None:
+    async with established(deadman_s=0.2) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(3.0)
+        rig.forget_written()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+        ((_, reason, _),) = await rig.refusals()
+        assert "deadman" in reason
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written()[-1] == MOVE_LEFT
+
+
+@jumping
+async def test_the_loss_of_the_bus_stops_a_moving_robot() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.bus.connection(False)
+        assert rig.written() == [STOP]
+        await asyncio.sleep(2.0)
+        assert len(rig.written()) >= 9
+        rig.bus.connection(True)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+
+
+@jumping
+async def test_the_loss_of_the_bus_does_not_touch_a_standing_robot() -> None:
+    async with established() as rig:
+        rig.bus.connection(False)
+        await asyncio.sleep(1.0)
+        assert rig.written() == []
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"\xc1", "Drive: MessagePack"),
+        (b"\x81", "Drive: "),
+        (b"\x01", "got `int`"),
+        (msgpack.packb({"forward": 1.5}), "forward"),
+        (msgpack.packb({"forward": "fast"}), "forward"),
+        (msgpack.packb({"forward": math.nan}), "forward"),
+        (msgpack.packb({"forward": None}), "forward"),
+    ],
+)
+@jumping
+async def test_a_malformed_payload_is_refused_counted_and_shown(payload: bytes, reason: str) -> None:
+    async with established() as rig:
+        rig.command("drive", payload)
+        assert rig.written() == []
+        assert rig.metrics.total("refused") == 1
+        ((command, shown, count),) = await rig.refusals()
+        assert command == "drive"
+        assert shown.startswith("Drive: "), "the message that was expected"
+        assert reason in shown
+        assert count == 1
+
+
+@pytest.mark.parametrize("name", ["dance", "drive/fast", "motor/left", "light", "raw/other", "sensor/x"])
+@jumping
+async def test_an_unknown_command_is_refused(name: str) -> None:
+    async with established() as rig:
+        rig.command(name, {"on": True, "value": 1.0, "id": 1})
+        assert rig.written() == []
+        ((command, reason, _),) = await rig.refusals()
+        assert command == name
+        assert "no such command" in reason
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "reason"),
+    [
+        ("camera", {"on": True}, "camera"),
+        ("text", {"text": "hi", "kind": "chat"}, "raw"),
+        ("text", {"text": ""}, "empty text"),
+        ("raw/tcpudp", {"id": 200}, "may crash"),
+        ("raw/tcpudp", {"id": 11}, "not raw"),
+        ("text", {"text": "x" * 5000}, "4096"),
+        ("text", {"text": "Grüße"}, "text"),
+    ],
+)
+@jumping
+async def test_what_the_robot_cannot_do_is_refused_with_the_reason(
+    name: str, fields: dict[str, Any], reason: str
+) -> None:
+    async with established() as rig:
+        rig.command(name, fields)
+        await asyncio.sleep(0.1)
+        assert rig.written() == []
+        ((_, shown, _),) = await rig.refusals()
+        assert reason in shown
+
+
+@jumping
+async def test_refusals_are_gathered_before_control_shows_them() -> None:
+    async with established() as rig:
+        before = len(rig.values("control"))
+        for _ in range(100):
+            rig.command("dance")
+        assert len(rig.values("control")) == before
+        assert await rig.refusals() == [("dance", "no such command", 100)]
+        assert len(rig.values("control")) == before + 1
+        assert rig.metrics.total("refused") == 100
+
+
+@jumping
+async def test_the_part_of_a_drive_that_is_left_out_is_reported() -> None:
+    async with established() as rig:
+        rig.command("drive", {"left": 1.0, "turn": 0.5, "light": True})
+        assert rig.written() == [MOVE_LEFT]
+        ((command, reason, _),) = await rig.refusals()
+        assert command == "drive"
+        assert "turn" in reason
+
+
+@jumping
+async def test_a_command_while_the_robot_is_offline_is_refused() -> None:
+    async with serving(unreachable="no route") as rig:
+        rig.command("lidar", {"on": True})
+        assert await rig.refusals() == [("lidar", "offline", 1)]
+
+
+@jumping
+async def test_a_command_during_the_handshake_is_refused() -> None:
+    async with serving() as rig:
+        rig.command("lidar", {"on": True})
+        assert rig.link.written == []
+        assert await rig.refusals() == [("lidar", "handshaking", 1)]
+
+
+@jumping
+async def test_motion_refused_while_offline_needs_neutral_afterwards() -> None:
+    async with serving() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await rig.establish()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [STOP, MOVE_LEFT]
+
+
+@jumping
+async def test_neutral_refused_while_offline_does_not_make_motion_possible() -> None:
+    async with serving() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        rig.command("drive", NEUTRAL)
+        await rig.establish()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+
+
+@jumping
+async def test_a_stop_while_offline_is_taken_and_remembered() -> None:
+    async with serving(unreachable="no route") as rig:
+        rig.command("stop")
+        assert rig.last("control")["state"] == "stopped"
+        assert await rig.refusals() == []
+
+
+@jumping
+async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() -> None:
+    async with serving() as rig:
+        await rig.establish(PLAIN_SETTINGS)
+        rig.command("drive", DRIVE_LEFT)
+        rig.command("mode", {"mode": "manual"})
+        rig.command("lidar", {"on": True})
+        rig.command("raw/tcpudp", {"id": 40, "body": b"hi"})
+        await asyncio.sleep(1.0)
+        assert rig.written() == []
+        shown = await rig.refusals()
+        assert [command for command, _, _ in shown] == ["drive", "mode", "lidar", "raw/tcpudp"]
+        assert all("does not announce" in reason for _, reason, _ in shown)
+        assert rig.last("control")["state"] == "free"
+
+
+@jumping
+async def test_forced_features_are_used_although_the_robot_does_not_announce_them() -> None:
+    async with serving(Options(force=("joystick",))) as rig:
+        await rig.establish(PLAIN_SETTINGS)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_a_robot_that_takes_nothing_is_not_flooded() -> None:
+    async with established() as rig:
+        rig.link.ready = False
+        for _ in range(100):
+            rig.command("text", {"text": "hi"})
+        assert rig.written() == []
+        ((command, reason, count),) = await rig.refusals()
+        assert command == "text"
+        assert reason.startswith("busy")
+        rig.link.ready = True
+        rig.conversations[0].writable()
+        await asyncio.sleep(2.0)
+        assert len(rig.written()) == 100 - count
+
+
+# Simulated lidar data
+
+
+@jumping
+async def test_a_scan_is_sent_in_the_robots_unit_and_shown_on_the_bus() -> None:
+    async with established() as rig:
+        ranges = struct.pack("<360f", *([2.0] * 360))
+        fields = {"angle_min": 0.0, "angle_increment": math.radians(1), "range_min": 0.1, "range_max": 9.0}
+        rig.command("scan", {**fields, "ranges": ranges})
+        expected = bytes.fromhex("a6050000 02 3d 68010000") + bytes.fromhex("00004843") * 360  # 200 cm
+        assert rig.written() == [expected]
+        assert rig.last("scan")["ranges"] == ranges
+
+
+@jumping
+async def test_a_scan_of_absurd_geometry_does_no_harm() -> None:
+    async with established() as rig:
+        fields = {"angle_min": 0.0, "angle_increment": 1e-300, "range_min": 0.1, "range_max": 9.0}
+        rig.command("scan", {**fields, "ranges": struct.pack("<10f", *([2.0] * 10))})
+        one_degree = bytes.fromhex("00004843") + bytes(4 * 359)  # 200 cm straight ahead
+        assert rig.written() == [bytes.fromhex("a6050000 02 3d 68010000") + one_degree]
+
+
+# Loss and return of the robot
+
+
+@jumping
+async def test_a_robot_lost_before_it_was_established_needs_no_neutral() -> None:
+    async with serving() as rig:
+        rig.goes("reset")
+        assert rig.last("control")["state"] == "free"
+        await asyncio.sleep(1.0)
+        await rig.establish()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_a_lost_robot_shows_as_offline_with_the_reason() -> None:
+    async with established() as rig:
+        rig.goes("connection lost: reset")
+        status = rig.last("status")
+        assert (status["state"], status["reason"]) == ("offline", "connection lost: reset")
+        assert status["version"] is None
+        assert status["features"] == []
+
+
+@jumping
+async def test_a_robot_that_returns_publishes_again() -> None:
+    async with established() as rig:
+        rig.goes()
+        await asyncio.sleep(1.0)
+        assert len(rig.links) == 2
+        await rig.establish()
+        assert rig.last("status")["state"] == "established"
+        rig.sends(POSITION)
+        assert len(rig.values("pose")) == 1
+
+
+@jumping
+async def test_a_robot_lost_while_moving_needs_neutral_when_it_returns_and_gets_no_old_motion() -> None:
+    async with established(deadman_s=60.0) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.goes()
+        assert rig.last("control")["state"] == "stopped"
+        await asyncio.sleep(1.0)
+        await rig.establish()
+        await asyncio.sleep(1.0)
+        assert rig.written() == []
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+        assert "robot lost" in (await rig.refusals())[-1][1]
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [STOP, MOVE_LEFT]
+
+
+@jumping
+async def test_the_deadman_of_a_lost_robot_does_not_fire() -> None:
+    async with established(deadman_s=0.5) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        rig.goes()
+        rig.unreachable = "no route"
+        await asyncio.sleep(2.0)
+        rig.command("drive", DRIVE_LEFT)
+        assert "robot lost" in (await rig.refusals())[-1][1]
+
+
+@jumping
+async def test_the_robots_new_client_id_is_used_after_its_return() -> None:
+    async with established() as rig:
+        rig.goes()
+        await asyncio.sleep(1.0)
+        await rig.establish(SETTINGS[:6] + b"\x07" + SETTINGS[7:])
+        rig.command("stop")
+        await asyncio.sleep(0.05)
+        assert rig.written() == [bytes.fromhex("02000000 07 0d")]
+
+
+# Raw frames
+
+
+@jumping
+async def test_raw_frames_are_shown_only_to_those_who_listen() -> None:
+    async with established() as rig:
+        rig.sends(POSITION)
+        assert rig.bus.values("fleet/r1/@wire/**") == []
+    bus = OpenBus()
+    seen: list[tuple[str, bytes]] = []
+    bus.join("3").subscribe("fleet/r1/@wire/**", lambda sample: seen.append((sample.key, sample.payload)))
+    async with serving(bus=bus) as rig:
+        await rig.establish()
+        rig.sends(POSITION + b"\x02\x00")
+        assert seen == [
+            ("fleet/r1/@wire/robot/in", SETTINGS),
+            ("fleet/r1/@wire/robot/out", ANSWER),
+            ("fleet/r1/@wire/robot/in", POSITION),
+        ]
+
+
+# Questions
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "answer"), [("map", "02000000 02 34", MAP), ("pose", "02000000 02 36", POSITION)]
+)
+@jumping
+async def test_a_query_asks_the_robot_and_is_answered_with_what_it_sends(name: str, asked: str, answer: bytes) -> None:
+    async with established() as rig:
+        question = rig.ask(name)
+        assert rig.written() == [bytes.fromhex(asked)]
+        assert question.replies == []
+        rig.sends(answer)
+        (reply,) = question.replies
+        assert reply.error is None
+        assert msgpack.unpackb(reply.payload) == rig.last(name)
+        rig.sends(answer)
+        assert len(question.replies) == 1
+
+
+@jumping
+async def test_two_queries_at_once_ask_the_robot_once_and_are_both_answered() -> None:
+    async with established() as rig:
+        questions = [rig.ask("pose"), rig.ask("pose")]
+        await asyncio.sleep(0.1)
+        assert len(rig.written()) == 1
+        rig.sends(POSITION)
+        assert [len(question.replies) for question in questions] == [1, 1]
+
+
+@jumping
+async def test_a_position_does_not_answer_a_query_for_the_map() -> None:
+    async with established() as rig:
+        question = rig.ask("map")
+        rig.sends(POSITION)
+        assert question.replies == []
+
+
+@jumping
+async def test_a_query_the_robot_does_not_answer_is_refused_after_two_seconds() -> None:
+    async with established() as rig:
+        question = rig.ask("map")
+        await asyncio.sleep(1.99)
+        assert question.replies == []
+        await asyncio.sleep(0.02)
+        (reply,) = question.replies
+        assert reply.error == "the robot did not answer within 2 s"
+        rig.forget_written()
+        rig.ask("map")
+        assert len(rig.written()) == 1, "the next query asks anew"
+
+
+@jumping
+async def test_a_query_while_offline_is_refused_at_once() -> None:
+    async with serving(unreachable="no route") as rig:
+        (reply,) = await rig.hq.ask("fleet/r1/@rpc/map")
+        assert reply.error == "offline"
+
+
+@jumping
+async def test_a_query_the_robot_cannot_be_asked_is_refused_at_once() -> None:
+    async with serving() as rig:
+        await rig.establish(PLAIN_SETTINGS)
+        (reply,) = rig.ask("map").replies
+        assert reply.error is not None
+        assert "slam_map" in reply.error
+        assert rig.written() == []
+
+
+@jumping
+async def test_queries_that_wait_are_refused_when_the_robot_is_lost() -> None:
+    async with established() as rig:
+        question = rig.ask("map")
+        rig.goes()
+        (reply,) = question.replies
+        assert reply.error == "the robot was lost"
+        await asyncio.sleep(3.0)
+        assert len(question.replies) == 1
+
+
+# Back pressure and leave-taking
+
+
+@jumping
+async def test_a_bus_that_is_full_pauses_the_link_until_it_takes_more() -> None:
+    async with established() as rig:
+        rig.bus.takes = False
+        rig.sends(POSITION)
+        assert rig.link.paused
+        rig.bus.relieve()
+        assert not rig.link.paused
+        rig.sends(POSITION)
+        assert not rig.link.paused
+
+
+@jumping
+async def test_a_link_made_while_the_bus_is_full_is_read_until_the_bus_says_so_again() -> None:
+    async with established() as rig:
+        rig.bus.takes = False
+        rig.sends(POSITION)
+        assert rig.link.paused
+        rig.goes()
+        await asyncio.sleep(1.0)
+        await rig.establish()
+        rig.sends(POSITION)
+        assert rig.link.paused
+        rig.bus.relieve()
+        assert not rig.link.paused
+
+
+@jumping
+async def test_a_second_cancellation_does_not_cut_the_leave_taking_short() -> None:
+    rig = Rig(Options(), 60.0, OpenBus())
+    task = asyncio.create_task(rig.device.run())
+    await rig.establish()
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    task.cancel()
+    await asyncio.sleep(0.05)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    await asyncio.sleep(2.0)
+    assert rig.last("status")["reason"] == "gateway stopped"
+    assert set(rig.written()) == {STOP}
+    assert rig.link.closed
+
+
+@jumping
+async def test_a_moving_robot_is_stopped_before_the_gateway_ends() -> None:
+    async with established(deadman_s=60.0) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        start = rig.loop.time()
+    stops = rig.written()
+    assert set(stops) == {STOP}
+    assert len(stops) >= 10
+    assert rig.loop.time() - start <= 1.7
+    assert rig.link.closed
+    assert (rig.last("status")["state"], rig.last("status")["reason"]) == ("offline", "gateway stopped")
+
+
+@jumping
+async def test_a_standing_robot_is_left_at_once() -> None:
+    async with established() as rig:
+        start = rig.loop.time()
+    assert rig.written() == []
+    assert rig.loop.time() - start < 0.1
+    assert rig.link.closed
+    assert rig.last("status")["reason"] == "gateway stopped"
+
+
+@jumping
+async def test_a_device_prints_its_robot_and_state() -> None:
+    async with established() as rig:
+        assert repr(rig.device) == "<Device r1 established>"

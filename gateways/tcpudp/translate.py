@@ -216,6 +216,7 @@ class TcpUdpRobot(Robot):
         return self._session
 
 
+@np.errstate(all="ignore")  # absurd numbers are points the scan does not have
 def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
     """Resample a scan to float32[360] in the robot's unit, index = degree counter-clockwise from straight ahead.
 
@@ -235,8 +236,7 @@ def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float
     ranges = np.asarray(scan.ranges, np.float32)
     values = ranges[indices]
     usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
-    with np.errstate(over="ignore"):
-        lengths = values / np.float32(unit_m)
+    lengths = values / np.float32(unit_m)
     polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
     return polar
 
@@ -255,7 +255,9 @@ def _side(cells: int, settings: Settings | None) -> int:
 
 def _known_cells(cells: Cells) -> Cells:
     """Take cells that are none of 0, 1, 2 as unknown."""
-    return cells if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED else np.where(cells <= _OCCUPIED, cells, np.uint8(0))
+    if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED:
+        return cells
+    return np.where(cells <= _OCCUPIED, cells, np.uint8(0))
 
 
 def _switch(mode: int, stamp_ns: int) -> Switch:

@@ -32,6 +32,7 @@ class Writer:
         self._backlog = 0
         self._full = False
         self._stopping = False
+        self._ended = False
         self._wake = threading.Condition()
         self._dropped = metrics.count("bus_out_dropped", writer=name)
         self._replaced = metrics.count("bus_out_replaced", writer=name)
@@ -41,7 +42,7 @@ class Writer:
     def put(self, call: Call, size: int = 1) -> bool:
         """Carry out a call of ``size`` messages; False asks to pause the source."""
         with self._wake:
-            if self._stopping:
+            if self._ended:
                 self._dropped.value += size
                 return True
             self._jobs.append((call, size))
@@ -58,6 +59,9 @@ class Writer:
         if self._lossless:
             return self.put(call, size)
         with self._wake:
+            if self._ended:
+                self._dropped.value += 1
+                return True
             if key in self._latest:
                 self._replaced.value += 1
             self._latest[key] = call
@@ -83,6 +87,7 @@ class Writer:
                 while not (self._jobs or self._latest or self._stopping):
                     self._wake.wait()
                 if not (self._jobs or self._latest):
+                    self._ended = True
                     return
                 latest = list(self._latest.values())
                 self._latest.clear()

@@ -27,10 +27,10 @@ def schema(message: type[FleetMessage]) -> str:
 
 
 def _array_bytes(value: Any) -> memoryview:
-    """Give the bytes of an array: float32 little endian for numbers with a fraction, else uint8."""
+    """Give the bytes of an array: uint8 as it is, everything else as float32 little endian."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"{type(value).__name__} has no place in a payload")
-    dtype = "<f4" if value.dtype.kind == "f" else "|u1"
+    dtype = "|u1" if value.dtype == np.uint8 else "<f4"
     return np.ascontiguousarray(value, dtype).reshape(-1).view(np.uint8).data
 
 

@@ -1,7 +1,6 @@
 """How protocols are found, and what every robot has by default."""
 
 import re
-from collections.abc import Iterable
 from importlib.metadata import EntryPoint, EntryPoints
 from typing import Any
 
@@ -12,7 +11,7 @@ from zbridge import protocol
 from zbridge.errors import ConfigError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
-from zbridge.protocol import Outcome, Protocol, Robot, Telemetry, find_protocol, protocol_names
+from zbridge.protocol import Outcome, Protocol, Robot, find_protocol, protocol_names
 
 
 class ToyRobot(Robot):
@@ -29,8 +28,8 @@ class ToyRobot(Robot):
     def driving(self) -> Toy | None:
         return self.current
 
-    def telemetry(self, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
-        return ()
+    def translator(self, kind: type) -> Any:
+        return lambda message, stamp_ns: ()
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         return Outcome()

@@ -22,7 +22,7 @@ def question() -> FakeQuestion:
 @jumping
 async def test_the_first_question_of_a_topic_must_be_put_to_the_robot_and_the_others_not() -> None:
     waiting = questions()
-    assert not waiting
+    assert not waiting.waiting
     assert waiting.add(topics.MAP, question())
     assert not waiting.add(topics.MAP, question())
     assert waiting.add(topics.POSE, question())
@@ -61,7 +61,7 @@ async def test_a_question_is_refused_when_its_own_time_is_over() -> None:
     assert second.replies == []
     await asyncio.sleep(1.0)
     assert len(second.replies) == 1
-    assert not waiting
+    assert not waiting.waiting
 
 
 @jumping
@@ -81,7 +81,7 @@ async def test_a_removed_question_gets_no_reply() -> None:
     waiting.add(topics.MAP, asked)
     waiting.remove(topics.MAP, asked)
     waiting.remove(topics.MAP, asked)
-    assert not waiting
+    assert not waiting.waiting
     waiting.answer(topics.MAP, b"map")
     await asyncio.sleep(5.0)
     assert asked.replies == []
@@ -96,7 +96,7 @@ async def test_all_who_wait_can_be_refused_at_once() -> None:
     waiting.refuse_all("the robot was lost")
     await asyncio.sleep(5.0)
     assert [reply.error for reply in (*first.replies, *second.replies)] == ["the robot was lost"] * 2
-    assert not waiting
+    assert not waiting.waiting
 
 
 @jumping

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from zbridge.bus import Bus, Entry, Publisher, Question, Sample
+from zbridge.bus import Bus, Publisher, Question, Sample
 from zbridge.conversation import Conversation
 from zbridge.errors import EncodeError, LinkError, PayloadError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads
@@ -20,7 +20,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, LinkStatus, RobotState, 
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
-from zbridge.protocol import Robot
+from zbridge.protocol import Robot, Translate
 from zbridge.questions import Questions
 from zbridge.session.control import Authority
 from zbridge.session.manager import Backoff, SessionManager
@@ -110,6 +110,7 @@ class Device:
         self._loop = asyncio.get_running_loop()
         self._endpoints = [_Endpoint(name, at) for name, at in zip(robot.link_names, addresses, strict=True)]
         self._publishers: dict[str, Publisher] = {}
+        self._translators: dict[type, Translate] = {}
         self._deadman: asyncio.TimerHandle | None = None
         self._control_due: asyncio.TimerHandle | None = None
         self._closing = False
@@ -233,27 +234,32 @@ class Device:
     def _deliver(self, messages: list[Any]) -> None:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
         stamp_ns = self._clock_ns()
-        translate, encode, publishers = self._robot.telemetry, payloads.encode, self._publishers
-        batch: list[Entry] = []
-        flowing, published = True, 0
+        encode, translators, waiting = payloads.encode, self._translators, self._questions.waiting
+        streams: dict[str, list[bytes]] = {}
+        flowing, states = True, 0
         for message in messages:
+            translate = translators.get(type(message)) or self._translator(type(message))
             try:
                 for topic, telemetry in translate(message, stamp_ns):
                     payload = encode(telemetry)
-                    published += 1
-                    publisher = publishers.get(topic.path) or self._declare(topic)
-                    if topic.delivery is Delivery.STREAM:
-                        batch.append((publisher, payload))
-                    elif not publisher.put(payload):
-                        flowing = False
-                    if self._questions:
+                    stream = streams.get(topic.path)
+                    if stream is not None:
+                        stream.append(payload)
+                    elif topic.delivery is Delivery.STREAM:
+                        streams[topic.path] = [payload]
+                        self._publisher(topic)
+                    else:
+                        flowing = self._publisher(topic).put(payload) and flowing
+                        states += 1
+                    if waiting:
                         self._questions.answer(topic, payload)
             except ProtocolError as error:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._keys.robot, error)
-        self._published.value += published
-        if batch and not self._bus.put_all(batch):
-            flowing = False
+        self._published.value += states + sum(map(len, streams.values()))
+        if streams:
+            batch = [(self._publishers[path], payload_list) for path, payload_list in streams.items()]
+            flowing = self._bus.put_all(batch) and flowing
         if not flowing:
             for endpoint in self._endpoints:
                 if endpoint.conversation is not None:
@@ -269,12 +275,17 @@ class Device:
         publisher = self._bus.frames(key, listened)
 
     def _publish(self, topic: Topic, message: FleetMessage) -> None:
-        publisher = self._publishers.get(topic.path) or self._declare(topic)
-        publisher.put(payloads.encode(message))
+        self._publisher(topic).put(payloads.encode(message))
 
-    def _declare(self, topic: Topic) -> Publisher:
-        publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
+    def _publisher(self, topic: Topic) -> Publisher:
+        publisher = self._publishers.get(topic.path)
+        if publisher is None:
+            publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
         return publisher
+
+    def _translator(self, kind: type) -> Translate:
+        translate = self._translators[kind] = self._robot.translator(kind)
+        return translate
 
     def _publish_status(self) -> None:
         first = self._endpoints[0]

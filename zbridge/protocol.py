@@ -21,6 +21,8 @@ from zbridge.session.session import Session, State
 GROUP = "zbridge.protocols"
 
 Telemetry = tuple[Topic, FleetMessage]
+Translate = Callable[[Any, int], Iterable[Telemetry]]
+"""``translate(message, stamp_ns)``; raises ProtocolError where a message has no meaning."""
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -51,8 +53,12 @@ class Robot(ABC):
         """The session that takes drive commands, None before the first connection."""
 
     @abstractmethod
+    def translator(self, kind: type) -> Translate:
+        """Give the function that translates what the robot sends in messages of one class."""
+
     def telemetry(self, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
         """Translate what the robot sent; raise ProtocolError where it has no meaning."""
+        return self.translator(type(message))(message, stamp_ns)
 
     @abstractmethod
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:

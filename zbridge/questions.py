@@ -20,17 +20,14 @@ class Questions:
     def __init__(self, loop: asyncio.AbstractEventLoop, answer_s: float = ANSWER_S) -> None:
         self._loop = loop
         self._answer_s = answer_s
-        self._waiting: dict[str, list[tuple[Question, asyncio.TimerHandle]]] = {}
+        self.waiting: dict[str, list[tuple[Question, asyncio.TimerHandle]]] = {}
 
     def __repr__(self) -> str:
-        return f"<Questions waiting for {sorted(self._waiting)}>"
-
-    def __bool__(self) -> bool:
-        return bool(self._waiting)
+        return f"<Questions waiting for {sorted(self.waiting)}>"
 
     def add(self, topic: Topic, question: Question) -> bool:
         """Let a question wait; tell whether it is the first, so that the robot must be asked."""
-        waiting = self._waiting.setdefault(topic.path, [])
+        waiting = self.waiting.setdefault(topic.path, [])
         if len(waiting) >= WAITING:
             raise Refused(f"busy: {WAITING} queries wait for the robot's answer")
         timer = self._loop.call_later(self._answer_s, self._expire, topic, question)
@@ -39,23 +36,24 @@ class Questions:
 
     def remove(self, topic: Topic, question: Question) -> None:
         """Forget a question that will not be answered."""
-        waiting = self._waiting.get(topic.path, [])
+        waiting = self.waiting.get(topic.path, [])
         for entry in [entry for entry in waiting if entry[0] is question]:
             entry[1].cancel()
             waiting.remove(entry)
         if not waiting:
-            self._waiting.pop(topic.path, None)
+            self.waiting.pop(topic.path, None)
 
     def answer(self, topic: Topic, payload: bytes) -> None:
         """Answer all who wait for ``topic``."""
-        for question, timer in self._waiting.pop(topic.path, ()):
+        for question, timer in self.waiting.pop(topic.path, ()):
             timer.cancel()
             question.answer(payload)
 
     def refuse_all(self, reason: str) -> None:
         """Refuse all who wait for anything."""
-        waiting, self._waiting = self._waiting, {}
-        for entries in waiting.values():
+        entries_of_all = list(self.waiting.values())
+        self.waiting.clear()
+        for entries in entries_of_all:
             for question, timer in entries:
                 timer.cancel()
                 question.refuse(reason)

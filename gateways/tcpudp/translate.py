@@ -7,7 +7,8 @@ forward, lengths in its own unit (centimetres), headings in degrees; the fleet's
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -40,7 +41,7 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
-from zbridge.protocol import Outcome, Robot, Telemetry
+from zbridge.protocol import Outcome, Robot, Telemetry, Translate
 
 NAME = "tcpudp"
 ON, OFF = 1, 2
@@ -52,6 +53,7 @@ SCAN_POINTS = 360
 """Points deployed robots take in simulated lidar data, one a degree."""
 _MOTION = "motion"
 _OCCUPIED = 2
+_RADIANS = math.pi / 180
 
 ForcedFeature = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
 PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -95,9 +97,8 @@ class TcpUdpRobot(Robot):
 
     # Packets to telemetry
 
-    def telemetry(self, message: Packet, stamp_ns: int) -> Iterable[Telemetry]:
-        translate = _TELEMETRY.get(type(message), TcpUdpRobot._raw)
-        return translate(self, message, stamp_ns)
+    def translator(self, kind: type) -> Translate:
+        return partial(_TELEMETRY.get(kind, TcpUdpRobot._raw), self)
 
     def _pose(self, message: ServerPosition, stamp_ns: int) -> tuple[Telemetry, ...]:
         unit_m = self._unit_m
@@ -107,7 +108,7 @@ class TcpUdpRobot(Robot):
                 Pose(
                     message.x * unit_m,
                     message.y * unit_m,
-                    math.radians(message.heading_deg) + self._heading_offset,
+                    message.heading_deg * _RADIANS + self._heading_offset,
                     stamp_ns=stamp_ns,
                 ),
             ),

@@ -174,9 +174,9 @@ def test_a_full_bus_asks_for_a_pause_and_relieves_it() -> None:
     publisher = bus.publisher("fleet/r1/pose", topics.POSE)
     relieved: list[bool] = []
     bus.on_relief(lambda: relieved.append(True))
-    assert bus.put_all([(publisher, b"1"), (publisher, b"2")])
+    assert bus.put_all([(publisher, [b"1", b"2"])])
     bus.takes = False
-    assert not bus.put_all([(publisher, b"3")])
+    assert not bus.put_all([(publisher, [b"3"])])
     assert bus.values("fleet/r1/pose") == [b"1", b"2", b"3"]
     bus.relieve()
     assert relieved == [True]

@@ -6,14 +6,14 @@ opened, so that whatever needs no bus starts without it.
 
 from __future__ import annotations
 
-from zbridge.bus.interface import Answer, Bus, BusSettings, Entry, Handle, Publisher, Question, Sample, Tls
+from zbridge.bus.interface import Answer, Batch, Bus, BusSettings, Handle, Publisher, Question, Sample, Tls
 from zbridge.metrics import Metrics
 
 __all__ = [
     "Answer",
+    "Batch",
     "Bus",
     "BusSettings",
-    "Entry",
     "Handle",
     "Publisher",
     "Question",

@@ -6,10 +6,10 @@ Handlers are called on the spot. Publishers keep what was put, so that a test ma
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TypeVar
 
-from zbridge.bus.interface import Answer, Entry, Handle, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, Handle, Publisher, Question, Sample
 from zbridge.fleet.topics import Topic
 
 H = TypeVar("H", bound=Handle)
@@ -79,9 +79,10 @@ class FakeBus:
     def publisher(self, key: str, topic: Topic) -> Publisher:
         return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
 
-    def put_all(self, batch: Sequence[Entry]) -> bool:
-        for publisher, payload in batch:
-            publisher.put(payload)
+    def put_all(self, batch: Batch) -> bool:
+        for publisher, payloads in batch:
+            for payload in payloads:
+                publisher.put(payload)
         return self.takes
 
     def on_relief(self, handler: Callable[[], None]) -> None:

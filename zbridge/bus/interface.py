@@ -86,7 +86,8 @@ class Handle(Protocol):
         """Take it back; idempotent."""
 
 
-Entry = tuple[Publisher, bytes]
+Batch = Sequence[tuple[Publisher, list[bytes]]]
+"""What was published together: for each key its payloads in order."""
 
 
 class Bus(Protocol):
@@ -99,7 +100,7 @@ class Bus(Protocol):
     def publisher(self, key: str, topic: Topic) -> Publisher:
         """Declare that ``key`` will be written."""
 
-    def put_all(self, batch: Sequence[Entry]) -> bool:
+    def put_all(self, batch: Batch) -> bool:
         """Publish stream messages in order; False asks to pause the source until the relief handler is called."""
 
     def on_relief(self, handler: Callable[[], None]) -> None:

@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from queue import SimpleQueue
 
 from zbridge.metrics import Metrics
 
@@ -33,7 +34,9 @@ class Writer:
         self._full = False
         self._stopping = False
         self._ended = False
-        self._wake = threading.Condition()
+        self._lock = threading.Lock()
+        self._bell: SimpleQueue[None] = SimpleQueue()
+        self._rung = False
         self._dropped = metrics.count("bus_out_dropped", writer=name)
         self._replaced = metrics.count("bus_out_replaced", writer=name)
         self._thread = threading.Thread(target=self._run, name=f"zbridge-{name}", daemon=True)
@@ -41,7 +44,7 @@ class Writer:
 
     def put(self, call: Call, size: int = 1) -> bool:
         """Carry out a call of ``size`` messages; False asks to pause the source."""
-        with self._wake:
+        with self._lock:
             if self._ended:
                 self._dropped.value += size
                 return True
@@ -51,28 +54,28 @@ class Writer:
                 self._full = self._full or self._backlog > BACKLOG
             else:
                 self._forget_oldest()
-            self._wake.notify()
+            self._ring()
             return not self._full
 
     def replace(self, key: str, call: Call, size: int = 1) -> bool:
         """Carry out a call unless a newer one of the same key comes first; a lossless writer does every one."""
         if self._lossless:
             return self.put(call, size)
-        with self._wake:
+        with self._lock:
             if self._ended:
                 self._dropped.value += 1
                 return True
             if key in self._latest:
                 self._replaced.value += 1
             self._latest[key] = call
-            self._wake.notify()
+            self._ring()
             return True
 
     def stop(self, timeout_s: float = 0.5) -> None:
         """Finish what waits, for at most ``timeout_s`` seconds."""
-        with self._wake:
+        with self._lock:
             self._stopping = True
-            self._wake.notify()
+            self._ring()
         self._thread.join(timeout_s)
 
     def _forget_oldest(self) -> None:
@@ -81,22 +84,35 @@ class Writer:
             self._backlog -= size
             self._dropped.value += size
 
+    def _ring(self) -> None:
+        """Wake the thread, once: a condition variable takes several times as long to do it."""
+        if not self._rung:
+            self._rung = True
+            self._bell.put(None)
+
     def _run(self) -> None:
         while True:
-            with self._wake:
-                while not (self._jobs or self._latest or self._stopping):
-                    self._wake.wait()
-                if not (self._jobs or self._latest):
+            self._bell.get()
+            self._rung = False
+            while self._work():
+                pass
+            with self._lock:
+                if self._stopping and not (self._jobs or self._latest):
                     self._ended = True
                     return
-                latest = list(self._latest.values())
-                self._latest.clear()
-                job = self._jobs.popleft() if self._jobs else None
-            for call in latest:
-                self._carry_out(call, 1)
-            if job is not None:
-                self._carry_out(*job)
-                self._written(job[1])
+
+    def _work(self) -> bool:
+        """Carry out all that waits by key, and the first of the line; False when there was nothing."""
+        with self._lock:
+            latest = list(self._latest.values())
+            self._latest.clear()
+            job = self._jobs.popleft() if self._jobs else None
+        for call in latest:
+            self._carry_out(call, 1)
+        if job is not None:
+            self._carry_out(*job)
+            self._written(job[1])
+        return job is not None or bool(latest)
 
     def _carry_out(self, call: Call, size: int) -> None:
         try:
@@ -106,7 +122,7 @@ class Writer:
             log.debug("not written to the bus: %s", error)
 
     def _written(self, size: int) -> None:
-        with self._wake:
+        with self._lock:
             self._backlog -= size
             relieved = self._full and self._backlog < BACKLOG // 2
             self._full = self._full and not relieved

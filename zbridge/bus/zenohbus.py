@@ -18,7 +18,7 @@ import zenoh
 import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, BusSettings, Entry, Handle, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Publisher, Question, Sample
 from zbridge.bus.writer import Writer
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
@@ -127,9 +127,9 @@ class ZenohBus:
         blocks = qos.congestion is Congestion.BLOCK
         return self._keep(_PlainPublisher(key, plain, self._writer if blocks else None))
 
-    def put_all(self, batch: Sequence[Entry]) -> bool:
-        """Publish stream messages in order: the last one express, which takes the others with it."""
-        return self._streams.put(lambda: _put_batch(batch), len(batch))
+    def put_all(self, batch: Batch) -> bool:
+        """Publish stream messages, those of a key in order: the last one express, which takes the others along."""
+        return self._streams.put(lambda: _put_batch(batch), sum(len(waiting) for _, waiting in batch))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
         """Call ``handler`` when a source that was asked to pause may go on."""
@@ -392,10 +392,10 @@ class _Question:
             self._query.drop()  # type: ignore[no-untyped-call]
 
 
-def _put_batch(batch: Sequence[tuple[Any, bytes]]) -> None:
-    last = len(batch) - 1
-    for index, (publisher, payload) in enumerate(batch):
-        if index < last:
-            publisher.put_plain(payload)
-        else:
-            publisher.put_express(payload)
+def _put_batch(batch: Sequence[tuple[Any, list[bytes]]]) -> None:
+    last = batch[-1][1].pop()
+    for publisher, waiting in batch:
+        put = publisher.put_plain
+        for payload in waiting:
+            put(payload)
+    batch[-1][0].put_express(last)

@@ -7,6 +7,7 @@ of the command line's libraries. Exit codes: 0 done, 1 failed, 2 wrong arguments
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import sys
 from collections.abc import Coroutine
@@ -53,6 +54,7 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
     plan = load(file)
     if only is not None and plan.protocol.name != only:
         raise ConfigError(f"{file}: device.protocol = {plan.protocol.name!r}: expected {only!r}")
+    gc.freeze()  # what start-up made stays, and need not be looked through again
     run_loop(until_signal(Gateway(plan).run()))
 
 

@@ -14,6 +14,10 @@ An offset beyond ``len(data)`` says that at least so many bytes are needed. It i
 """
 
 
+_JOINED = 1024
+"""Bytes that are joined to an incomplete frame at least, where its end is not known yet."""
+
+
 class FrameBuffer:
     """Keeps the incomplete frame between reads; never holds more than ``limit`` bytes of it."""
 
@@ -36,20 +40,37 @@ class FrameBuffer:
 
         The frames before a broken one are yielded first. After an error the buffer is of no further use.
         """
-        if self._rest:
-            self._rest += data
+        start = 0
+        while self._rest:
+            # Only what the incomplete frame needs is joined to it: the rest of a large read is not copied.
+            more = data[start : start + max(self._needed - len(self._rest), _JOINED)]
+            self._rest += more
+            start += len(more)
             if len(self._rest) < self._needed:
                 return
-            data = bytes(self._rest)
+            joined = bytes(self._rest)
             self._rest.clear()
-        frame_end, start, size = self._frame_end, 0, len(data)
+            end = self._end(joined, 0)
+            if end > len(joined):
+                self._rest += joined
+                self._needed = end
+                if start == len(data):
+                    return
+            else:
+                start -= len(joined) - end
+                yield joined[:end]
+        size = len(data)
         while start < size:
-            end = frame_end(data, start)
-            if end - start > self._limit:
-                raise ProtocolError(f"frame of {end - start} bytes exceeds {self._limit}")
+            end = self._end(data, start)
             if end > size:
                 self._rest += data[start:]
                 self._needed = end - start
                 return
             yield data[start:end]
             start = end
+
+    def _end(self, data: bytes, start: int) -> int:
+        end = self._frame_end(data, start)
+        if end - start > self._limit:
+            raise ProtocolError(f"frame of {end - start} bytes exceeds {self._limit}")
+        return end

@@ -9,7 +9,7 @@ from typing import Any
 
 from zbridge.link import Link
 from zbridge.metrics import Count
-from zbridge.session.session import Session, State
+from zbridge.session.session import Datagram, Session, State
 
 log = logging.getLogger("zbridge.link")
 
@@ -25,6 +25,7 @@ class Conversation:
         deliver: Callable[[list[Any]], None],
         changed: Callable[[], None] = lambda: None,
         malformed: Count | None = None,
+        foreign: Count | None = None,
     ) -> None:
         self.session = session
         self.ended: asyncio.Future[None] = loop.create_future()
@@ -33,8 +34,9 @@ class Conversation:
         self._changed = changed
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._seen = session.state
+        self._seen = (session.state, session.busy)
         self._malformed = malformed or Count()
+        self._foreign = foreign or Count()
         self._malformed_logged = 0
 
     def __repr__(self) -> str:
@@ -51,7 +53,24 @@ class Conversation:
         """Take bytes from the link."""
         session = self.session
         messages = session.receive(data, self._loop.time())
-        if session.state is not self._seen and not session.over:
+        self._hand_on(messages)
+
+    def received_datagram(self, datagram: bytes) -> None:
+        """Take a datagram from the link."""
+        self._hand_on(self.session.receive_datagram(datagram, self._loop.time()))
+
+    def claims(self, datagram: bytes) -> bool:
+        """Tell whether the first datagram of an unknown source is this session's."""
+        return self.session.claims(datagram)
+
+    def foreign_datagram(self) -> None:
+        """Count a datagram that came from elsewhere."""
+        self.session.traffic.foreign += 1
+        self._foreign.value += 1
+
+    def _hand_on(self, messages: list[Any]) -> None:
+        session = self.session
+        if not session.over:
             self._notify()
         if messages:  # what came before the end of a session is delivered before the end is told
             self._deliver(messages)
@@ -76,9 +95,11 @@ class Conversation:
             frame = session.outgoing(now)
             if frame is None:
                 break
-            link.write(frame)
-        if session.state is not self._seen:
-            self._notify()
+            if type(frame) is Datagram:
+                link.write_datagram(frame)
+            else:
+                link.write(frame)
+        self._notify()
         if session.state is State.CLOSED:
             self._end()
         else:
@@ -119,8 +140,11 @@ class Conversation:
             self._timer = self._loop.call_at(deadline, self._tick)
 
     def _notify(self) -> None:
-        self._seen = self.session.state
-        self._changed()
+        """Tell of a change of state, once."""
+        now = (self.session.state, self.session.busy)
+        if now != self._seen:
+            self._seen = now
+            self._changed()
 
     def _end(self) -> None:
         self._set_timer(None)

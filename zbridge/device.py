@@ -114,10 +114,12 @@ class Device:
         self._deadman: asyncio.TimerHandle | None = None
         self._control_due: asyncio.TimerHandle | None = None
         self._closing = False
+        self._busy: str | None = None
         self._questions = Questions(self._loop)
         self._published = metrics.count("published")
         self._untranslatable = metrics.count("untranslatable")
         self._malformed = metrics.count("malformed")
+        self._foreign = metrics.count("foreign_datagrams")
         self._refused = metrics.count("refused")
         self._commands = metrics.count("commands")
 
@@ -188,6 +190,7 @@ class Device:
             deliver=self._deliver,
             changed=lambda: self._on_session(endpoint, session),
             malformed=self._malformed,
+            foreign=self._foreign,
         )
         self._set_state(endpoint, "connecting", None)
         endpoint.conversation = conversation
@@ -217,7 +220,10 @@ class Device:
             self._watch_deadman()
             self._questions.refuse_all("the robot was lost")
             self._publish_control()
-        self._set_state(endpoint, _STATES[session.state], session.reason)
+        if session is self._robot.driving and session.busy != self._busy:
+            self._busy = session.busy
+            self._halt(self._busy or "no longer busy")
+        self._set_state(endpoint, _STATES[session.state], session.busy or session.reason)
 
     def _set_state(self, endpoint: _Endpoint, state: RobotState, reason: str | None) -> None:
         if (endpoint.state, endpoint.reason) != (state, reason):
@@ -357,8 +363,7 @@ class Device:
 
     def _require_ready(self) -> None:
         if not self._robot.ready:
-            state = self._endpoints[0].state
-            raise Refused(state if state != "established" else "the robot takes no commands now")
+            raise Refused(self._busy or self._endpoints[0].state)
 
     def _report(self, topic: Topic, outcome: Any) -> None:
         for shown, message in outcome.telemetry:
@@ -385,7 +390,8 @@ class Device:
         self._authority.stopped(reason)
         self._watch_deadman()
         self._publish_control()
-        if self._robot.ready:
+        driving = self._robot.driving
+        if driving is not None and driving.state is State.ESTABLISHED:
             log.info("%s: stop (%s)", self._keys.robot, reason)
             self._robot.stop(now, now + STOP_REPEAT_S)
             self._pump()

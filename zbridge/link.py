@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Protocol, cast
 from urllib.parse import urlsplit
 
@@ -55,6 +56,15 @@ class Receiver(Protocol):
     def received(self, data: bytes) -> None:
         """Take bytes as they were read."""
 
+    def received_datagram(self, datagram: bytes) -> None:
+        """Take a datagram of this peer."""
+
+    def claims(self, datagram: bytes) -> bool:
+        """Tell whether the first datagram of an unknown source is this peer's."""
+
+    def foreign_datagram(self) -> None:
+        """Take note of a datagram that came from elsewhere and was dropped."""
+
     def lost(self, reason: str) -> None:
         """Take note that the connection is gone; called once, nothing follows."""
 
@@ -74,6 +84,9 @@ class Link(Protocol):
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
 
+    def write_datagram(self, data: bytes) -> None:
+        """Send ``data`` as one datagram to the peer; lost where the network takes none."""
+
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
 
@@ -87,8 +100,10 @@ class Link(Protocol):
 class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection: every write a segment of its own, a vanished peer noticed by keep-alive."""
 
-    def __init__(self, receiver: Receiver) -> None:
+    def __init__(self, receiver: Receiver, hub: DatagramHub | None = None) -> None:
         self.peer = ""
+        self._hub = hub
+        self._datagrams: DatagramSocket | None = None
         self._receiver = receiver
         self._transport: asyncio.Transport | None = None
         self._buffer = bytearray(READ_BYTES)
@@ -107,6 +122,19 @@ class TcpLink(asyncio.BufferedProtocol):
         """Write ``data`` as one segment."""
         if self._transport is not None:
             self._transport.write(data)
+
+    def write_datagram(self, data: bytes) -> None:
+        """Send ``data`` as one datagram to the peer; lost where the network takes none.
+
+        Towards a peer we connected to, the first one opens a socket of our own, that hears nobody but the
+        peer's address and port. An accepted peer is answered from the listener's port.
+        """
+        if self._hub is not None:
+            self._hub.send(self, data)
+        elif self._transport is not None:
+            if self._datagrams is None:
+                self._datagrams = DatagramSocket(self._transport, self._receiver)
+            self._datagrams.send(data)
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
@@ -139,6 +167,8 @@ class TcpLink(asyncio.BufferedProtocol):
             return
         self.peer = str(Address(*peer[:2]))
         _tune(transport.get_extra_info("socket"))
+        if self._hub is not None:
+            self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
@@ -159,6 +189,10 @@ class TcpLink(asyncio.BufferedProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
+        if self._datagrams is not None:
+            self._datagrams.close()
+        if self._hub is not None:
+            self._hub.remove(self)
         self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
@@ -188,13 +222,138 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
     return link
 
 
-async def listen(address: Address, receiver: Callable[[], Receiver]) -> asyncio.Server:
-    """Listen for peers, each with a receiver of its own; raise LinkError where the address cannot be had."""
+@contextlib.asynccontextmanager
+async def listen(
+    address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False
+) -> AsyncIterator[Address]:
+    """Listen for peers, each with a receiver of its own; give the address, with the port that was had.
+
+    ``datagrams``: serve UDP on the same port number too. Raises LinkError where the address cannot be had.
+    """
     loop = asyncio.get_running_loop()
+    hub = DatagramHub() if datagrams else None
     try:
-        return await loop.create_server(lambda: TcpLink(receiver()), address.host, address.port)
+        server = await loop.create_server(lambda: TcpLink(receiver(), hub), address.host, address.port)
+        async with server:
+            host, port = server.sockets[0].getsockname()[:2]
+            if hub is not None:
+                hub.open(host, port)
+            try:
+                yield Address(host, port)
+            finally:
+                if hub is not None:
+                    hub.close()
     except OSError as error:
         raise LinkError(f"{address}: {error.strerror or error}") from error
+
+
+_DATAGRAM_BYTES = 65_536
+_DATAGRAMS = 64
+"""Most datagrams taken from a socket before the loop serves others."""
+
+
+class _DatagramReader:
+    """A bound UDP socket on the event loop; asyncio and uvloop alike."""
+
+    def __init__(self) -> None:
+        self._socket: socket.socket | None = None
+        self._loop = asyncio.get_running_loop()
+
+    def _listen(self, host: str, port: int) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.bind((host, port))
+        self._loop.add_reader(self._socket.fileno(), self._read)
+
+    def _read(self) -> None:
+        for _ in range(_DATAGRAMS):
+            if self._socket is None:
+                return
+            try:
+                data, source = self._socket.recvfrom(_DATAGRAM_BYTES)
+            except OSError:  # nothing more, or an ICMP error of an earlier send
+                return
+            self._take(data, source[:2])
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        raise NotImplementedError
+
+    def _send(self, data: bytes, destination: tuple[str, int]) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # a full buffer, an unreachable peer: the datagram is lost
+                self._socket.sendto(data, destination)
+
+    def close(self) -> None:
+        """Close the socket; idempotent."""
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            self._loop.remove_reader(sock.fileno())
+            sock.close()
+
+
+class DatagramSocket(_DatagramReader):
+    """Our own UDP socket towards one peer: it hears the peer's address and port, and counts everything else."""
+
+    def __init__(self, transport: asyncio.Transport, receiver: Receiver) -> None:
+        super().__init__()
+        self._receiver = receiver
+        self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
+        self._listen(transport.get_extra_info("sockname")[0], 0)
+
+    def send(self, data: bytes) -> None:
+        """Send to the peer."""
+        self._send(data, self._peer)
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        if source == self._peer:
+            self._receiver.received_datagram(data)
+        else:
+            self._receiver.foreign_datagram()
+
+
+class DatagramHub(_DatagramReader):
+    """The UDP socket of a listener: each source belongs to the link of the same host that claimed it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._hosts: dict[Link, tuple[str, Receiver]] = {}
+        self._sources: dict[tuple[str, int], Link] = {}
+        self.foreign = 0
+
+    def open(self, host: str, port: int) -> None:
+        """Bind the port."""
+        self._listen(host, port)
+
+    def add(self, link: Link, host: str, receiver: Receiver) -> None:
+        """Let a link have the datagrams of its host that it claims."""
+        self._hosts[link] = (host, receiver)
+
+    def remove(self, link: Link) -> None:
+        """Forget a link and its source; idempotent."""
+        self._hosts.pop(link, None)
+        self._sources = {source: owner for source, owner in self._sources.items() if owner is not link}
+
+    def send(self, link: Link, data: bytes) -> None:
+        """Send to the source a link has claimed; nowhere while there is none."""
+        for source, owner in self._sources.items():
+            if owner is link:
+                self._send(data, source)
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        link = self._sources.get(source) or self._claim(data, source)
+        if link is None:
+            self.foreign += 1
+        else:
+            self._hosts[link][1].received_datagram(data)
+
+    def _claim(self, data: bytes, source: tuple[str, int]) -> Link | None:
+        taken = set(self._sources.values())
+        for link, (host, receiver) in self._hosts.items():
+            if host == source[0] and link not in taken and receiver.claims(data):
+                self._sources[source] = link
+                return link
+        return None
 
 
 class FakeLink:
@@ -204,12 +363,17 @@ class FakeLink:
         self.peer = peer
         self.ready = True
         self.written: list[bytes] = []
+        self.datagrams: list[bytes] = []
         self.paused = False
         self.closed = False
 
     def write(self, data: bytes) -> None:
         """Keep ``data``."""
         self.written.append(data)
+
+    def write_datagram(self, data: bytes) -> None:
+        """Keep ``data``."""
+        self.datagrams.append(data)
 
     def pause(self) -> None:
         """Take note."""

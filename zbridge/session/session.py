@@ -54,6 +54,10 @@ class Limits(msgspec.Struct, frozen=True):
     gap_s: float = 0.0
 
 
+class Datagram(bytes):
+    """A frame that goes by datagram; every other frame goes by the stream."""
+
+
 class Traffic(msgspec.Struct):
     """What one session has carried, and what of it was not usable."""
 
@@ -62,6 +66,8 @@ class Traffic(msgspec.Struct):
     bytes_in: int = 0
     bytes_out: int = 0
     malformed: int = 0
+    foreign: int = 0
+    """Datagrams that came from elsewhere."""
 
 
 class Snapshot(msgspec.Struct, frozen=True):
@@ -92,6 +98,8 @@ class Session(ABC, Generic[M]):
         self.peer = peer
         self.state = State.CONNECTING
         self.reason: str | None = None
+        self.busy: str | None = None
+        """Why the peer takes no commands for now, although the session is established."""
         self.version: str | None = None
         self.features: tuple[str, ...] = ()
         self.transport = "tcp"
@@ -122,6 +130,17 @@ class Session(ABC, Generic[M]):
     @abstractmethod
     def accept(self, message: M, now: float) -> bool:
         """Take a message of the handshake, or of a class in ``handled``; False keeps it for the session itself."""
+
+    def claims(self, datagram: bytes) -> bool:
+        """Tell whether the first datagram of an unknown source is this session's."""
+        return False
+
+    def timers(self) -> float:
+        """Tell when :meth:`on_timer` wants to be called next; ``inf`` for never."""
+        return math.inf
+
+    def on_timer(self, now: float) -> None:
+        """Let a protocol's own timers that are due take effect."""
 
     def overdue(self) -> str:
         """Say why a handshake that was never finished probably was not."""
@@ -173,6 +192,32 @@ class Session(ABC, Generic[M]):
         traffic.frames_in += frames
         return messages
 
+    def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
+        """Take one datagram, which is one frame; return its message for the translator.
+
+        A datagram that is no frame is counted and changes nothing else.
+        """
+        if self.over:
+            return []
+        self.traffic.frames_in += 1
+        self.traffic.bytes_in += len(datagram)
+        if self.tap is not None:
+            self.tap("in", datagram)
+        try:
+            end = type(self).frame_end(datagram, 0)
+            if end != len(datagram):
+                raise ProtocolError(f"datagram of {len(datagram)} bytes holds a frame of {end}")
+            message = self.decode(datagram)
+            if self.accept_datagram(message, now):
+                return [message]
+        except ProtocolError as error:
+            self.malformed(str(error))
+        return []
+
+    def accept_datagram(self, message: M, now: float) -> bool:
+        """Take a message that came by datagram; False keeps it for the session itself."""
+        return self.accept(message, now)
+
     def malformed(self, what: str) -> None:
         """Count one message of the peer that could not be used."""
         self.traffic.malformed += 1
@@ -200,11 +245,13 @@ class Session(ABC, Generic[M]):
         if self.state is State.CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
-        earliest = self._limit_at if outbox is None else min(outbox, self._limit_at)
+        earliest = min(self._limit_at, self.timers(), math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
         """Let the timers that are due take effect."""
+        if not self.over and now >= self.timers():
+            self.on_timer(now)
         if now < self._limit_at:
             return
         self._limit_at = math.inf

@@ -75,14 +75,18 @@ class Robot(ABC):
     @property
     def ready(self) -> bool:
         """Whether the robot takes commands now."""
-        return self.driving is not None and self.driving.state is State.ESTABLISHED
+        session = self.driving
+        return session is not None and session.state is State.ESTABLISHED and session.busy is None
 
 
 class Simulation(msgspec.Struct, frozen=True):
     """How a simulated robot is started. ``ready`` is called with the address it listens on."""
 
     address: Address
-    seed: int
+    seed: int = 1
+    version: str | None = None
+    udp: bool = False
+    strict: bool = False
     ready: Callable[[Address], None] = lambda address: None
 
 

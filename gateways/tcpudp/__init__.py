@@ -1,12 +1,16 @@
 """The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
 
 ``messages`` declares the packets, ``session`` holds the conversation in both roles, ``translate`` turns
-packets into fleet messages and commands into packets, ``simulator`` is a robot to play with.
+packets into fleet messages and commands into packets, ``simulator`` is a robot to play with, ``strict`` one that
+is as fragile as the deployed ones and shares no code with the others.
 """
 
 from __future__ import annotations
 
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
+from gateways.tcpudp.versions import VERSIONS
+from zbridge.errors import ConfigError
+from zbridge.link import Address
 from zbridge.protocol import Protocol, Simulation
 
 TEMPLATE = """\
@@ -21,6 +25,7 @@ protocol = "tcpudp"
 connect = ["tcp://127.0.0.1:11001"]     # the robot's address
 
 [device.options]
+udp = true                              # use datagrams where the robot offers them and they get through
 gap_s = 0.01                            # least time between two packets: robots take one read as one packet
 force = []                              # features to use although the robot does not announce them, for
                                         # example ["joystick", "lidar"], and ids of raw packets it knows
@@ -49,9 +54,23 @@ deadman_s = 2.0                         # motion without a fresh command ends af
 
 
 async def _simulate(simulation: Simulation) -> None:
-    from gateways.tcpudp.simulator import simulate
+    if simulation.version is not None and simulation.version not in VERSIONS:
+        raise ConfigError(f"version {simulation.version!r}: expected one of {', '.join(VERSIONS)}")
+    if simulation.strict:
+        from gateways.tcpudp.strict import simulate_strict
 
-    await simulate(simulation)
+        address, version = simulation.address, simulation.version or "1.3"
+
+        def ready(port: int) -> None:
+            simulation.ready(Address(address.host, port))
+
+        await simulate_strict(
+            address.host, address.port, version=version, udp=simulation.udp, seed=simulation.seed, ready=ready
+        )
+    else:
+        from gateways.tcpudp.simulator import simulate
+
+        await simulate(simulation)
 
 
 PROTOCOL = Protocol(

@@ -302,10 +302,32 @@ def decoder(packet_id: int) -> Callable[[bytes, int], Packet]:
     spec = PACKETS.get(packet_id)
     if spec is None:
         return lambda frame, start: OpaquePacket(packet_id, frame[start:])
-    return _decode_map if spec.packet is ServerSLAMMap else spec.codec.decode
+    return _DECODERS.get(spec.packet, spec.codec.decode)
+
+
+def _decode_text(frame: bytes, start: int) -> Packet:
+    """Read packet 1; one that is broadcast carries a second header before the first ("The gateway as HQ")."""
+    while _is_whole_text(frame, start):
+        start += HEADER.size
+    return DebugMessage.spec.codec.decode(frame, start)
+
+
+def _is_whole_text(frame: bytes, start: int) -> bool:
+    """Tell whether a body is itself a packet 1 from the robot, down to its last byte."""
+    size = len(frame) - start
+    if size < HEADER.size + 4:
+        return False
+    length, sender_id, packet_id = HEADER.unpack_from(frame, start)
+    return bool(length + 4 == size and sender_id == SERVER_ID and packet_id == DebugMessage.spec.id)
 
 
 def _decode_map(frame: bytes, start: int) -> Packet:
     """Read packet 53; some robots answer 54 with it and three floats: a position ("The gateway as HQ")."""
     three_floats = len(frame) - start == 12 and int.from_bytes(frame[start : start + 4], "little") != _MAP_OF_12_BYTES
     return (ServerPosition if three_floats else ServerSLAMMap).spec.codec.decode(frame, start)
+
+
+_DECODERS: dict[type[Packet], Callable[[bytes, int], Packet]] = {
+    DebugMessage: _decode_text,
+    ServerSLAMMap: _decode_map,
+}

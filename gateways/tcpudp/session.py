@@ -1,11 +1,11 @@
 """Sessions of the TCP/UDP package protocol in both roles: handshake, identities, what may be sent. Sans-IO.
 
 Source: "Handshake", "Settings and version negotiation" and "The gateway as HQ" of the protocol page.
-Spoken here: version 1.3 over TCP.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 
 from gateways.tcpudp.messages import (
@@ -13,31 +13,40 @@ from gateways.tcpudp.messages import (
     MAX_FRAME,
     PACKETS,
     SERVER_ID,
+    Carrier,
     ClientSettings,
+    ClientUDPConnection,
+    ClientUDPConnectionStatus,
     DebugMessage,
     OpaquePacket,
     Packet,
     Sender,
     ServerSettings,
+    ServerSLAMMapPart,
+    ServerStartUDP,
+    ServerUDPConnection,
     decoder,
     encode_packet,
     frame_end,
 )
-from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, Settings13, read_settings
+from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
+from gateways.tcpudp.versions import LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.session.negotiation import agree, parse_versions
-from zbridge.session.session import Limits, Role, Session
+from zbridge.session.probe import Probe, Verdict
+from zbridge.session.session import Datagram, Limits, Role, Session
 
-VERSIONS = ("1.3",)
-"""The versions that are spoken."""
-LISTED = "1.1,1.2,1.3"
-"""What peers of version 1.3 send, and the only list deployed 1.3 robots take safely."""
-_QUOTED = 80
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
 HANDSHAKE_S = 5.0
-ANNOUNCED = Settings13(lidar_sim=True)
-"""What deployed HQ programs of version 1.3 announce (UDP aside): robots are known to take it."""
+PROBE_S = 2.0
+"""Seconds each end waits for the other's datagram."""
+SILENCE_S = 2.05
+"""Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7."""
+MAP_SILENCE_S = 1.5
+"""Seconds without a map part after which a robot's TCP side is taken to be free again."""
+BUSY_MAP = "busy: map"
+_QUOTED = 80
 
 
 def limits(gap_s: float) -> Limits:
@@ -63,7 +72,10 @@ class _TcpUdpSession(Session[Packet]):
     _decoders: dict[bytes, Decode]
 
     def encode(self, message: Packet) -> bytes:
-        return encode_packet(message, self.sender_id)
+        frame = encode_packet(message, self.sender_id)
+        if self.transport == "udp" and not isinstance(message, OpaquePacket):
+            return Datagram(frame) if message.spec.carrier is Carrier.UDP_IF_AGREED else frame
+        return frame
 
     def decode(self, frame: bytes) -> Packet:
         """Read a packet of the stream; ``frame_end`` has checked its length."""
@@ -79,9 +91,9 @@ class _TcpUdpSession(Session[Packet]):
             return f"{spec.name} ({packet_id}) from the wrong side"
         return f"packet {packet_id} with id {sender_id}, which is not the peer's"
 
-    def refuse_versions(self, listed: str, now: float) -> None:
+    def refuse_versions(self, listed: str, ours: Iterable[str], now: float) -> None:
         """Tell the peer and the operator that no version is common, and close."""
-        reason = f"no common version: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(VERSIONS)}"
+        reason = f"no common version: the peer speaks {listed[:_QUOTED]!r}, this gateway {', '.join(ours)}"
         self.send(DebugMessage(reason))
         self.close(reason, now)
 
@@ -90,18 +102,26 @@ _OWN = {Role.HQ: Sender.HQ, Role.ROBOT: Sender.ROBOT}
 
 
 class HqSession(_TcpUdpSession):
-    """We play HQ towards a robot. ``force``: features and packet ids to use although it does not announce them."""
+    """We play HQ towards a robot.
+
+    ``udp``: offer datagrams. ``force``: features and packet ids to use although it does not announce them.
+    """
 
     role = Role.HQ
-    handled = frozenset({ServerSettings})
+    handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, ServerSLAMMapPart})
     _decoders = decoders(Sender.HQ, (SERVER_ID,))
 
-    def __init__(self, limits: Limits, *, force: Iterable[Feature | int] = ()) -> None:
+    def __init__(self, limits: Limits, *, udp: bool = True, force: Iterable[Feature | int] = ()) -> None:
         super().__init__(limits)
         self.sender_id = 0
         self.settings: Settings | None = None
+        self._udp = udp
         self._force = frozenset(force)
-        self._usable: frozenset[Feature | int] = self._force
+        self._agreed = ""
+        self._start = Probe(PROBE_S)
+        self._probe = Probe(PROBE_S)
+        self._silent_until = math.inf
+        self._map_until = math.inf
 
     def overdue(self) -> str:
         return (
@@ -112,10 +132,25 @@ class HqSession(_TcpUdpSession):
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ServerSettings):
             self._take_settings(message, now)
-            return False
-        if self.version is None:
+        elif self.settings is None:
             raise ProtocolError(f"{type(message).__name__} before serverSettings")
-        return True
+        elif isinstance(message, ServerStartUDP):
+            self._take_start(now)
+        elif isinstance(message, ServerUDPConnection):
+            self._take_answer(message, now, by_datagram=False)
+        else:
+            if isinstance(message, ServerSLAMMapPart):
+                self._begin_map(now)
+            return True
+        return False
+
+    def accept_datagram(self, message: Packet, now: float) -> bool:
+        if isinstance(message, ServerUDPConnection):
+            self._take_answer(message, now, by_datagram=True)
+            return False
+        return self.accept(message, now)
+
+    # What may be sent
 
     def may_send(self, message: Packet) -> None:
         """Raise Refused for a packet that this robot may not know: an unregistered id crashes it."""
@@ -125,9 +160,15 @@ class HqSession(_TcpUdpSession):
         if isinstance(message, OpaquePacket):
             raise Refused(f"packet {packet_id} may crash the robot; list it in options.force if it knows it")
         needed = message.spec.features
-        if needed and self._usable.isdisjoint(needed):
+        if not needed or not self._force.isdisjoint(needed):
+            return
+        # Of several features the first one that the robot's version has a flag for decides.
+        feature = next((feature for feature in needed if hasattr(self.settings, feature.value)), None)
+        if feature is None:
             names = " or ".join(feature.value for feature in needed)
-            raise Refused(f"{message.spec.name}: the robot does not announce {names}")
+            raise Refused(f"{message.spec.name}: version {self._agreed} has no {names}")
+        if not getattr(self.settings, feature.value):
+            raise Refused(f"{message.spec.name}: the robot does not announce {feature.value}")
 
     def encode(self, message: Packet) -> bytes:
         """Write a packet the robot can take whole; raise Refused for one it may not know."""
@@ -139,51 +180,169 @@ class HqSession(_TcpUdpSession):
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
 
+    # Handshake
+
     def _take_settings(self, message: ServerSettings, now: float) -> None:
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
         self.sender_id = message.client_id
-        version = agree(VERSIONS, parse_versions(message.versions))
-        if version is None:
-            self.refuse_versions(message.versions, now)
+        listed = parse_versions(message.versions)
+        agreed = agree(VERSIONS, listed)
+        if agreed is None:
+            self.refuse_versions(message.versions, VERSIONS, now)
             return
         self.settings = read_settings(message.versions, message.block, ROBOT_BLOCKS)
-        self._usable = self._force.union(self.settings.features)
-        self.send(ClientSettings(LISTED, ANNOUNCED.encode()))
-        self.establish(version, tuple(feature.value for feature in self.settings.features))
+        self._agreed = agreed
+        udp = self._udp and self.settings.udp
+        answer = VERSIONS[agreed].answer or message.versions
+        self.send(ClientSettings(answer, announced(answer, udp=udp)))
+        if udp:
+            self._limit_at = math.inf
+            self._start.begin(now)
+        else:
+            self._finish()
+
+    def _take_start(self, now: float) -> None:
+        """Packet 4: send 5 by UDP at once, and nothing by TCP but one 7 until the silence has ended."""
+        if not self._start.settle(works=True):
+            raise ProtocolError("serverStartUDP was not due")
+        self._silent_until = now + SILENCE_S
+        self.outbox.put(Datagram(self.encode(ClientUDPConnection())))
+        self._probe.begin(now)
+
+    def _take_answer(self, message: ServerUDPConnection, now: float, *, by_datagram: bool) -> None:
+        works = message.received and by_datagram
+        if not self._probe.settle(works=works):
+            raise ProtocolError("serverUDPConnection was not due")
+        self._report_probe(works=works)
+
+    def _report_probe(self, *, works: bool) -> None:
+        if works:
+            self.transport = "udp"
+        self.send(ClientUDPConnectionStatus(works))
+
+    def _finish(self) -> None:
+        assert self.settings is not None
+        self.establish(self._agreed, tuple(feature.value for feature in self.settings.features))
+
+    # Timers
+
+    def timers(self) -> float:
+        return min(self._start.deadline, self._probe.deadline, self._silent_until, self._map_until)
+
+    def on_timer(self, now: float) -> None:
+        if self._start.expire(now):
+            self._finish()  # the robot wants no datagrams after all
+        if self._probe.expire(now):
+            self._report_probe(works=False)
+        if now >= self._silent_until:
+            self._silent_until = math.inf
+            self._finish()
+        if now >= self._map_until:
+            self._map_until = math.inf
+            self.busy = None
+
+    # A robot that sends its map in parts takes nothing by TCP meanwhile
+
+    def _begin_map(self, now: float) -> None:
+        self.busy = BUSY_MAP
+        self._map_until = now + MAP_SILENCE_S
+
+    def end_map(self) -> None:
+        """Take note that the last part has come: the robot reads again."""
+        self._map_until = math.inf
+        self.busy = None
 
 
 class RobotSession(_TcpUdpSession):
-    """We play the robot towards an HQ: what we announce, and the id we give it."""
+    """We play the robot towards an HQ: what we announce, the versions we list verbatim, and the id we give it."""
 
     role = Role.ROBOT
-    handled = frozenset({ClientSettings})
+    handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
     sender_id = SERVER_ID
 
-    def __init__(self, limits: Limits, settings: Settings, client_id: int) -> None:
+    def __init__(self, limits: Limits, settings: Settings, client_id: int, versions: Iterable[str] = LISTED) -> None:
         super().__init__(limits)
         self.settings = settings
         self.client_id = client_id
-        self._decoders = decoders(Sender.ROBOT, (0, client_id))
         self.client: Settings | None = None
+        self._versions = tuple(versions)
+        self._agreed = ""
+        self._probe = Probe(PROBE_S)
+        self._report = Probe(PROBE_S)
+        self._decoders = decoders(Sender.ROBOT, (0, client_id))
 
     def opened(self, now: float) -> None:
-        self.send(ServerSettings(self.client_id, LISTED, self.settings.encode()))
+        self.send(ServerSettings(self.client_id, ",".join(self._versions), self.settings.encode()))
 
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientSettings):
             self._take_settings(message, now)
-            return False
-        if self.version is None:
+        elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
-        return True
+        elif isinstance(message, ClientUDPConnectionStatus):
+            # Deployed HQ programs say true whatever happened: only the datagram that arrived is believed.
+            if not self._report.settle(works=message.connected):
+                raise ProtocolError("clientUDPConnectionStatus was not due")
+            self._finish()
+        elif isinstance(message, ClientUDPConnection):
+            raise ProtocolError("clientUDPConnection by TCP")
+        else:
+            return True
+        return False
+
+    def claims(self, datagram: bytes) -> bool:
+        waited_for = self._probe.verdict is Verdict.WAITING
+        return waited_for and datagram == encode_packet(ClientUDPConnection(), self.client_id)
+
+    def accept_datagram(self, message: Packet, now: float) -> bool:
+        if not isinstance(message, ClientUDPConnection):
+            return self.accept(message, now)
+        if not self._probe.settle(works=True):
+            raise ProtocolError("clientUDPConnection was not due")
+        self.transport = "udp"
+        self._answer_probe(now)
+        return False
+
+    def may_send(self, message: Packet) -> None:
+        """Raise Refused for a packet that an HQ of this version does not know: it cripples it for good."""
+        known = VERSIONS[self._agreed].known_to_hq
+        packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
+        if packet_id not in known:
+            raise Refused(f"an HQ of version {self._agreed} does not know packet {packet_id}")
 
     def _take_settings(self, message: ClientSettings, now: float) -> None:
         if self.client is not None:
             raise ProtocolError("clientSettings a second time")
-        version = agree(VERSIONS, parse_versions(message.versions))
-        if version is None:
-            self.refuse_versions(message.versions, now)
+        agreed = agree(self._versions, parse_versions(message.versions))
+        if agreed is None:
+            self.refuse_versions(message.versions, self._versions, now)
+            return
+        self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
+        self._agreed = agreed
+        if self.settings.udp and self.client.udp:
+            self._limit_at = math.inf
+            self.send(ServerStartUDP())
+            self._probe.begin(now)
         else:
-            self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
-            self.establish(version, tuple(feature.value for feature in self.client.features))
+            self._finish()
+
+    def _answer_probe(self, now: float) -> None:
+        """Packet 6: true by UDP, false by TCP; then the HQ has its time to answer 7."""
+        works = self.transport == "udp"
+        frame = self.encode(ServerUDPConnection(works))
+        self.outbox.put(Datagram(frame) if works else frame)
+        self._report.begin(now)
+
+    def _finish(self) -> None:
+        assert self.client is not None
+        self.establish(self._agreed, tuple(feature.value for feature in self.client.features))
+
+    def timers(self) -> float:
+        return min(self._probe.deadline, self._report.deadline)
+
+    def on_timer(self, now: float) -> None:
+        if self._probe.expire(now):
+            self._answer_probe(now)
+        if self._report.expire(now):
+            self._finish()

@@ -1,16 +1,18 @@
 """A robot of the TCP/UDP package protocol to play with: moves, sees walls, builds a map, answers every packet.
 
-It speaks version 1.3 over TCP. Deterministic with a seed: the same packets at the same times give the
+It speaks any version, with or without UDP. Deterministic with a seed: the same packets at the same times give the
 same world. Source: the packet table and "Translation" of the protocol page.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import math
 import random
 
+import msgspec
 import numpy as np
 
 from gateways.tcpudp.messages import (
@@ -31,12 +33,14 @@ from gateways.tcpudp.messages import (
     ServerLidarStatus,
     ServerPosition,
     ServerSLAMMap,
+    ServerSLAMMapPart,
 )
 from gateways.tcpudp.session import RobotSession, limits
-from gateways.tcpudp.settings import RobotSettings13
+from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
+from gateways.tcpudp.versions import VERSIONS
 from zbridge.conversation import Conversation
 from zbridge.errors import EncodeError, Refused
-from zbridge.link import Address, Link, listen
+from zbridge.link import Link, Receiver, listen
 from zbridge.protocol import Simulation
 from zbridge.session.session import State
 from zbridge.world import Body, Grid, cast
@@ -59,16 +63,17 @@ LIDAR_RANGE_M = 4.0
 _DEGREES = np.radians(np.arange(360.0))
 _POSE_EVERY, _MAP_EVERY, _ASK_EVERY = 5, 50, 50
 CLIENTS = range(2, 256)
-SETTINGS = RobotSettings13(
-    cam=True,
-    joystick=True,
-    chat=True,
-    lidar=True,
-    lidar_sim=True,
-    slam_map=True,
-    slam_map_size=SIDE * CELL,
-    slam_map_interval=CELL,
-)
+PARTS = 4
+"""Packets in which a robot of version "1.4" sends its map, one a second."""
+
+
+def settings_of(version: str, *, udp: bool) -> Settings:
+    """Give what a simulated robot of a version announces: every flag its version has."""
+    block = ROBOT_BLOCKS.get(version, RobotSettings13)
+    flags: dict[str, int] = {feature.value: True for feature in Feature if hasattr(block, feature.value)}
+    if block is RobotSettings13:
+        flags |= {"slam_map_size": SIDE * CELL, "slam_map_interval": CELL}
+    return msgspec.convert({**flags, "udp": udp}, block)
 
 
 class Vehicle:
@@ -161,8 +166,11 @@ class Vehicle:
 class Simulator:
     """Serves one vehicle to the HQ programs that connect."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
         self.vehicle = Vehicle(seed)
+        self._versions = VERSIONS[version].listed.split(",")
+        self._settings = settings_of(version, udp=udp)
+        self._parts = version == "1.4"
         self._peers: dict[int, Conversation] = {}
         self._loop = asyncio.get_running_loop()
 
@@ -171,10 +179,8 @@ class Simulator:
 
     async def run(self, simulation: Simulation) -> None:
         """Listen and live until cancelled."""
-        server = await listen(simulation.address, lambda: _Peer(self))
-        async with server:
-            host, port = server.sockets[0].getsockname()[:2]
-            simulation.ready(Address(host, port))
+        async with listen(simulation.address, lambda: _Peer(self), datagrams=self._settings.udp) as address:
+            simulation.ready(address)
             await self._live()
 
     def admit(self, link: Link) -> Conversation | None:
@@ -182,7 +188,7 @@ class Simulator:
         client_id = next((free for free in CLIENTS if free not in self._peers), None)
         if client_id is None:
             return None
-        session = RobotSession(limits(0.0), SETTINGS, client_id)
+        session = RobotSession(limits(0.0), self._settings, client_id, self._versions)
         session.name = f"hq {client_id}"
         conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
         conversation.ended.add_done_callback(lambda _: self._peers.pop(client_id, None))
@@ -192,8 +198,26 @@ class Simulator:
 
     def _deliver(self, conversation: Conversation, messages: list[Packet]) -> None:
         for message in messages:
+            if self._parts and isinstance(message, ClientGetSLAMMap):
+                self._send_parts(conversation)
+                continue
             for answer in self.vehicle.take(message):
                 _send(conversation, answer)
+
+    def _send_parts(self, conversation: Conversation) -> None:
+        """Send the map as it is now in parts, one a second."""
+        cells = self.vehicle.grid.cells.tobytes()
+        size = -(-len(cells) // PARTS)
+        for number, start in enumerate(range(0, len(cells), size)):
+            part = ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
+            self._loop.call_later(number * 1.0, self._send_part, conversation, part)
+
+    def _send_part(self, conversation: Conversation, part: ServerSLAMMapPart) -> None:
+        """Send a part as deployed robots do: to whoever asked, without asking whether it knows the packet."""
+        if conversation.session.state is State.ESTABLISHED:
+            with contextlib.suppress(Refused):
+                conversation.session.send(part)
+            conversation.pump()
 
     def _tell_all(self, message: Packet) -> None:
         for conversation in tuple(self._peers.values()):
@@ -214,7 +238,8 @@ class Simulator:
             if steps % _MAP_EVERY == 0:
                 if self.vehicle.lidar:
                     self.vehicle.look()
-                self._tell_all(self.vehicle.map())
+                if not self._parts:
+                    self._tell_all(self.vehicle.map())
             if steps % _ASK_EVERY == _ASK_EVERY // 2:
                 self._tell_all(ServerGetSimulatedLidarData())
             if steps == _ASK_EVERY:
@@ -222,7 +247,7 @@ class Simulator:
                 self._tell_all(ServerLidarStatus(1))
 
 
-class _Peer:
+class _Peer(Receiver):
     """The receiver of an accepted link, which finds its conversation when it is attached."""
 
     def __init__(self, simulator: Simulator) -> None:
@@ -245,6 +270,16 @@ class _Peer:
             log.info("%s: %s", self._conversation.session.peer, reason)
             self._conversation.lost(reason)
 
+    def received_datagram(self, datagram: bytes) -> None:
+        if self._conversation is not None:
+            self._conversation.received_datagram(datagram)
+
+    def claims(self, datagram: bytes) -> bool:
+        return self._conversation is not None and self._conversation.claims(datagram)
+
+    def foreign_datagram(self) -> None:
+        pass
+
     def writable(self) -> None:
         if self._conversation is not None:
             self._conversation.writable()
@@ -252,11 +287,14 @@ class _Peer:
 
 def _send(conversation: Conversation, message: Packet) -> None:
     try:
-        conversation.session.send(message)
+        session = conversation.session
+        assert isinstance(session, RobotSession)
+        session.may_send(message)
+        session.send(message)
     except (Refused, EncodeError) as error:
         log.debug("%s: not sent, %s", conversation.session.name, error)
 
 
 async def simulate(simulation: Simulation) -> None:
     """Be a simulated robot until cancelled."""
-    await Simulator(simulation.seed).run(simulation)
+    await Simulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)

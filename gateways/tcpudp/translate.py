@@ -34,6 +34,7 @@ from gateways.tcpudp.messages import (
     ServerLidarStatus,
     ServerPosition,
     ServerSLAMMap,
+    ServerSLAMMapPart,
 )
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
@@ -51,6 +52,8 @@ STOP_REPEAT_S = 0.1
 """Seconds between the repetitions of a stop: a late datagram can restart motion."""
 SCAN_POINTS = 360
 """Points deployed robots take in simulated lidar data, one a degree."""
+MAX_SIDE = 2048
+"""Cells along a side of the largest map that is put together from parts."""
 _MOTION = "motion"
 _OCCUPIED = 2
 _RADIANS = math.pi / 180
@@ -65,6 +68,7 @@ Length = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
+    udp: bool = True
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
     force: tuple[ForcedFeature | PacketId, ...] = ()
     combine: Literal["exclusive", "both"] = "exclusive"
@@ -84,6 +88,7 @@ class TcpUdpRobot(Robot):
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
         self._session: HqSession | None = None
+        self._parts: bytearray | None = None
         self._unit_m = options.length_unit_m
         self._heading_offset = options.heading_offset
 
@@ -92,7 +97,8 @@ class TcpUdpRobot(Robot):
         return self._session
 
     def session(self, link: int, peer: str) -> HqSession:
-        self._session = HqSession(limits(self.options.gap_s), force=self._force)
+        self._session = HqSession(limits(self.options.gap_s), udp=self.options.udp, force=self._force)
+        self._parts = None
         return self._session
 
     # Packets to telemetry
@@ -124,6 +130,20 @@ class TcpUdpRobot(Robot):
         half = -side * cell / 2
         origin = self.options.map_origin or (half, half)
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
+
+    def _map_part(self, message: ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
+        """Put a part in its place, cut where the map ends, and show the map as far as it is known."""
+        session = self._connected()
+        side = announced_side(session.settings)
+        if side == 0:
+            raise ProtocolError("map part of a robot that announces no map size")
+        if self._parts is None or len(self._parts) != side * side:
+            self._parts = bytearray(side * side)
+        cells = message.cells[: max(0, len(self._parts) - message.start)]
+        self._parts[message.start : message.start + len(cells)] = cells
+        if message.end >= len(self._parts):
+            session.end_map()
+        return self._map(ServerSLAMMap(bytes(self._parts)), stamp_ns)
 
     def _cell_m(self, settings: Settings | None) -> float:
         interval = settings.slam_map_interval if isinstance(settings, RobotSettings13) else 0
@@ -242,12 +262,19 @@ def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float
     return polar
 
 
+def announced_side(settings: Settings | None) -> int:
+    """Give the cells along a side of the map as the robot announces them; 0 where it does not, or absurdly."""
+    if not isinstance(settings, RobotSettings13) or settings.slam_map_interval <= 0:
+        return 0
+    side = settings.slam_map_size // settings.slam_map_interval
+    return side if 0 < side <= MAX_SIDE else 0
+
+
 def _side(cells: int, settings: Settings | None) -> int:
     """Find the side of a square map: size / interval where that fits the body, else the root of its length."""
-    if isinstance(settings, RobotSettings13) and settings.slam_map_interval > 0:
-        announced = settings.slam_map_size // settings.slam_map_interval
-        if announced > 0 and announced * announced == cells:
-            return announced
+    announced = announced_side(settings)
+    if announced and announced * announced == cells:
+        return announced
     side = math.isqrt(cells)
     if side * side != cells:
         raise ProtocolError(f"map of {cells} cells is not square")
@@ -284,6 +311,7 @@ def _raw_packet(command: Raw) -> Packet:
 _TELEMETRY: dict[type[Packet], Callable[[TcpUdpRobot, Any, int], tuple[Telemetry, ...]]] = {
     ServerPosition: TcpUdpRobot._pose,
     ServerSLAMMap: TcpUdpRobot._map,
+    ServerSLAMMapPart: TcpUdpRobot._map_part,
     DebugMessage: TcpUdpRobot._text,
     ServerGetSimulatedLidarData: TcpUdpRobot._request,
     ServerLidarStatus: TcpUdpRobot._lidar,

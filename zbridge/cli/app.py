@@ -67,6 +67,9 @@ def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     listen: Annotated[str, typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one")],
     seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
+    version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
+    udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="be as fragile as a deployed robot")] = False,
     verbose: Verbose = False,
 ) -> None:
     """Be a robot to play with, until SIGTERM or SIGINT."""
@@ -75,9 +78,32 @@ def simulate(
     simulation = Simulation(
         Address.parse(listen),
         seed,
+        version or None,
+        udp,
+        strict,
         lambda address: print(f"listening on {address}", flush=True),  # noqa: T201
     )
     run_loop(until_signal(simulated.simulate(simulation)))
+
+
+@app.command()
+def probe(
+    protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
+    address: Annotated[str, typer.Argument(help="tcp://host:port", show_default=False)],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="talk to it although that may use up its connection")
+    ] = False,
+    connect: Connect = [],
+    realm: Realm = "fleet",
+) -> None:
+    """Say what a device is: from its gateway on the bus, else, with --yes, by talking to it."""
+    from zbridge.cli.probe import probe as ask
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    found, at = find_protocol(protocol), Address.parse(address)
+    code = run_loop(ask(client_settings(connect), found, at, realm=realm, sure=yes))
+    if code:
+        raise typer.Exit(code)
 
 
 @app.command()

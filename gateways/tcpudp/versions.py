@@ -1,0 +1,46 @@
+"""The version table: what peers of each generation send, understand and know. Sans-IO.
+
+Source: "Settings and version negotiation" and "The gateway as robot" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from gateways.tcpudp.settings import HQ_BLOCKS, Settings, Settings12
+from zbridge.session.negotiation import newest, parse_versions
+
+LISTED = ("1.1", "1.2", "1.3")
+"""What peers of version 1.3 list, and the only list deployed 1.3 and "1.4" robots take without crashing."""
+_LISTED = ",".join(LISTED)
+
+
+class Version(msgspec.Struct, frozen=True):
+    """One row. ``listed``: what a robot of this version sends.
+
+    answer: the list such a robot understands from an HQ; None: its own, to the letter.
+    known_to_hq: the packet ids an HQ of this version knows; one it does not know cripples it.
+    """
+
+    listed: str
+    answer: str | None
+    known_to_hq: frozenset[int]
+
+
+_HQ_11 = frozenset({1, 2, 4, 6, 51, 53, 55})
+_HQ_12 = _HQ_11 | {60}
+VERSIONS = {
+    "1.1": Version("1.1", None, _HQ_11),
+    "1.2": Version("1.2", None, _HQ_12),
+    "1.3": Version(_LISTED, _LISTED, _HQ_12),
+    "1.4": Version(f"{_LISTED},1.4", _LISTED, _HQ_12 | {56}),  # exists on robots only
+}
+
+
+def announced(listed: str, *, udp: bool) -> bytes:
+    """Write the settings block of an HQ that lists these versions: what deployed HQ programs announce."""
+    block = HQ_BLOCKS[newest(parse_versions(listed), known=HQ_BLOCKS) or "1.1"]
+    flags: dict[str, bool] = {"udp": udp}
+    if issubclass(block, Settings12):
+        flags["lidar_sim"] = True
+    return block(**flags).encode() if block is not Settings else Settings(udp=udp).encode()

@@ -1,0 +1,104 @@
+"""``zbridge probe``: say what a device is; from its gateway if it has one, else by talking to it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+
+import msgspec
+from rich.console import Console
+
+from zbridge.bus import BusSettings
+from zbridge.cli.bus import joined
+from zbridge.conversation import Conversation
+from zbridge.errors import BusError, LinkError, PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.messages import Status
+from zbridge.fleet.topics import split_key
+from zbridge.link import Address, connect
+from zbridge.protocol import Protocol
+from zbridge.session.session import State
+
+PROBE_S = 15.0
+"""Longest time a handshake may take."""
+WARNING = (
+    "{address} has no gateway on the bus. Deployed robots give one usable connection per start of the robot program: "
+    "probing uses it up, and the robot must be restarted before a gateway can connect. Say --yes to do it."
+)
+
+console = Console(highlight=False, soft_wrap=True)
+errors = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+async def probe(settings: BusSettings, protocol: Protocol, address: Address, *, realm: str, sure: bool) -> int:
+    """Print what the device is; give the exit code: 0 known, 1 it did not answer, 2 not asked without ``sure``."""
+    served = await _served(settings, address, realm)
+    if served is not None:
+        robot, status = served
+        console.print(f"{address} is served by the gateway of {robot}:")
+        _show(msgspec.to_builtins(status))
+        return 0
+    if not sure:
+        errors.print(WARNING.format(address=address))
+        return 2
+    return await _talk(protocol, address)
+
+
+async def _served(settings: BusSettings, address: Address, realm: str) -> tuple[str, Status] | None:
+    """Look on the bus for a gateway that is connected to the address."""
+    with contextlib.suppress(BusError):
+        async with joined(settings) as bus:
+            answers = await bus.ask(f"{realm}/*/status")
+        for answer in answers:
+            with contextlib.suppress(PayloadError):
+                status = payloads.decode(Status, answer.payload)
+                split = split_key(answer.key)
+                if split is not None and any(link.peer == str(address) for link in status.links):
+                    return split[1], status
+    return None
+
+
+async def _talk(protocol: Protocol, address: Address) -> int:
+    """Shake hands with the device, say what was agreed, and leave."""
+    loop = asyncio.get_running_loop()
+    robot = protocol.robot(protocol.options(), 1)
+    session = robot.session(0, str(address))
+    settled = asyncio.Event()
+
+    def changed() -> None:
+        if session.state is State.ESTABLISHED:
+            settled.set()
+
+    conversation = Conversation(session, loop, deliver=lambda messages: None, changed=changed)
+    conversation.ended.add_done_callback(lambda _: settled.set())
+    try:
+        await connect(address, conversation)
+        async with asyncio.timeout(PROBE_S):
+            await settled.wait()
+    except (LinkError, TimeoutError) as error:
+        errors.print(f"{address}: {error or 'no handshake'}")
+        return 1
+    finally:
+        established, seen = session.version is not None, session.snapshot()
+        conversation.close("probed")
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(asyncio.shield(conversation.ended), 1.0)
+        conversation.abandon()
+    _show(
+        {
+            "protocol": protocol.name,
+            "version": seen.version,
+            "features": list(seen.features),
+            "transport": seen.transport,
+            "reason": seen.reason,
+            "malformed": seen.traffic.malformed,
+        }
+    )
+    return 0 if established else 1
+
+
+def _show(fields: dict[str, object]) -> None:
+    for name, value in fields.items():
+        if value not in (None, [], 0):
+            console.print(f"  {name}: {value if isinstance(value, str) else json.dumps(value)}", markup=False)

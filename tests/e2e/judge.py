@@ -1,0 +1,252 @@
+"""Mixed commands through a real gateway against the strict robot: no violation, and everything arrives.
+
+    python -m tests.e2e.judge                     # every version, with and without UDP, 2000 commands each
+    python -m tests.e2e.judge --commands 300 --version 1.4 --udp
+
+A command that the robot's version or features exclude must be refused and never arrive. While a "1.4" robot sends
+its map, everything but a stop is refused; the judge waits for the end of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import random
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tests.e2e.conftest import Bench, until
+
+VERSIONS = ("1.1", "1.2", "1.3", "1.4")
+PACE_S = 0.03
+"""Seconds between two commands: more than the gap, so that no drive has a reason to replace another."""
+HAS_LIDAR_SIM = {"1.2", "1.3", "1.4"}
+
+
+@dataclass
+class Judgement:
+    """What came of one run."""
+
+    version: str
+    udp: bool
+    sent: Counter[str] = field(default_factory=Counter)
+    violations: list[str] = field(default_factory=list)
+    excused: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    answered: Counter[str] = field(default_factory=Counter)
+    alive: bool = False
+    seconds: float = 0.0
+
+    @property
+    def clean(self) -> bool:
+        """Whether the robot has nothing to complain of and everything arrived."""
+        return self.alive and not self.violations and not self.missing
+
+    def __str__(self) -> str:
+        commands = sum(self.sent.values())
+        return (
+            f"{self.version} {'udp' if self.udp else 'tcp'}: {commands} commands in {self.seconds:.0f} s, "
+            f"{len(self.violations)} violations, {len(self.excused)} excused (the robot's process was late), "
+            f"{len(self.missing)} missing, answered {dict(self.answered)}"
+        )
+
+
+def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement:
+    """Run one gateway against one strict robot."""
+    with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder), stack)
+        robot = stack.enter_context(_robot(version, udp=udp, seed=seed))
+        assert robot.stdout is not None
+        bench.gateway("r1", int(robot.stdout.readline()))
+        until(lambda: bench.fleet.state("r1") == "established", what="established")
+        run = _Run(bench, Judgement(version, udp), random.Random(seed))
+        began = time.monotonic()
+        for number in range(commands):
+            run.command(number)
+            time.sleep(PACE_S)
+        run.end()
+        run.judgement.seconds = time.monotonic() - began
+        report = json.loads(robot.communicate("end\n", timeout=20)[0])
+    run.compare(report)
+    return run.judgement
+
+
+@contextlib.contextmanager
+def _robot(version: str, *, udp: bool, seed: int) -> Any:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.e2e.strict_robot", version, str(int(udp)), str(seed)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class _Run:
+    """Sends commands and remembers which bodies must arrive, by packet id."""
+
+    def __init__(self, bench: Bench, judgement: Judgement, rng: random.Random) -> None:
+        self.judgement = judgement
+        self._bench = bench
+        self._rng = rng
+        self._expected: list[tuple[int, str]] = []
+        self._forbidden: list[tuple[int, str]] = []
+        self._kinds = [
+            *(self.drive,) * 6,
+            *(self.turn, self.neutral, self.text, self.mode, self.lidar, self.scan, self.chat, self.stop),
+            *(self.undefined, self.pose, self.burst),
+        ]
+
+    def command(self, number: int) -> None:
+        if self.judgement.version == "1.4" and number % 100 == 50:
+            self.map()
+            return
+        kind = self._rng.choice(self._kinds)
+        self.judgement.sent[kind.__name__] += 1
+        kind(number)
+
+    def end(self) -> None:
+        self.map()
+        self._put("stop")
+        time.sleep(1.5)
+
+    def compare(self, report: dict[str, Any]) -> None:
+        """Hold what arrived against what had to."""
+        judgement = self.judgement
+        judgement.alive = report["alive"]
+        for text in report["violations"]:
+            (judgement.excused if "woke" in text else judgement.violations).append(text)
+        arrived = Counter((packet_id, body) for _, packet_id, body in report["received"])
+        excused = len(judgement.excused)
+        for packet_id, body in self._expected:
+            if arrived[packet_id, body]:
+                arrived[packet_id, body] -= 1
+            elif excused:
+                excused -= 1
+            else:
+                judgement.missing.append(f"packet {packet_id} {body[:40]}")
+        for packet_id, body in self._forbidden:
+            if arrived[packet_id, body]:
+                judgement.violations.append(f"packet {packet_id} {body[:40]} should have been refused")
+
+    # One method a command; each value is used once, so that every body is its own
+
+    def drive(self, number: int) -> None:
+        forward = (number % 997 + 1) / 1000
+        self._put("drive", forward=forward)
+        self._expect(11, struct.pack("<fff", 0.0, 1.0, forward))
+
+    def turn(self, number: int) -> None:
+        turn = (number % 997 + 1) / 1000
+        self._put("drive", turn=turn)
+        self._expect(12, struct.pack("<f", -turn))
+
+    def neutral(self, number: int) -> None:
+        self._put("drive")
+
+    def stop(self, number: int) -> None:
+        self._put("stop")
+        time.sleep(PACE_S)
+        self._put("drive")
+
+    def text(self, number: int) -> None:
+        text = f"command {number}".encode()
+        self._put("text", text=text.decode())
+        self._expect(1, struct.pack("<i", len(text)) + text)
+
+    def mode(self, number: int) -> None:
+        mode = ("none", "manual", "autonomous")[number % 3]
+        self._put("mode", mode=mode)
+        self._expect(10, struct.pack("<i", number % 3 + 1))
+
+    def lidar(self, number: int) -> None:
+        self._put("lidar", on=bool(number % 2))
+        self._expect(50, struct.pack("<i", 1 if number % 2 else 2))
+
+    def scan(self, number: int) -> None:
+        ranges = np.full(360, 1.0 + number / 1000, "<f4")
+        self._put(
+            "scan",
+            angle_min=0.0,
+            angle_increment=float(np.radians(1.0)),
+            range_min=0.0,
+            range_max=100.0,
+            ranges=ranges.tobytes(),
+        )
+        body = struct.pack("<i", 360) + (ranges / np.float32(0.01)).astype("<f4").tobytes()
+        if self.judgement.version in HAS_LIDAR_SIM:
+            self._expect(61, body)
+        else:
+            self._forbidden.append((61, body.hex()))
+
+    def chat(self, number: int) -> None:
+        body = struct.pack("<i", number)
+        self._put("raw/tcpudp", id=40, body=body)
+        self._expect(40, body)
+
+    def burst(self, number: int) -> None:
+        """Several at once: the gateway has to space them."""
+        for part in range(3):
+            self.text(10_000 * (part + 1) + number)
+        self.mode(number)
+
+    def undefined(self, number: int) -> None:
+        body = struct.pack("<i", number)
+        self._put("raw/tcpudp", id=70 + number % 10, body=body)
+        self._forbidden.append((70 + number % 10, body.hex()))
+
+    def pose(self, number: int) -> None:
+        self._ask("pose")
+
+    def map(self) -> None:
+        self._ask("map")
+        if self.judgement.version == "1.4":
+            time.sleep(2.5)  # four parts, 0.2 s apart, and the stop behind them
+            self._put("drive")
+            time.sleep(PACE_S)
+
+    def _ask(self, what: str) -> None:
+        replies = self._bench.fleet.get(f"fleet/r1/@rpc/{what}")
+        self.judgement.answered[what if replies and isinstance(replies[0], dict) else f"no {what}"] += 1
+
+    def _put(self, what: str, **fields: Any) -> None:
+        self._bench.fleet.put(f"r1/@cmd/{what}", **fields)
+
+    def _expect(self, packet_id: int, body: bytes) -> None:
+        self._expected.append((packet_id, body.hex()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--commands", type=int, default=2000)
+    parser.add_argument("--version", choices=VERSIONS)
+    parser.add_argument("--udp", action="store_true")
+    parser.add_argument("--seed", type=int, default=1)
+    wanted = parser.parse_args()
+    cases = [(wanted.version, wanted.udp)] if wanted.version else [(v, udp) for v in VERSIONS for udp in (False, True)]
+    failed = False
+    for version, udp in cases:
+        judgement = judge(version, udp=udp, commands=wanted.commands, seed=wanted.seed)
+        print(judgement, flush=True)
+        for line in [*judgement.violations[:10], *judgement.missing[:10]]:
+            print("   ", line)
+        failed = failed or not judgement.clean
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()

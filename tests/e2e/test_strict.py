@@ -1,0 +1,17 @@
+"""The gateway before its judge: a hundred mixed commands for each version, by TCP and by UDP."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.e2e.judge import VERSIONS, judge
+
+
+@pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_fragile_robot_survives_a_hundred_mixed_commands(version: str, udp: bool) -> None:
+    judgement = judge(version, udp=udp, commands=100)
+    assert judgement.alive
+    assert judgement.violations == []
+    assert judgement.missing == []
+    assert judgement.answered["no pose"] == judgement.answered["no map"] == 0

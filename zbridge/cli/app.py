@@ -90,9 +90,7 @@ def simulate(
 def probe(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     address: Annotated[str, typer.Argument(help="tcp://host:port", show_default=False)],
-    yes: Annotated[
-        bool, typer.Option("--yes", help="talk to it although that may use up its connection")
-    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="talk to it although that may use up its connection")] = False,
     connect: Connect = [],
     realm: Realm = "fleet",
 ) -> None:

@@ -26,7 +26,10 @@ _CONTROL_S = 0.05
 
 
 class Commands:
-    """Carries out, refuses and stops. ``publish`` shows a message on the bus, ``pump`` writes to the robot."""
+    """Carries out, refuses and stops. ``publish`` shows a message on the bus, ``pump`` writes to the robot.
+
+    ``clock``: seconds on the event loop's time line.
+    """
 
     def __init__(
         self,
@@ -37,12 +40,14 @@ class Commands:
         *,
         publish: Callable[[Topic, FleetMessage], object],
         pump: Callable[[], None],
+        clock: Callable[[], float],
     ) -> None:
         self._robot = robot
         self._authority = authority
         self._keys = keys
         self._publish = publish
         self._pump = pump
+        self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._deadman: asyncio.TimerHandle | None = None
         self._control_due: asyncio.TimerHandle | None = None
@@ -77,7 +82,7 @@ class Commands:
 
     def halt(self, reason: str) -> None:
         """Stop the robot at once and for a second; motion needs a neutral drive afterwards."""
-        now = self._loop.time()
+        now = self._clock()
         self.forbid(reason)
         session = self._robot.driving
         if session is None or session.state is not State.ESTABLISHED:
@@ -116,7 +121,7 @@ class Commands:
         if topic is topics.CMD_STOP:  # whatever its payload
             self.halt("stop")
             return
-        now = self._loop.time()
+        now = self._clock()
         command = payloads.decode(topic.message, sample.payload)
         if isinstance(command, Drive):
             self._drive(topic, command, now)
@@ -161,7 +166,7 @@ class Commands:
 
     def _on_deadman(self) -> None:
         self._deadman = None
-        if self._authority.overdue(self._loop.time()):
+        if self._authority.overdue(self._clock()):
             self.halt("deadman")
         else:
             self._watch_deadman()

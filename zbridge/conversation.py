@@ -15,7 +15,10 @@ log = logging.getLogger("zbridge.link")
 
 
 class Conversation:
-    """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state."""
+    """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
+
+    ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
+    """
 
     def __init__(
         self,
@@ -26,10 +29,12 @@ class Conversation:
         changed: Callable[[], None] = lambda: None,
         malformed: Count | None = None,
         foreign: Count | None = None,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self.session = session
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
+        self._clock = clock or loop.time
         self._deliver = deliver
         self._changed = changed
         self._link: Link | None = None
@@ -46,18 +51,18 @@ class Conversation:
         """Begin: the link is up."""
         self._link = link
         self.session.peer = link.peer
-        self.session.open(self._loop.time())
+        self.session.open(self._clock())
         self.pump()
 
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
         session = self.session
-        messages = session.receive(data, self._loop.time())
+        messages = session.receive(data, self._clock())
         self._hand_on(messages)
 
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        self._hand_on(self.session.receive_datagram(datagram, self._loop.time()))
+        self._hand_on(self.session.receive_datagram(datagram, self._clock()))
 
     def claims(self, datagram: bytes) -> bool:
         """Tell whether the first datagram of an unknown source is this session's."""
@@ -90,15 +95,16 @@ class Conversation:
 
     def pump(self) -> None:
         """Write what may be written now, and set the timer for what may not."""
-        session, link, now = self.session, self._link, self._loop.time()
+        session, link = self.session, self._link
         while link is not None and link.ready:
-            frame = session.outgoing(now)
+            frame = session.outgoing(self._clock())
             if frame is None:
                 break
             if type(frame) is Datagram:
                 link.write_datagram(frame)
             else:
                 link.write(frame)
+            session.outbox.written(self._clock())
         self._notify()
         if session.state is State.CLOSED:
             self._end()
@@ -107,7 +113,7 @@ class Conversation:
 
     def close(self, reason: str) -> None:
         """End the conversation from our side."""
-        self.session.close(reason, self._loop.time())
+        self.session.close(reason, self._clock())
         self.pump()
 
     def abandon(self) -> None:
@@ -127,7 +133,7 @@ class Conversation:
 
     def _tick(self) -> None:
         self._timer = None
-        self.session.expire(self._loop.time())
+        self.session.expire(self._clock())
         self.pump()
 
     def _set_timer(self, deadline: float | None) -> None:

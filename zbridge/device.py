@@ -52,8 +52,10 @@ class Device:
         manager: SessionManager,
         metrics: Metrics,
         connect: Connect = connect,
+        clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
+        clock = clock or asyncio.get_running_loop().time
         self._robot = robot
         self._protocol = protocol
         self._keys = keys
@@ -63,7 +65,7 @@ class Device:
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
         self._questions = Questions(asyncio.get_running_loop())
-        self._commands = Commands(robot, authority, keys, metrics, publish=self._publish, pump=self._pump)
+        self._commands = Commands(robot, authority, keys, metrics, publish=self._publish, pump=self._pump, clock=clock)
         self._published = metrics.count("published")
         self._untranslatable = metrics.count("untranslatable")
         self._endpoints = [
@@ -80,6 +82,7 @@ class Device:
                     manager=manager,
                     malformed=metrics.count("malformed"),
                     foreign=metrics.count("foreign_datagrams"),
+                    clock=clock,
                 ),
             )
             for index, (name, address) in enumerate(zip(robot.link_names, addresses, strict=True))

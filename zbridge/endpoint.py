@@ -43,6 +43,7 @@ class Hooks(msgspec.Struct, frozen=True):
     manager: SessionManager
     malformed: Count
     foreign: Count
+    clock: Callable[[], float]
 
 
 class Endpoint:
@@ -133,6 +134,7 @@ class Endpoint:
             changed=lambda: self._on_session(session),
             malformed=hooks.malformed,
             foreign=hooks.foreign,
+            clock=hooks.clock,
         )
         self._set_state("connecting", None)
         self.conversation = conversation

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import signal
+import time
 from collections.abc import Coroutine
 from typing import Any
 
@@ -63,6 +64,7 @@ class Gateway:
             authority=Authority(config.control.deadman_s),
             manager=self.sessions,
             metrics=self.metrics,
+            clock=time.monotonic,  # the time line of every event loop on Linux, without its rounding
         )
 
     async def _open_bus(self) -> Bus:

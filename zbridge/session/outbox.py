@@ -103,6 +103,10 @@ class Outbox:
             self._free_at = now + self.gap_s
         return frame
 
+    def written(self, now: float) -> None:
+        """Take note that the frame taken last was written only now: the gap begins here."""
+        self._free_at = max(self._free_at, now + self.gap_s)
+
     def _next(self, now: float) -> bytes | None:
         slot = self._due_slot(now)
         if slot is None:

@@ -42,6 +42,7 @@ from zbridge.conversation import Conversation
 from zbridge.errors import EncodeError, Refused
 from zbridge.link import Link, Receiver, listen
 from zbridge.protocol import Simulation
+from zbridge.session.manager import ClientIds
 from zbridge.session.session import State
 from zbridge.world import Body, Grid, cast
 
@@ -63,6 +64,8 @@ LIDAR_RANGE_M = 4.0
 _DEGREES = np.radians(np.arange(360.0))
 _POSE_EVERY, _MAP_EVERY, _ASK_EVERY = 5, 50, 50
 CLIENTS = range(2, 256)
+QUIET_S = 2.0
+"""Seconds before a client id is given again ("The gateway as robot")."""
 PARTS = 4
 """Packets in which a robot of version "1.4" sends its map, one a second."""
 
@@ -172,6 +175,7 @@ class Simulator:
         self._settings = settings_of(version, udp=udp)
         self._parts = version == "1.4"
         self._peers: dict[int, Conversation] = {}
+        self._ids = ClientIds(CLIENTS, QUIET_S)
         self._loop = asyncio.get_running_loop()
 
     def __repr__(self) -> str:
@@ -185,16 +189,20 @@ class Simulator:
 
     def admit(self, link: Link) -> Conversation | None:
         """Begin a conversation with a new HQ; None when all client ids are taken."""
-        client_id = next((free for free in CLIENTS if free not in self._peers), None)
+        client_id = self._ids.take(self._loop.time())
         if client_id is None:
             return None
         session = RobotSession(limits(0.0), self._settings, client_id, self._versions)
         session.name = f"hq {client_id}"
         conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
-        conversation.ended.add_done_callback(lambda _: self._peers.pop(client_id, None))
+        conversation.ended.add_done_callback(lambda _: self._dismiss(client_id))
         self._peers[client_id] = conversation
         log.info("%s: connected as client %d", link.peer, client_id)
         return conversation
+
+    def _dismiss(self, client_id: int) -> None:
+        self._peers.pop(client_id, None)
+        self._ids.release(client_id, self._loop.time())
 
     def _deliver(self, conversation: Conversation, messages: list[Packet]) -> None:
         for message in messages:

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from tests.session.test_session import LIMITS, Toy
-from zbridge.session.manager import REMEMBERED, Backoff, SessionManager
+from zbridge.session.manager import REMEMBERED, Backoff, ClientIds, SessionManager
 from zbridge.session.session import State
 
 
@@ -105,3 +105,20 @@ def test_a_backoff_prints_its_next_delay() -> None:
 
 def test_two_backoffs_do_not_march_in_step() -> None:
     assert Backoff().delay_s() != pytest.approx(Backoff().delay_s(), abs=1e-12)
+
+
+def test_a_client_gets_the_lowest_id_that_is_free() -> None:
+    ids = ClientIds(range(2, 256), quiet_s=2.0)
+    assert [ids.take(0.0) for _ in range(3)] == [2, 3, 4]
+    ids.release(3, 1.0)
+    assert ids.take(2.9) == 5, "3 rests for two seconds"
+    assert ids.take(3.0) == 3
+
+
+def test_the_255th_client_gets_no_id() -> None:
+    ids = ClientIds(range(2, 256), quiet_s=0.0)
+    taken = [ids.take(0.0) for _ in range(254)]
+    assert sorted(taken) == list(range(2, 256))
+    assert ids.take(0.0) is None
+    ids.release(77, 1.0)
+    assert ids.take(1.0) == 77

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from typing import Any
 
@@ -31,6 +32,30 @@ class Backoff:
     def reset(self) -> None:
         """Begin anew: the last attempt worked."""
         self._next_s = self._first_s
+
+
+class ClientIds:
+    """The ids a robot gives its clients: the lowest free one, and none again within ``quiet_s`` of its release."""
+
+    def __init__(self, ids: range, quiet_s: float) -> None:
+        self._quiet_s = quiet_s
+        self._free_at = dict.fromkeys(ids, -math.inf)
+
+    def __repr__(self) -> str:
+        taken = sum(free_at == math.inf for free_at in self._free_at.values())
+        return f"<ClientIds {taken} of {len(self._free_at)} taken>"
+
+    def take(self, now: float) -> int | None:
+        """Give an id that is free now; None where there is none."""
+        for client_id, free_at in self._free_at.items():
+            if free_at <= now:
+                self._free_at[client_id] = math.inf
+                return client_id
+        return None
+
+    def release(self, client_id: int, now: float) -> None:
+        """Take an id back."""
+        self._free_at[client_id] = now + self._quiet_s
 
 
 class SessionManager:

@@ -132,13 +132,13 @@ class Commands:
 
     def _drive(self, topic: Topic, command: Drive, now: float) -> None:
         moving = command.moving
-        self._authority.admit(moving=moving)
         try:
             self.require_ready()
         except Refused as refusal:
             if moving:
                 self.forbid(str(refusal))
             raise
+        self._authority.admit(moving=moving)
         outcome = self._robot.command(topic, command, now)
         self._authority.applied(moving=moving, now=now)
         self._watch_deadman()

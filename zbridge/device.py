@@ -126,11 +126,12 @@ class Device:
     def _on_session(self, session: Session[Any]) -> None:
         if session is not self._robot.driving:
             return
-        if session.over and session.version is not None:
-            self._commands.forbid("robot lost")
-            self._questions.refuse_all("the robot was lost")
-        if session.busy != self._busy:
-            self._busy = session.busy
+        busy, self._busy = self._busy, session.busy
+        if session.over:
+            if session.version is not None:
+                self._commands.forbid("robot lost")
+                self._questions.refuse_all("the robot was lost")
+        elif busy != self._busy:
             self._commands.halt(self._busy or "no longer busy")
 
     def _pump(self) -> None:

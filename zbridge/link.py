@@ -232,19 +232,17 @@ async def listen(
     """
     loop = asyncio.get_running_loop()
     hub = DatagramHub() if datagrams else None
-    try:
-        server = await loop.create_server(lambda: TcpLink(receiver(), hub), address.host, address.port)
-        async with server:
+    async with contextlib.AsyncExitStack() as stack:
+        try:
+            server = await loop.create_server(lambda: TcpLink(receiver(), hub), address.host, address.port)
+            await stack.enter_async_context(server)
             host, port = server.sockets[0].getsockname()[:2]
             if hub is not None:
                 hub.open(host, port)
-            try:
-                yield Address(host, port)
-            finally:
-                if hub is not None:
-                    hub.close()
-    except OSError as error:
-        raise LinkError(f"{address}: {error.strerror or error}") from error
+                stack.callback(hub.close)
+        except OSError as error:
+            raise LinkError(f"{address}: {error.strerror or error}") from error
+        yield Address(host, port)
 
 
 _DATAGRAM_BYTES = 65_536
@@ -261,10 +259,15 @@ class _DatagramReader:
 
     def _listen(self, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self._socket.bind((host, port))
-        self._loop.add_reader(self._socket.fileno(), self._read)
+        sock = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            sock.setblocking(False)
+            sock.bind((host, port))
+        except OSError:
+            sock.close()
+            raise
+        self._socket = sock
+        self._loop.add_reader(sock.fileno(), self._read)
 
     def _read(self) -> None:
         for _ in range(_DATAGRAMS):

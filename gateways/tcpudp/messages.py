@@ -318,7 +318,9 @@ def _is_whole_text(frame: bytes, start: int) -> bool:
     if size < HEADER.size + 4:
         return False
     length, sender_id, packet_id = HEADER.unpack_from(frame, start)
-    return bool(length + 4 == size and sender_id == SERVER_ID and packet_id == DebugMessage.spec.id)
+    (inner,) = _LENGTH(frame, start + HEADER.size)  # the count of the text, or the length of yet another header
+    whole = length + 4 == size and inner + 4 == size - HEADER.size
+    return bool(whole and sender_id == SERVER_ID and packet_id == DebugMessage.spec.id)
 
 
 def _decode_map(frame: bytes, start: int) -> Packet:

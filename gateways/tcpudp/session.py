@@ -41,6 +41,8 @@ MAX_WRITE = 4096
 HANDSHAKE_S = 5.0
 PROBE_S = 2.0
 """Seconds each end waits for the other's datagram."""
+REPORT_S = 3.0
+"""Seconds an HQ has for packet 7: it may wait :data:`PROBE_S` for a 6 that was lost."""
 SILENCE_S = 2.05
 """Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7."""
 MAP_SILENCE_S = 1.5
@@ -269,7 +271,7 @@ class RobotSession(_TcpUdpSession):
         self._versions = tuple(versions)
         self._agreed = ""
         self._probe = Probe(PROBE_S)
-        self._report = Probe(PROBE_S)
+        self._report = Probe(REPORT_S)
         self._decoders = decoders(Sender.ROBOT, (0, client_id))
 
     def opened(self, now: float) -> None:
@@ -281,9 +283,11 @@ class RobotSession(_TcpUdpSession):
         elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         elif isinstance(message, ClientUDPConnectionStatus):
-            # Deployed HQ programs say true whatever happened: only the datagram that arrived is believed.
+            # Deployed HQ programs say true whatever happened: true is believed only if a datagram arrived.
             if not self._report.settle(works=message.connected):
                 raise ProtocolError("clientUDPConnectionStatus was not due")
+            if not message.connected:
+                self.transport = "tcp"
             self._finish()
         elif isinstance(message, ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")

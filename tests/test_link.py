@@ -2,25 +2,30 @@
 
 import asyncio
 import contextlib
+import gc
 import socket
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
 from zbridge import link as links
 from zbridge.errors import LinkError
-from zbridge.link import Address, FakeLink, Link, TcpLink, connect, listen
+from zbridge.link import Address, DatagramHub, FakeLink, Link, Receiver, TcpLink, connect, listen
 
 SOON_S = 5.0
+LOCAL = Address("127.0.0.1", 0)
 
 
-class Recorder:
-    """A receiver that keeps what a link brings."""
+class Recorder(Receiver):
+    """A receiver that keeps what a link brings, and claims the first datagrams that begin with ``mark``."""
 
-    def __init__(self) -> None:
+    def __init__(self, mark: bytes = b"") -> None:
         self.link: Link | None = None
+        self.mark = mark
         self.data = b""
+        self.datagrams: list[bytes] = []
+        self.foreign = 0
         self.reason: str | None = None
         self.calls: list[str] = []
         self._changed = asyncio.Event()
@@ -34,6 +39,18 @@ class Recorder:
         self.data += data
         self._note("received")
 
+    def received_datagram(self, datagram: bytes) -> None:
+        assert type(datagram) is bytes
+        self.datagrams.append(datagram)
+        self._note("datagram")
+
+    def claims(self, datagram: bytes) -> bool:
+        return bool(self.mark) and datagram.startswith(self.mark)
+
+    def foreign_datagram(self) -> None:
+        self.foreign += 1
+        self._note("foreign")
+
     def lost(self, reason: str) -> None:
         self.reason = reason
         self._note("lost")
@@ -45,9 +62,9 @@ class Recorder:
         self.calls.append(call)
         self._changed.set()
 
-    async def until(self, call: str, *, received: int = 0) -> None:
+    async def until(self, call: str, *, received: int = 0, datagrams: int = 0) -> None:
         async with asyncio.timeout(SOON_S):
-            while call not in self.calls or len(self.data) < received:
+            while call not in self.calls or len(self.data) < received or len(self.datagrams) < datagrams:
                 self._changed.clear()
                 await self._changed.wait()
 
@@ -55,8 +72,8 @@ class Recorder:
 class Pair:
     """Both ends of one connection."""
 
-    def __init__(self, server: asyncio.Server, here: TcpLink, near: Recorder, far: Recorder) -> None:
-        self.server, self.here, self.near, self.far = server, here, near, far
+    def __init__(self, address: Address, here: TcpLink, near: Recorder, far: Recorder) -> None:
+        self.address, self.here, self.near, self.far = address, here, near, far
 
     @property
     def there(self) -> TcpLink:
@@ -67,11 +84,10 @@ class Pair:
 @contextlib.asynccontextmanager
 async def connected() -> AsyncIterator[Pair]:
     near, far = Recorder(), Recorder()
-    server = await listen(Address("127.0.0.1", 0), lambda: far)
-    async with server:
-        here = await connect(Address(*server.sockets[0].getsockname()[:2]), near)
+    async with listen(LOCAL, lambda: far) as address:
+        here = await connect(address, near)
         await far.until("attached")
-        pair = Pair(server, here, near, far)
+        pair = Pair(address, here, near, far)
         yield pair
         here.abort()
         pair.there.abort()
@@ -119,8 +135,7 @@ async def test_both_ends_are_attached_first_and_know_their_peer() -> None:
     async with connected() as pair:
         assert pair.near.calls == ["attached"]
         assert pair.near.link is pair.here
-        host, port = pair.server.sockets[0].getsockname()[:2]
-        assert pair.here.peer == f"tcp://{host}:{port}"
+        assert pair.here.peer == str(pair.address)
         assert pair.there.peer.startswith("tcp://127.0.0.1:")
         assert repr(pair.here) == f"<TcpLink {pair.here.peer}>"
 
@@ -266,9 +281,9 @@ def test_a_peer_that_is_gone_before_it_is_looked_at_is_lost_and_nothing_else() -
 
 async def test_an_address_that_is_taken_is_a_link_error() -> None:
     async with connected() as pair:
-        taken = Address(*pair.server.sockets[0].getsockname()[:2])
-        with pytest.raises(LinkError, match=str(taken)):
-            await listen(taken, Recorder)
+        with pytest.raises(LinkError, match=str(pair.address)):
+            async with listen(pair.address, Recorder):
+                pass
 
 
 async def test_every_peer_of_a_listener_has_a_receiver_of_its_own() -> None:
@@ -278,9 +293,7 @@ async def test_every_peer_of_a_listener_has_a_receiver_of_its_own() -> None:
         receivers.append(Recorder())
         return receivers[-1]
 
-    server = await listen(Address("127.0.0.1", 0), receiver)
-    async with server:
-        address = Address(*server.sockets[0].getsockname()[:2])
+    async with listen(LOCAL, receiver) as address:
         ends = [await connect(address, Recorder()) for _ in range(2)]
         for number, end in enumerate(ends):
             end.write(b"%d" % number)
@@ -293,11 +306,293 @@ async def test_every_peer_of_a_listener_has_a_receiver_of_its_own() -> None:
     assert sorted(each.data for each in receivers) == [b"0", b"1"]
 
 
+async def test_what_goes_wrong_inside_is_not_the_listeners() -> None:
+    with pytest.raises(FileNotFoundError):
+        async with listen(LOCAL, Recorder):
+            raise FileNotFoundError(2, "no such file")
+    with pytest.raises(TimeoutError):
+        async with listen(LOCAL, Recorder), asyncio.timeout(0):
+            await asyncio.sleep(1)
+
+
+async def test_a_listener_that_ends_takes_no_more_peers_and_frees_its_ports() -> None:
+    async with listen(LOCAL, Recorder, datagrams=True) as address:
+        pass
+    with pytest.raises(LinkError):
+        await connect(address, Recorder())
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as free:
+        free.bind((address.host, address.port))
+
+
+# Datagrams of a link that was connected
+
+
+class Peer:
+    """A robot's UDP socket, on the port number of its TCP listener, and a stranger's."""
+
+    def __init__(self, pair: Pair) -> None:
+        self.pair = pair
+        self.socket = udp_socket((pair.address.host, pair.address.port))
+        self.stranger = udp_socket(("127.0.0.1", 0))
+
+    async def hears(self) -> tuple[bytes, tuple[str, int]]:
+        return await heard_by(self.socket)
+
+
+def udp_socket(address: tuple[str, int]) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    made.bind(address)
+    return made
+
+
+async def heard_by(listening: socket.socket) -> tuple[bytes, tuple[str, int]]:
+    async with asyncio.timeout(SOON_S):
+        return await asyncio.get_running_loop().sock_recvfrom(listening, 65_536)
+
+
+@contextlib.asynccontextmanager
+async def with_udp() -> AsyncIterator[Peer]:
+    async with connected() as pair:
+        peer = Peer(pair)
+        with contextlib.closing(peer.socket), contextlib.closing(peer.stranger):
+            yield peer
+
+
+async def test_the_first_datagram_opens_a_socket_and_goes_to_the_peers_address_and_port() -> None:
+    async with with_udp() as peer:
+        peer.pair.here.write_datagram(b"five")
+        data, source = await peer.hears()
+        assert data == b"five"
+        assert source[0] == "127.0.0.1"
+        peer.pair.here.write_datagram(b"more")
+        assert await peer.hears() == (b"more", source)
+
+
+async def test_a_datagram_of_the_peer_is_received_whole_and_one_by_one() -> None:
+    async with with_udp() as peer:
+        peer.pair.here.write_datagram(b"five")
+        _, source = await peer.hears()
+        large = bytes(range(256)) * 234  # 59904 bytes
+        for data in (b"six", b"", large):
+            peer.socket.sendto(data, source)
+        await peer.pair.near.until("datagram", datagrams=3)
+        assert peer.pair.near.datagrams == [b"six", b"", large]
+        assert peer.pair.near.data == b""
+
+
+async def test_datagrams_from_elsewhere_are_counted_and_dropped() -> None:
+    async with with_udp() as peer:
+        peer.pair.here.write_datagram(b"five")
+        _, source = await peer.hears()
+        peer.stranger.sendto(b"six", source)
+        peer.stranger.sendto(b"seven", source)
+        peer.socket.sendto(b"true", source)
+        await peer.pair.near.until("datagram", datagrams=1)
+        assert peer.pair.near.datagrams == [b"true"]
+        assert peer.pair.near.foreign == 2
+
+
+async def test_a_burst_of_datagrams_is_taken_in_order() -> None:
+    async with with_udp() as peer:
+        peer.pair.here.write_datagram(b"five")
+        _, source = await peer.hears()
+        sent = [b"%d" % number for number in range(150)]
+        for data in sent:
+            peer.socket.sendto(data, source)
+        await peer.pair.near.until("datagram", datagrams=150)
+        assert peer.pair.near.datagrams == sent
+
+
+async def test_datagrams_to_a_peer_that_hears_none_are_lost_without_a_word() -> None:
+    async with connected() as pair:
+        for _ in range(3):
+            pair.here.write_datagram(b"five")
+            await asyncio.sleep(0.01)
+        pair.here.write_datagram(bytes(70_000))
+        pair.here.write(b"still there")
+        await pair.far.until("received", received=11)
+        assert pair.near.calls == ["attached"]
+
+
+async def test_a_lost_link_sends_and_receives_no_datagrams() -> None:
+    async with with_udp() as peer:
+        peer.pair.here.write_datagram(b"five")
+        _, source = await peer.hears()
+        peer.pair.here.abort()
+        await peer.pair.near.until("lost")
+        peer.pair.here.write_datagram(b"late")
+        with contextlib.closing(udp_socket(source)) as free:  # the port is free again
+            assert free.getsockname() == source
+        with pytest.raises(BlockingIOError):
+            peer.socket.recvfrom(100)
+
+
+# Datagrams of a listener
+
+
+class Served:
+    """A listener with UDP, and the recorders of its links, in the order in which they came."""
+
+    def __init__(self, marks: list[bytes]) -> None:
+        self.marks = marks
+        self.recorders: list[Recorder] = []
+        self.ends: list[TcpLink] = []
+        self.address = LOCAL
+
+    def receiver(self) -> Recorder:
+        self.recorders.append(Recorder(self.marks[len(self.recorders)]))
+        return self.recorders[-1]
+
+    def send(self, source: socket.socket, data: bytes) -> None:
+        source.sendto(data, (self.address.host, self.address.port))
+
+    def links(self, number: int) -> Link:
+        link = self.recorders[number].link
+        assert link is not None
+        return link
+
+
+@contextlib.asynccontextmanager
+async def served(*marks: bytes) -> AsyncIterator[Served]:
+    """A listener with one link for each mark."""
+    serving = Served(list(marks))
+    async with listen(LOCAL, serving.receiver, datagrams=True) as serving.address:
+        for number in range(len(marks)):
+            serving.ends.append(await connect(serving.address, Recorder()))
+            async with asyncio.timeout(SOON_S):
+                while len(serving.recorders) <= number:  # noqa: ASYNC110
+                    await asyncio.sleep(0)
+            await serving.recorders[number].until("attached")
+        yield serving
+        for end in serving.ends:
+            end.abort()
+        for recorder in serving.recorders:
+            await recorder.until("lost")
+
+
+@contextlib.contextmanager
+def sources(count: int) -> Iterator[list[socket.socket]]:
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(contextlib.closing(udp_socket(("127.0.0.1", 0)))) for _ in range(count)]
+
+
+async def test_a_listener_hears_datagrams_on_the_port_number_of_its_tcp() -> None:
+    async with served(b"a") as serving:
+        with sources(1) as (source,):
+            serving.send(source, b"a5")
+            serving.send(source, b"more")
+            await serving.recorders[0].until("datagram", datagrams=2)
+            assert serving.recorders[0].datagrams == [b"a5", b"more"]
+            serving.links(0).write_datagram(b"six")
+            assert await heard_by(source) == (b"six", (serving.address.host, serving.address.port))
+
+
+async def test_two_links_of_the_same_host_each_have_the_source_they_claimed() -> None:
+    async with served(b"a", b"b") as serving:
+        with sources(2) as (one, two):
+            serving.send(two, b"b5")
+            await serving.recorders[1].until("datagram", datagrams=1)
+            serving.send(one, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            serving.send(two, b"a again")
+            await serving.recorders[1].until("datagram", datagrams=2)
+            assert serving.recorders[0].datagrams == [b"a5"]
+            assert serving.recorders[1].datagrams == [b"b5", b"a again"]
+            serving.links(0).write_datagram(b"for a")
+            serving.links(1).write_datagram(b"for b")
+            assert (await heard_by(one))[0] == b"for a"
+            assert (await heard_by(two))[0] == b"for b"
+
+
+async def test_a_link_has_one_source_and_others_are_foreign() -> None:
+    async with served(b"a") as serving:
+        with sources(2) as (one, two):
+            serving.send(one, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            serving.send(two, b"a5")
+            serving.send(one, b"more")
+            await serving.recorders[0].until("datagram", datagrams=2)
+            assert serving.recorders[0].datagrams == [b"a5", b"more"]
+
+
+async def test_a_link_that_has_claimed_nothing_sends_datagrams_nowhere() -> None:
+    async with served(b"a") as serving:
+        with sources(1) as (source,):
+            serving.links(0).write_datagram(b"early")
+            serving.send(source, b"stranger")
+            serving.links(0).write_datagram(b"early too")
+            serving.send(source, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            assert serving.recorders[0].datagrams == [b"a5"]
+            serving.links(0).write_datagram(b"six")
+            assert (await heard_by(source))[0] == b"six"
+
+
+async def test_a_source_is_free_again_when_its_link_is_lost() -> None:
+    async with served(b"a", b"a") as serving:
+        with sources(1) as (source,):
+            serving.send(source, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            serving.ends[0].abort()
+            await serving.recorders[0].until("lost")
+            serving.send(source, b"a5")
+            await serving.recorders[1].until("datagram", datagrams=1)
+            assert serving.recorders[0].datagrams == [b"a5"]
+            serving.links(1).write_datagram(b"six")
+            assert (await heard_by(source))[0] == b"six"
+
+
+async def test_a_listener_without_datagrams_serves_no_udp() -> None:
+    async with listen(LOCAL, Recorder) as address:
+        with contextlib.closing(udp_socket((address.host, address.port))) as free:
+            assert free.getsockname()[1] == address.port
+
+
+async def test_a_udp_port_that_is_taken_is_a_link_error_and_leaves_nothing_open() -> None:
+    with sources(1) as (taken,):
+        host, port = taken.getsockname()
+        with pytest.raises(LinkError, match=f"tcp://{host}:{port}"):
+            async with listen(Address(host, port), Recorder, datagrams=True):
+                pass
+        gc.collect()
+        with contextlib.closing(socket.socket()) as free:
+            free.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            free.bind((host, port))
+
+
+async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
+    hub, near, far = DatagramHub(), Recorder(b"a"), Recorder(b"a")
+    hub.add(FakeLink(), "10.0.0.1", near)
+    hub.add(FakeLink(), "10.0.0.2", far)
+    hub._take(b"a5", ("10.0.0.2", 11000))
+    hub._take(b"a5", ("10.0.0.3", 11000))
+    assert (near.datagrams, far.datagrams, hub.foreign) == ([], [b"a5"], 1)
+
+
+async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link() -> None:
+    hub, recorder, link = DatagramHub(), Recorder(b"a"), FakeLink()
+    hub.add(link, "10.0.0.1", recorder)
+    hub._take(b"b5", ("10.0.0.1", 1))
+    hub._take(b"a5", ("10.0.0.1", 1))
+    hub._take(b"a5", ("10.0.0.1", 2))
+    hub.remove(link)
+    hub.remove(link)
+    hub._take(b"a5", ("10.0.0.1", 1))
+    assert recorder.datagrams == [b"a5"]
+    assert hub.foreign == 3
+    hub.send(link, b"into the void")
+    hub.close()
+    hub.close()
+
+
 def test_a_fake_link_keeps_what_is_done_to_it() -> None:
     link = FakeLink("tcp://a:1")
     link.write(b"x")
+    link.write_datagram(b"y")
     link.pause()
-    assert (link.peer, link.ready, link.written, link.paused) == ("tcp://a:1", True, [b"x"], True)
+    assert (link.peer, link.ready, link.paused) == ("tcp://a:1", True, True)
+    assert (link.written, link.datagrams) == ([b"x"], [b"y"])
     link.resume()
     link.close()
     assert (link.paused, link.closed) == (False, True)

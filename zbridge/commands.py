@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 
 from zbridge.bus import Sample
 from zbridge.errors import EncodeError, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Raw
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot
@@ -51,7 +52,8 @@ class Commands:
         self._loop = asyncio.get_running_loop()
         self._deadman: asyncio.TimerHandle | None = None
         self._control_due: asyncio.TimerHandle | None = None
-        self._closed = False
+        self._closing: str | None = None
+        self._stands_at = -math.inf
         self._refused = metrics.count("refused")
         self._taken = metrics.count("commands")
 
@@ -60,8 +62,18 @@ class Commands:
 
     @property
     def moving(self) -> bool:
-        """Whether the robot was told to move and not yet to stop."""
-        return self._authority.moving
+        """Whether the robot was told to move, or to move on its own, and not yet to stop."""
+        return self._authority.moving or self._authority.on_its_own
+
+    @property
+    def stopping_s(self) -> float:
+        """Seconds for which a stop or a neutral is still being repeated."""
+        return max(0.0, self._stands_at - self._clock())
+
+    def take_stop(self, sample: Sample) -> None:
+        """Stop, whatever the payload says."""
+        self._taken.value += 1
+        self.halt("stop")
 
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it where everybody sees."""
@@ -82,17 +94,26 @@ class Commands:
 
     def halt(self, reason: str) -> None:
         """Stop the robot at once and for a second; motion needs a neutral drive afterwards."""
-        now = self._clock()
         self.forbid(reason)
         session = self._robot.driving
         if session is None or session.state is not State.ESTABLISHED:
             return
         log.info("%s: stop (%s)", self._keys.robot, reason)
         try:
-            self._robot.stop(now, now + STOP_REPEAT_S)
+            self.stand_still()
         except Refused as refusal:
             self._refuse("stop", str(refusal))
+
+    def stand_still(self) -> None:
+        """Send the robot its stop, for a second; raise Refused where it cannot be sent."""
+        now = self._clock()
+        self._robot.stop(now, now + STOP_REPEAT_S)
+        self._stands_at = now + STOP_REPEAT_S
         self._pump()
+
+    def refuse_all(self, reason: str) -> None:
+        """Take nothing but stops from now on."""
+        self._closing = reason
 
     def forbid(self, reason: str) -> None:
         """Allow no motion before a neutral drive: the robot stands, or is out of reach."""
@@ -109,7 +130,6 @@ class Commands:
 
     def close(self) -> None:
         """Let no timer fire any more."""
-        self._closed = True
         for timer in (self._deadman, self._control_due):
             if timer is not None:
                 timer.cancel()
@@ -118,16 +138,21 @@ class Commands:
         topic = topics.find(path)
         if topic is None or topic.delivery is not Delivery.COMMAND:
             raise Refused("no such command")
-        if topic is topics.CMD_STOP:  # whatever its payload
-            self.halt("stop")
+        if topic is topics.CMD_STOP:  # has a lane of its own, and came by it
+            self._taken.value -= 1
             return
+        if self._closing is not None:
+            raise Refused(self._closing)
         now = self._clock()
         command = payloads.decode(topic.message, sample.payload)
         if isinstance(command, Drive):
             self._drive(topic, command, now)
         else:
             self.require_ready()
+            on_its_own = _moves_by_itself(command)
+            self._authority.admit(moving=on_its_own)
             self._show(topic, self._robot.command(topic, command, now))
+            self._authority.on_its_own = self._authority.on_its_own or on_its_own
         self._pump()
 
     def _drive(self, topic: Topic, command: Drive, now: float) -> None:
@@ -141,6 +166,8 @@ class Commands:
         self._authority.admit(moving=moving)
         outcome = self._robot.command(topic, command, now)
         self._authority.applied(moving=moving, now=now)
+        if not moving:
+            self._stands_at = now + STOP_REPEAT_S
         self._watch_deadman()
         self._show(topic, outcome)
 
@@ -153,7 +180,7 @@ class Commands:
     def _refuse(self, command: str, reason: str) -> None:
         self._refused.value += 1
         self._authority.refuse(command, reason)
-        if self._control_due is None and not self._closed:
+        if self._control_due is None:
             self._control_due = self._loop.call_later(_CONTROL_S, self.report)
 
     def _watch_deadman(self) -> None:
@@ -170,3 +197,8 @@ class Commands:
             self.halt("deadman")
         else:
             self._watch_deadman()
+
+
+def _moves_by_itself(command: FleetMessage) -> bool:
+    """Tell a command after which a robot may move without being driven: what is opaque may do anything."""
+    return isinstance(command, Raw) or (isinstance(command, Mode) and command.mode == "autonomous")

@@ -6,13 +6,14 @@ Wires sans-IO parts together: sessions and translation (from the protocol), cont
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from zbridge.bus import Bus, Publisher, Question
+from zbridge.bus import Bus, Lane, Publisher, Question
 from zbridge.commands import STOP_REPEAT_S, Commands
 from zbridge.endpoint import Connect, Endpoint, Hooks
 from zbridge.errors import ProtocolError, Refused
@@ -26,7 +27,7 @@ from zbridge.protocol import Robot, Translate
 from zbridge.questions import Questions
 from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
-from zbridge.session.session import Session
+from zbridge.session.session import Session, State
 
 log = logging.getLogger("zbridge.device")
 
@@ -64,9 +65,11 @@ class Device:
         self._publishers: dict[str, Publisher] = {}
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
-        self._questions = Questions(asyncio.get_running_loop())
+        self._greeted: Session[Any] | None = None
+        self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
         self._commands = Commands(robot, authority, keys, metrics, publish=self._publish, pump=self._pump, clock=clock)
         self._published = metrics.count("published")
+        self._lost = metrics.count("commands_lost")
         self._untranslatable = metrics.count("untranslatable")
         self._endpoints = [
             Endpoint(
@@ -96,7 +99,8 @@ class Device:
         self._publish_status()
         self._commands.report()
         self._bus.on_relief(self._resume)
-        self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, first=True)
+        self._bus.subscribe(self._keys.key(topics.CMD_STOP.path), self._commands.take_stop, lane=Lane.STOP)
+        self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=Lane.COMMAND)
         self._bus.watch_connected(self._on_bus)
         for path in _ASKED:
             self._bus.answer(self._keys.key(path), self._on_question)
@@ -114,9 +118,10 @@ class Device:
 
     async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, and say so on the bus; at most 1.7 s."""
+        self._commands.refuse_all("gateway stopped")
         if self._commands.moving:
             self._commands.halt("gateway stopped")
-            await asyncio.sleep(STOP_REPEAT_S)
+        await asyncio.sleep(min(self._commands.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(endpoint.close("gateway stopped", LEAVE_S) for endpoint in self._endpoints))
         self._publish_status()
         self._commands.close()
@@ -129,8 +134,13 @@ class Device:
         busy, self._busy = self._busy, session.busy
         if session.over:
             if session.version is not None:
+                self._lost.value += len(session.outbox)
                 self._commands.forbid("robot lost")
                 self._questions.refuse_all("the robot was lost")
+        elif session.state is State.ESTABLISHED and session is not self._greeted:
+            self._greeted = session
+            with contextlib.suppress(Refused):  # whoever drove it before, it stands now
+                self._commands.stand_still()
         elif busy != self._busy:
             self._commands.halt(self._busy or "no longer busy")
 

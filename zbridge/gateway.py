@@ -32,6 +32,8 @@ class Gateway:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
+        self.left = True
+        """Whether the bus was left in order; if not, its threads may hang."""
         self.metrics = Metrics()
         self.sessions = SessionManager()
 
@@ -47,11 +49,25 @@ class Gateway:
             async with contextlib.AsyncExitStack() as stack:
                 if self._plan.metrics is not None:
                     await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
-                await claim.take()
-                await self._device(bus).run()
+                while True:
+                    await claim.take()
+                    await self._serve(bus, claim)
         finally:
             claim.release()
-            await bus.close()
+            self.left = await bus.close()
+
+    async def _serve(self, bus: Bus, claim: Claim) -> None:
+        """Serve the robot until another gateway turns out to have the better claim."""
+        serving = asyncio.ensure_future(self._device(bus).run())
+        losing = asyncio.ensure_future(claim.lost())
+        try:
+            await asyncio.wait((serving, losing), return_when=asyncio.FIRST_COMPLETED)
+            if serving.done():
+                serving.result()
+        finally:
+            for task in (serving, losing):
+                task.cancel()
+            await asyncio.shield(asyncio.gather(serving, losing, return_exceptions=True))
 
     def _device(self, bus: Bus) -> Device:
         plan, config = self._plan, self._plan.config

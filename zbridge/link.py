@@ -36,9 +36,11 @@ class Address(msgspec.Struct, frozen=True):
         try:
             parts = urlsplit(text)
             host, port = parts.hostname, parts.port
+            (host or "").encode("idna")
         except ValueError as error:
             raise LinkError(f"{text!r}: {error}; expected tcp://host:port") from error
-        if parts.scheme != "tcp" or not host or port is None or parts.path or parts.query:
+        odd = parts.path or parts.query or parts.fragment or parts.username is not None
+        if parts.scheme != "tcp" or not host or port is None or odd:
             raise LinkError(f"{text!r}: expected tcp://host:port")
         return cls(host, port)
 
@@ -217,8 +219,8 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
             _, link = await loop.create_connection(lambda: TcpLink(receiver), address.host, address.port)
     except TimeoutError as error:
         raise LinkError(f"{address}: no answer within {CONNECT_S:g} s") from error
-    except OSError as error:
-        raise LinkError(f"{address}: {error.strerror or error}") from error
+    except (OSError, UnicodeError) as error:
+        raise LinkError(f"{address}: {getattr(error, 'strerror', None) or error}") from error
     return link
 
 

@@ -48,6 +48,7 @@ SILENCE_S = 2.05
 MAP_SILENCE_S = 1.5
 """Seconds without a map part after which a robot's TCP side is taken to be free again."""
 BUSY_MAP = "busy: map"
+LATE_START = "handshaking"
 _QUOTED = 80
 
 
@@ -126,6 +127,8 @@ class HqSession(_TcpUdpSession):
         self._map_until = math.inf
 
     def overdue(self) -> str:
+        if self.last_malformed is not None:
+            return f"no settings that can be read within {self.limits.handshake_s:g} s: {self.last_malformed}"
         return (
             f"connected, but no settings within {self.limits.handshake_s:g} s: "
             "its one connection may be used up, restart the robot program"
@@ -197,7 +200,7 @@ class HqSession(_TcpUdpSession):
         self._agreed = agreed
         udp = self._udp and self.settings.udp
         answer = VERSIONS[agreed].answer or message.versions
-        self.send(ClientSettings(answer, announced(answer, udp=udp)))
+        self.send_first(ClientSettings(answer, announced(answer, udp=udp)))
         if udp:
             self._limit_at = math.inf
             self._start.begin(now)
@@ -206,10 +209,13 @@ class HqSession(_TcpUdpSession):
 
     def _take_start(self, now: float) -> None:
         """Packet 4: send 5 by UDP at once, and nothing by TCP but one 7 until the silence has ended."""
-        if not self._start.settle(works=True):
+        if self._probe.verdict is not Verdict.UNKNOWN or self._start.verdict is Verdict.UNKNOWN:
             raise ProtocolError("serverStartUDP was not due")
+        if not self._start.settle(works=True):
+            self.busy = LATE_START  # we had given it up, and the robot sleeps all the same
         self._silent_until = now + SILENCE_S
-        self.outbox.put(Datagram(self.encode(ClientUDPConnection())))
+        self.outbox.quiet(self._silent_until)
+        self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
         self._probe.begin(now)
 
     def _take_answer(self, message: ServerUDPConnection, now: float, *, by_datagram: bool) -> None:
@@ -221,7 +227,7 @@ class HqSession(_TcpUdpSession):
     def _report_probe(self, *, works: bool) -> None:
         if works:
             self.transport = "udp"
-        self.send(ClientUDPConnectionStatus(works))
+        self.send_first(ClientUDPConnectionStatus(works))
 
     def _finish(self) -> None:
         assert self.settings is not None
@@ -239,21 +245,25 @@ class HqSession(_TcpUdpSession):
             self._report_probe(works=False)
         if now >= self._silent_until:
             self._silent_until = math.inf
-            self._finish()
+            if self.busy == LATE_START:
+                self.busy = None
+            else:
+                self._finish()
         if now >= self._map_until:
-            self._map_until = math.inf
-            self.busy = None
+            self.end_map()
 
     # A robot that sends its map in parts takes nothing by TCP meanwhile
 
     def _begin_map(self, now: float) -> None:
         self.busy = BUSY_MAP
+        self.outbox.held = True
         self._map_until = now + MAP_SILENCE_S
 
     def end_map(self) -> None:
         """Take note that the last part has come: the robot reads again."""
         self._map_until = math.inf
         self.busy = None
+        self.outbox.held = False
 
 
 class RobotSession(_TcpUdpSession):
@@ -275,7 +285,7 @@ class RobotSession(_TcpUdpSession):
         self._decoders = decoders(Sender.ROBOT, (0, client_id))
 
     def opened(self, now: float) -> None:
-        self.send(ServerSettings(self.client_id, ",".join(self._versions), self.settings.encode()))
+        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self.settings.encode()))
 
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientSettings):
@@ -326,7 +336,7 @@ class RobotSession(_TcpUdpSession):
         self._agreed = agreed
         if self.settings.udp and self.client.udp:
             self._limit_at = math.inf
-            self.send(ServerStartUDP())
+            self.send_first(ServerStartUDP())
             self._probe.begin(now)
         else:
             self._finish()
@@ -335,7 +345,7 @@ class RobotSession(_TcpUdpSession):
         """Packet 6: true by UDP, false by TCP; then the HQ has its time to answer 7."""
         works = self.transport == "udp"
         frame = self.encode(ServerUDPConnection(works))
-        self.outbox.put(Datagram(frame) if works else frame)
+        self.outbox.put_exempt(Datagram(frame) if works else frame)
         self._report.begin(now)
 
     def _finish(self) -> None:

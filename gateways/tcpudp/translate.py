@@ -132,7 +132,7 @@ class TcpUdpRobot(Robot):
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
 
     def _map_part(self, message: ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Put a part in its place, cut where the map ends, and show the map as far as it is known."""
+        """Put a part in its place, cut where the map ends; the last one makes a map."""
         session = self._connected()
         side = announced_side(session.settings)
         if side == 0:
@@ -141,8 +141,9 @@ class TcpUdpRobot(Robot):
             self._parts = bytearray(side * side)
         cells = message.cells[: max(0, len(self._parts) - message.start)]
         self._parts[message.start : message.start + len(cells)] = cells
-        if message.end >= len(self._parts):
-            session.end_map()
+        if message.end < len(self._parts):
+            return ()
+        session.end_map()
         return self._map(ServerSLAMMap(bytes(self._parts)), stamp_ns)
 
     def _cell_m(self, settings: Settings | None) -> float:

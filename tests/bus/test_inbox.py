@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from zbridge.bus import Lane
 from zbridge.bus.inbox import LANE, Inbox
 from zbridge.metrics import Metrics
 
@@ -18,7 +19,7 @@ class Rig:
         self.seen: list[Any] = []
 
     def put(self, raw: Any, *, first: bool = False) -> None:
-        self.inbox.put(self.seen.append, raw, lambda value: value, first=first)
+        self.inbox.put(self.seen.append, raw, lambda value: value, Lane.COMMAND if first else Lane.OTHER)
 
     async def drained(self) -> list[Any]:
         for _ in range(100):
@@ -37,7 +38,7 @@ async def test_items_come_in_order_and_not_before_the_loop_runs() -> None:
 async def test_items_are_read_on_the_loops_thread_only() -> None:
     rig = Rig()
     reader: list[int] = []
-    rig.inbox.put(rig.seen.append, b"raw", lambda raw: reader.append(threading.get_ident()) or "read", first=False)
+    rig.inbox.put(rig.seen.append, b"raw", lambda raw: reader.append(threading.get_ident()) or "read", Lane.OTHER)
     assert reader == []
     assert await rig.drained() == ["read"]
     assert reader == [threading.get_ident()]
@@ -89,13 +90,21 @@ async def test_a_flood_of_other_items_costs_no_first_item() -> None:
     assert (await rig.drained())[:10] == list(range(10))
 
 
+async def test_a_flood_of_commands_costs_no_stop() -> None:
+    rig = Rig()
+    rig.inbox.put(rig.seen.append, "stop", lambda value: value, Lane.STOP)
+    for number in range(2 * LANE):
+        rig.put(number, first=True)
+    assert (await rig.drained())[0] == "stop"
+
+
 async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig()
 
     def fail(value: Any) -> None:
         raise RuntimeError("our bug")
 
-    rig.inbox.put(fail, 1, lambda value: value, first=False)
+    rig.inbox.put(fail, 1, lambda value: value, Lane.OTHER)
     rig.put(2)
     with caplog.at_level(logging.ERROR):
         assert await rig.drained() == [2]

@@ -50,7 +50,8 @@ class Judgement:
     @property
     def clean(self) -> bool:
         """Whether the robot has nothing to complain of and everything arrived."""
-        return self.alive and not self.violations and not self.missing
+        excused = len(self.excused) <= max(2, sum(self.sent.values()) // 50)
+        return self.alive and excused and not self.violations and not self.missing
 
     def __str__(self) -> str:
         commands = sum(self.sent.values())
@@ -139,6 +140,10 @@ class _Run:
                 excused -= 1
             else:
                 judgement.missing.append(f"packet {packet_id} {body[:40]}")
+        stops = sum(packet_id == 13 for _, packet_id, _ in report["received"])
+        wanted = judgement.sent["stop"] + judgement.sent["neutral"]
+        if stops < wanted:
+            judgement.missing.append(f"stops: {stops} came of {wanted} at least")
         for packet_id, body in self._forbidden:
             if arrived[packet_id, body]:
                 judgement.violations.append(f"packet {packet_id} {body[:40]} should have been refused")

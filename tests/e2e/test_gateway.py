@@ -15,7 +15,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.e2e.conftest import Bench, end, free_port, until
+from tests.e2e.conftest import Bench, Fleet, end, free_port, until
 from tests.e2e.robots import ScriptedRobot, position
 
 DEADMAN = "[control]\ndeadman_s = 0.3\n"
@@ -132,15 +132,21 @@ def test_driver_killed_the_robot_stops_within_the_deadman(bench: Bench, robot: S
         os.kill(driver.pid, signal.SIGKILL)
         killed = time.monotonic()
         driver.communicate()
-    stop_at, stop = until(lambda: robot.packets(13), what="stop")[0]
+    driving = robot.packets(11)[0][0]
+    stop_at, stop = until(lambda: stops_since(robot, driving), what="stop")[0]
     assert stop == bytes.fromhex("02000000020d")
     # The last accepted command came before the kill, so this is the stricter bound seen from outside.
     assert stop_at - killed < 0.3 + 0.05
     until(lambda: time.monotonic() > stop_at + 1.3)
-    stops = [at for at, _ in robot.packets(13)]
+    stops = [at for at, _ in stops_since(robot, driving)]
     assert 0.8 <= stops[-1] - stops[0] <= 1.1
     assert len(stops) >= 8
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
+
+
+def stops_since(robot: ScriptedRobot, since: float) -> list[tuple[float, bytes]]:
+    """The stops after a moment: the ones that greet the robot do not count."""
+    return [(at, data) for at, data in robot.packets(13) if at > since]
 
 
 DRIVER = """
@@ -163,7 +169,7 @@ def test_the_bus_lost_while_driving_stops_the_robot_at_once(bench: Bench, robot:
     until(lambda: robot.packets(11))
     cut = time.monotonic()
     bench.fleet.session.close()
-    stop_at, _ = until(lambda: robot.packets(13), what="stop")[0]
+    stop_at, _ = until(lambda: stops_since(robot, robot.packets(11)[0][0]), what="stop")[0]
     assert stop_at - cut < 0.5  # far below the deadman of 2 s
 
 
@@ -236,6 +242,84 @@ def test_a_second_gateway_waits_and_takes_over(bench: Bench, robot: ScriptedRobo
     robot.drop()
     until(lambda: robot.connections == 2, what="the second gateway's connection")
     until(lambda: established(bench))
+
+
+def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies(bench: Bench, robot: ScriptedRobot) -> None:
+    bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    second = bench.gateway("r1", robot.port)
+    assert second.stdout is not None
+    assert "another gateway serves r1" in second.stdout.readline()
+    bench.fleet.session.close()
+    time.sleep(3.0)
+    assert robot.connections == 1
+    bench.fleet = Fleet(bench.router())
+    until(lambda: established(bench), what="the first gateway on the bus again")
+    time.sleep(1.5)
+    assert robot.connections == 1
+    bench.fleet.session.close()
+
+
+def test_a_driver_that_goes_on_while_the_gateway_ends_moves_nothing(bench: Bench, robot: ScriptedRobot) -> None:
+    gateway = bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    bench.fleet.put("r1/@cmd/drive", forward=0.5)
+    until(lambda: robot.packets(11))
+    gateway.send_signal(signal.SIGTERM)
+    ended = time.monotonic()
+    while gateway.poll() is None and time.monotonic() - ended < 3:
+        bench.fleet.put("r1/@cmd/drive")
+        bench.fleet.put("r1/@cmd/drive", forward=0.5)
+        time.sleep(0.02)
+    assert gateway.wait(timeout=1) == 0
+    first_stop = robot.packets(13)[-5][0]
+    assert robot.packets(11)[-1][0] < first_stop
+    assert robot.reads[-1][1] == STOP
+
+
+def test_a_robot_is_stopped_when_its_connection_returns(bench: Bench, robot: ScriptedRobot) -> None:
+    bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    bench.fleet.put("r1/@cmd/drive", forward=0.5)
+    until(lambda: robot.packets(11))
+    before = len(robot.reads)
+    robot.drop()
+    until(lambda: robot.connections == 2)
+    until(lambda: [data for _, data in robot.reads[before:] if data == STOP], what="a stop on the new connection")
+    assert not [data for _, data in robot.reads[before:] if data[5] == 11]
+
+
+def test_sigterm_ends_the_gateway_although_the_router_stands_still(bench: Bench, robot: ScriptedRobot) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = subprocess.Popen([sys.executable, "-c", ROUTER, endpoint], stdout=subprocess.PIPE, text=True)
+    try:
+        assert router.stdout is not None
+        router.stdout.readline()
+        file = bench.configuration("r1", robot.port)
+        file.write_text(file.read_text().replace(bench.endpoint, endpoint))
+        gateway = bench.zbridge("run", str(file))
+        until(lambda: robot.packets(3), what="the handshake")
+        until(lambda: robot.packets(13), what="the greeting stop")
+        os.kill(router.pid, signal.SIGSTOP)
+        time.sleep(1.5)
+        gateway.send_signal(signal.SIGTERM)
+        assert gateway.wait(timeout=2) == 0
+    finally:
+        router.kill()
+        router.communicate()
+
+
+STOP = bytes.fromhex("02000000020d")
+ROUTER = """
+import sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", '["%s"]' % sys.argv[1])
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config):
+    print("open", flush=True)
+    time.sleep(60)
+"""
 
 
 def test_a_gateway_waits_for_a_bus_that_is_not_there_yet(bench: Bench, robot: ScriptedRobot) -> None:

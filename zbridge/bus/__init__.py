@@ -6,7 +6,7 @@ opened, so that whatever needs no bus starts without it.
 
 from __future__ import annotations
 
-from zbridge.bus.interface import Answer, Batch, Bus, BusSettings, Handle, Publisher, Question, Sample, Tls
+from zbridge.bus.interface import Answer, Batch, Bus, BusSettings, Handle, Lane, Publisher, Question, Sample, Tls
 from zbridge.metrics import Metrics
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Bus",
     "BusSettings",
     "Handle",
+    "Lane",
     "Publisher",
     "Question",
     "Sample",

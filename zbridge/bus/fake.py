@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
-from zbridge.bus.interface import Answer, Batch, Handle, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, Handle, Lane, Publisher, Question, Sample
 from zbridge.fleet.topics import Topic
 
 H = TypeVar("H", bound=Handle)
@@ -89,7 +89,7 @@ class FakeBus:
         self._relief.append(handler)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
     ) -> Handle:
         entry = (key_expr, handler)
         self._shared.subscribers.append(entry)
@@ -131,10 +131,11 @@ class FakeBus:
         handler(self.up)
         return self._keep(_FakeHandle(lambda: self._connected.remove(handler)))
 
-    async def close(self) -> None:
+    async def close(self) -> bool:
         handles, self._handles = self._handles, []
         for handle in handles:
             handle.close()
+        return True
 
     def _keep(self, handle: H) -> H:
         self._handles.append(handle)

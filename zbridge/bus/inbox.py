@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from zbridge.bus.interface import Lane
 from zbridge.metrics import Metrics
 
 log = logging.getLogger("zbridge.bus")
@@ -22,22 +23,22 @@ Read = Callable[[Any], Any]
 
 
 class Inbox:
-    """Carries what Zenoh's threads bring to the event loop: two bounded lanes, one wake-up per batch."""
+    """A bounded queue per lane, emptied in the order of the lanes; the loop is woken once per batch."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
-        self._first: deque[tuple[Handler, Any, Read]] = deque()
-        self._other: deque[tuple[Handler, Any, Read]] = deque()
+        self._lanes: dict[Lane, deque[tuple[Handler, Any, Read]]] = {lane: deque() for lane in Lane}
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
 
-    def put(self, handler: Handler, raw: Any, read: Read, *, first: bool) -> None:
-        lane = self._first if first else self._other
-        if len(lane) >= LANE:
+    def put(self, handler: Handler, raw: Any, read: Read, lane: Lane) -> None:
+        """Store an item for the loop, from any thread."""
+        waiting = self._lanes[lane]
+        if len(waiting) >= LANE:
             with contextlib.suppress(IndexError):
-                lane.popleft()
+                waiting.popleft()
             self._dropped.value += 1
-        lane.append((handler, raw, read))
+        waiting.append((handler, raw, read))
         if not self._awake:
             self._awake = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
@@ -46,10 +47,10 @@ class Inbox:
     def _drain(self) -> None:
         self._awake = False
         for _ in range(_DRAIN):
-            lane = self._first or self._other
-            if not lane:
+            waiting = next((waiting for waiting in self._lanes.values() if waiting), None)
+            if waiting is None:
                 return
-            handler, raw, read = lane.popleft()
+            handler, raw, read = waiting.popleft()
             try:
                 handler(read(raw))
             except Exception:

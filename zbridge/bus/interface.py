@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from enum import Enum
 from typing import Annotated, Literal, Protocol
 
 import msgspec
 
 from zbridge.fleet.topics import Topic
 
-Endpoint = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]+/[^ ]+$")]
+Endpoint = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
 """Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
 
 
@@ -90,6 +91,14 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 """What was published together: for each key its payloads in order."""
 
 
+class Lane(Enum):
+    """What waits for the event loop, in the order it is served; each lane has its own bound."""
+
+    STOP = 0
+    COMMAND = 1
+    OTHER = 2
+
+
 class Bus(Protocol):
     """What gateways and commands use of Zenoh. Handlers are called on the event loop's thread."""
 
@@ -107,9 +116,9 @@ class Bus(Protocol):
         """Call ``handler`` when a source that was asked to pause may go on."""
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
     ) -> Handle:
-        """Take samples; ``first`` ones are handled before all others, ``history`` asks for last values too."""
+        """Take samples by way of a lane; ``history`` asks for last values too."""
 
     def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards."""
@@ -129,5 +138,5 @@ class Bus(Protocol):
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Be told when the first connection to the bus is made and when the last one is gone."""
 
-    async def close(self) -> None:
-        """Leave the bus; idempotent."""
+    async def close(self) -> bool:
+        """Leave the bus; False where that hangs, and its threads must be left to the end of the process."""

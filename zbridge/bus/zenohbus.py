@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import json
 import re
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -18,7 +19,7 @@ import zenoh
 import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, Publisher, Question, Sample
 from zbridge.bus.writer import Writer
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
@@ -31,6 +32,8 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
 PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
+LEAVE_S = 0.4
+"""Longest time leaving the bus takes."""
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
@@ -136,13 +139,13 @@ class ZenohBus:
         self._relief.append(handler)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, first: bool = False, history: bool = False
+        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
     ) -> Handle:
-        """Take samples; ``first`` ones are handled before all others, ``history`` asks for last values too."""
+        """Take samples by way of a lane; ``history`` asks for last values too."""
         inbox = self._inbox
 
         def store(sample: zenoh.Sample) -> None:
-            inbox.put(handler, sample, _read_sample, first=first)
+            inbox.put(handler, sample, _read_sample, lane)
 
         if not history:
             return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
@@ -156,7 +159,7 @@ class ZenohBus:
         inbox, writer = self._inbox, self._writer
 
         def store(query: zenoh.Query) -> None:
-            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), first=True)
+            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), Lane.OTHER)
 
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
@@ -208,14 +211,24 @@ class ZenohBus:
 
         return self._keep(_Declared(info.declare_transport_events_listener(changed, history=True)))
 
-    async def close(self) -> None:
-        """Leave the bus; idempotent."""
+    async def close(self) -> bool:
+        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as before a router that stands still."""
         handles, self._handles = self._handles, []
-        await asyncio.to_thread(self._leave, handles)
+        left = threading.Event()
+
+        def leave() -> None:
+            self._leave(handles)
+            left.set()
+
+        threading.Thread(target=leave, name="zbridge-leave", daemon=True).start()
+        deadline = self._loop.time() + LEAVE_S
+        while not left.is_set() and self._loop.time() < deadline:  # noqa: ASYNC110 - a thread, not a task
+            await asyncio.sleep(0.005)
+        return left.is_set()
 
     def _leave(self, handles: list[Handle]) -> None:
         for writer in (self._streams, self._writer):
-            writer.stop()
+            writer.stop(LEAVE_S / 4)
         with contextlib.suppress(zenoh.ZError):
             for handle in reversed(handles):
                 handle.close()

@@ -1,4 +1,4 @@
-"""The command line: ``zbridge run``, ``check``, ``init``, ``simulate``, ``demo``, ``ls``, ``echo``, ``stop``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, ls, echo, stop``.
 
 Only this package imports typer and rich, and this module does not: a gateway runs for months, and carries none
 of the command line's libraries. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import os
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
@@ -55,7 +56,11 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
     if only is not None and plan.protocol.name != only:
         raise ConfigError(f"{file}: device.protocol = {plan.protocol.name!r}: expected {only!r}")
     gc.freeze()  # what start-up made stays, and need not be looked through again
-    run_loop(until_signal(Gateway(plan).run()))
+    gateway = Gateway(plan)
+    run_loop(until_signal(gateway.run()))
+    if not gateway.left:  # a thread of the bus hangs, and would keep the process from ending
+        logging.shutdown()
+        os._exit(0)
 
 
 def run_loop(work: Coroutine[Any, Any, Any]) -> Any:

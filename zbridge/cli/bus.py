@@ -169,7 +169,22 @@ async def _stop_one(bus: Bus, keys: KeySpace) -> bool:
         with contextlib.suppress(BusError, PayloadError):
             for answer in await bus.ask(keys.key(topics.CONTROL.path), timeout_s=0.3):
                 if answer.error is None and payloads.decode(Control, answer.payload).state == "stopped":
-                    console.print(f"{keys.robot}: stopped")
-                    return True
+                    return await _reached(bus, keys, payloads.decode(Control, answer.payload))
     errors.print(f"{keys.robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
     return False
+
+
+async def _reached(bus: Bus, keys: KeySpace, control: Control) -> bool:
+    """Say whether the stop that a gateway took could reach its robot."""
+    for refusal in control.refusals:
+        if refusal.command == "stop":
+            errors.print(f"{keys.robot}: cannot be stopped: {refusal.reason}")
+            return False
+    for answer in await bus.ask(keys.key(topics.STATUS.path), timeout_s=0.3):
+        status = payloads.decode(Status, answer.payload)
+        if status.state != "established":
+            why = status.reason or "no reason known"
+            errors.print(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
+            return False
+    console.print(f"{keys.robot}: stopped")
+    return True

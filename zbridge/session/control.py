@@ -21,12 +21,18 @@ REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
 
 
+_NAMED, _EXPLAINED = 64, 200
+"""Characters of a command's name and of a reason that are kept."""
+
+
 class Authority:
     """Decides on commands and watches over motion. ``deadman_s``: seconds that motion outlives its command."""
 
     def __init__(self, deadman_s: float) -> None:
         self.deadman_s = deadman_s
         self.moving = False
+        self.on_its_own = False
+        """Whether the robot was told to move without being driven: no deadman, but every other stop."""
         self.stop_reason: str | None = None
         self._stop_at = math.inf
         self._refusals: OrderedDict[tuple[str | None, str, str], int] = OrderedDict()
@@ -48,7 +54,7 @@ class Authority:
 
     def stopped(self, reason: str) -> None:
         """Take note that the robot is being stopped, or is out of reach."""
-        self.moving = False
+        self.moving = self.on_its_own = False
         self._stop_at = math.inf
         self.stop_reason = reason
 
@@ -62,7 +68,7 @@ class Authority:
 
     def refuse(self, command: str, reason: str, who: str | None = None) -> None:
         """Count a refusal; it shows on ``control``."""
-        key = (who, command, reason)
+        key = (who, command[:_NAMED], reason[:_EXPLAINED])
         self._refusals[key] = self._refusals.pop(key, 0) + 1
         if len(self._refusals) > REFUSALS:
             self._refusals.popitem(last=False)

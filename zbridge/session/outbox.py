@@ -53,18 +53,30 @@ class Outbox:
         self._standing: dict[str, _Standing] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False
+        self.held = False
+        """While set, only what is urgent or stands is given out."""
+        self._exempt: deque[bytes] = deque(maxlen=limit)
+        self._quiet_until = -math.inf
 
     def __repr__(self) -> str:
         return f"<Outbox {len(self._queue)} waiting, standing {sorted(self._standing)}>"
 
     def __len__(self) -> int:
-        return len(self._urgent) + len(self._queue)
+        return len(self._exempt) + len(self._urgent) + len(self._queue)
 
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when too many wait."""
         if len(self._queue) >= self._limit:
             raise Refused(f"busy: {self._limit} packets wait for the robot")
         self._queue.append(frame)
+
+    def quiet(self, until: float) -> None:
+        """Give nothing out before ``until`` but what :meth:`put_exempt` was given."""
+        self._quiet_until = until
+
+    def put_exempt(self, frame: bytes) -> None:
+        """Queue a frame of the handshake: it goes first, and through a silence."""
+        self._exempt.append(frame)
 
     def stand(
         self,
@@ -98,7 +110,12 @@ class Outbox:
         """Take the frame to write now, None when there is none or the gap has not passed."""
         if now < self._free_at:
             return None
-        frame = self._urgent.popleft() if self._urgent else self._next(now)
+        if self._exempt:
+            frame: bytes | None = self._exempt.popleft()
+        elif now < self._quiet_until:
+            return None
+        else:
+            frame = self._urgent.popleft() if self._urgent else self._next(now)
         if frame is not None:
             self._free_at = now + self.gap_s
         return frame
@@ -111,7 +128,7 @@ class Outbox:
         slot = self._due_slot(now)
         if slot is None:
             self._turn_of_queue = False
-            return self._queue.popleft() if self._queue else None
+            return self._queue.popleft() if self._queue and not self.held else None
         standing = self._standing[slot]
         frame = standing.step(now)
         if standing.over:
@@ -121,15 +138,18 @@ class Outbox:
 
     def deadline(self) -> float | None:
         """Tell when :meth:`take` will have something, None when nothing waits or stands."""
-        if self._urgent or self._queue:
+        if self._exempt:
             return self._free_at
+        free_at = max(self._free_at, self._quiet_until)
+        if self._urgent or (self._queue and not self.held):
+            return free_at
         if not self._standing:
             return None
-        return max(self._free_at, min(standing.due for standing in self._standing.values()))
+        return max(free_at, min(standing.due for standing in self._standing.values()))
 
     def _due_slot(self, now: float) -> str | None:
         """Pick a due slot; slots take turns with the queue."""
         due = [slot for slot, standing in self._standing.items() if standing.due <= now]
-        if not due or (self._queue and self._turn_of_queue):
+        if not due or (self._queue and self._turn_of_queue and not self.held):
             return None
         return min(due, key=lambda slot: self._standing[slot].due)

@@ -298,6 +298,10 @@ class Session(ABC, Generic[M]):
         """Queue a message that is sent once; raises Refused when too many wait, EncodeError."""
         self.outbox.put(self.encode(message))
 
+    def send_first(self, message: M) -> None:
+        """Queue a message of the handshake: nothing goes before it, and a silence does not hold it."""
+        self.outbox.put_exempt(self.encode(message))
+
     def snapshot(self) -> Snapshot:
         """Show the session as it is now."""
         return Snapshot(

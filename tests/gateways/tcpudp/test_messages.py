@@ -558,16 +558,56 @@ def test_map_of_eight_cells_is_no_position() -> None:
     assert decode_packet(frame) == ServerSLAMMap(b"\x00\x01\x02\x00\x01\x02\x00\x01")
 
 
-def test_second_header_before_a_broadcast_text_does_not_confuse_the_parser() -> None:
-    doubled = unhex("0f000000 01 01 09000000 01 01 03000000 627965")
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "0f000000 01 01 09000000 01 01 03000000 627965",
+        "15000000 01 01 0f000000 01 01 09000000 01 01 03000000 627965",
+    ],
+    ids=["doubled", "tripled"],
+)
+def test_more_headers_before_a_broadcast_text_do_not_confuse_the_parser(frame: str) -> None:
+    many = unhex(frame)
     position = unhex("0e000000 01 37 0000803f 000000c0 00003443")
     buffer = FrameBuffer(frame_end, MAX_FRAME)
-    frames = feed(buffer, doubled + position)
-    assert frames == [doubled, position]
-    text = decode_packet(frames[0])
-    assert type(text) is DebugMessage
-    assert text.text.endswith("bye")
+    frames = feed(buffer, many + position)
+    assert frames == [many, position]
+    assert decode_packet(frames[0]) == DebugMessage("bye")
     assert decode_packet(frames[1]) == ServerPosition(1.0, -2.0, 180.0)
+
+
+def test_second_header_before_an_empty_text_is_taken_off_too() -> None:
+    assert decode_packet(unhex("0c000000 01 01 06000000 01 01 00000000")) == DebugMessage("")
+
+
+@pytest.mark.parametrize(
+    ("frame", "text"),
+    [
+        ("0c000000 01 01 06000000 0102 61626364", "\x01\x02abcd"),
+        ("0c000000 01 01 06000000 0201 61626364", "\x02\x01abcd"),
+        ("0c000000 01 01 06000000 0501 00000000", "\x05\x01\x00\x00\x00\x00"),
+        # the first bytes of a header, but what follows is no counted text
+        ("0c000000 01 01 06000000 0101 61626364", "\x01\x01abcd"),
+        ("0d000000 01 01 07000000 0101 00000000 61", "\x01\x01\x00\x00\x00\x00a"),
+        ("08000000 01 01 02000000 0101", "\x01\x01"),
+        ("0b000000 01 01 05000000 0101 000000", "\x01\x01\x00\x00\x00"),
+    ],
+)
+def test_text_that_merely_looks_like_a_second_header_is_kept(frame: str, text: str) -> None:
+    assert decode_packet(unhex(frame)) == DebugMessage(text)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    ["0f000000 01 01 09000000 01 01 04000000 627965", "0f000000 01 01 08000000 01 01 03000000 627965"],
+    ids=["the inner count lies", "the inner length lies"],
+)
+def test_doubled_header_around_a_lie_gives_no_other_packet(frame: str) -> None:
+    try:
+        read = decode_packet(unhex(frame))
+    except ProtocolError:
+        return
+    assert read == DebugMessage("\x01\x01" + "\x04\x00\x00\x00bye")
 
 
 # --- values

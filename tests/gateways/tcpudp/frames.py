@@ -1,0 +1,105 @@
+"""Packets written by hand after "Framing" and "Settings" of the protocol page, and a session on a clock of its own.
+
+Nothing here encodes with the code under test.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gateways.tcpudp.messages import Packet
+from gateways.tcpudp.session import HqSession, RobotSession
+from zbridge.session.session import Datagram
+
+LISTED = b"1.1,1.2,1.3"
+ALL = "01010101010101"
+"""UDP, Cam, Joystick, Chat, Lidar, LidarSim, SLAMMap."""
+NO_UDP = "00010101010101"
+SIZE_100_10 = "e8030000 0a000000"
+"""SLAMMapSize 1000, SLAMMapIntervall 10: 100 cells along a side."""
+
+START = bytes.fromhex("02000000 01 04")
+PROBE = bytes.fromhex("02000000 05 05")
+ANSWER_TRUE = bytes.fromhex("03000000 01 06 01")
+ANSWER_FALSE = bytes.fromhex("03000000 01 06 00")
+STATUS_TRUE = bytes.fromhex("03000000 05 07 01")
+STATUS_FALSE = bytes.fromhex("03000000 05 07 00")
+MOVE = bytes.fromhex("0e000000 05 0b 00000000 0000803f 0000003f")
+ROTATE = bytes.fromhex("06000000 05 0c 000040bf")
+STOP = bytes.fromhex("02000000 05 0d")
+POSITION = bytes.fromhex("0e000000 01 37 0000c03f 000010c0 0000b442")
+
+
+def framed(sender: int, packet_id: int, body: bytes = b"") -> bytes:
+    """``int32 length | u8 id | u8 packet id | body``."""
+    return (2 + len(body)).to_bytes(4, "little") + bytes([sender, packet_id]) + body
+
+
+def counted(text: bytes) -> bytes:
+    """``int32 count | bytes``."""
+    return len(text).to_bytes(4, "little") + text
+
+
+def server_settings(versions: bytes = LISTED, block: str = ALL + SIZE_100_10, client_id: int = 5) -> bytes:
+    """Packet 2."""
+    return framed(1, 2, bytes([client_id]) + counted(versions) + bytes.fromhex(block))
+
+
+def client_settings(versions: bytes = LISTED, block: str = "01000000000100", sender: int = 5) -> bytes:
+    """Packet 3; the flags of deployed 1.3 programs are UDP and LidarSim."""
+    return framed(sender, 3, counted(versions) + bytes.fromhex(block))
+
+
+@dataclass(frozen=True)
+class Sent:
+    """One frame that left a session."""
+
+    at: float
+    by: str
+    frame: bytes
+
+
+class Timed:
+    """A session whose timers fire when they are due, and what left it when and by which channel."""
+
+    def __init__(self, session: HqSession | RobotSession) -> None:
+        self.session = session
+        self.now = 0.0
+        self.sent: list[Sent] = []
+        session.open(0.0)
+        self._write()
+
+    def until(self, now: float) -> None:
+        """Let time pass: every timer fires at its time, and what may be written is."""
+        for _ in range(10_000):
+            self._write()
+            due = self.session.deadline()
+            if due is None or due > now:
+                self.now = now
+                return
+            self.now = max(self.now, due)
+            self.session.expire(self.now)
+        raise AssertionError("a timer fires again and again")
+
+    def stream(self, data: bytes, at: float) -> list[Packet]:
+        """Let bytes come by TCP."""
+        self.until(at)
+        messages = self.session.receive(data, at)
+        self._write()
+        return messages
+
+    def datagram(self, data: bytes, at: float) -> list[Packet]:
+        """Let a datagram come."""
+        self.until(at)
+        messages = self.session.receive_datagram(data, at)
+        self._write()
+        return messages
+
+    def frames(self, by: str, start: float = -1.0, end: float = 1e9) -> list[bytes]:
+        """What left by one channel from ``start`` up to but not at ``end``."""
+        return [sent.frame for sent in self.sent if sent.by == by and start <= sent.at < end]
+
+    def _write(self) -> None:
+        while (frame := self.session.outgoing(self.now)) is not None:
+            by = "udp" if type(frame) is Datagram else "tcp"
+            self.sent.append(Sent(self.now, by, bytes(frame)))

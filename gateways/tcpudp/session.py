@@ -32,9 +32,9 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.versions import LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, ProtocolError, Refused
-from zbridge.session.negotiation import agree, parse_versions
+from zbridge.session.negotiation import agree, newest, parse_versions
 from zbridge.session.probe import Probe, Verdict
-from zbridge.session.session import Datagram, Limits, Role, Session
+from zbridge.session.session import Datagram, Limits, Role, Session, State
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -209,13 +209,15 @@ class HqSession(_TcpUdpSession):
 
     def _take_start(self, now: float) -> None:
         """Packet 4: send 5 by UDP at once, and nothing by TCP but one 7 until the silence has ended."""
-        if self._probe.verdict is not Verdict.UNKNOWN or self._start.verdict is Verdict.UNKNOWN:
-            raise ProtocolError("serverStartUDP was not due")
+        if self._probe.verdict is not Verdict.UNKNOWN:
+            raise ProtocolError("serverStartUDP a second time")
+        offered = self._start.verdict is not Verdict.UNKNOWN
         if not self._start.settle(works=True):
-            self.busy = LATE_START  # we had given it up, and the robot sleeps all the same
+            self.busy = LATE_START  # given up, or never offered: the robot sleeps all the same
         self._silent_until = now + SILENCE_S
         self.outbox.quiet(self._silent_until)
-        self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
+        if offered:
+            self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
         self._probe.begin(now)
 
     def _take_answer(self, message: ServerUDPConnection, now: float, *, by_datagram: bool) -> None:
@@ -245,10 +247,10 @@ class HqSession(_TcpUdpSession):
             self._report_probe(works=False)
         if now >= self._silent_until:
             self._silent_until = math.inf
-            if self.busy == LATE_START:
-                self.busy = None
-            else:
+            if self.state is State.HANDSHAKING:
                 self._finish()
+            elif self.busy == LATE_START:
+                self.busy = None
         if now >= self._map_until:
             self.end_map()
 
@@ -320,7 +322,8 @@ class RobotSession(_TcpUdpSession):
 
     def may_send(self, message: Packet) -> None:
         """Raise Refused for a packet that an HQ of this version does not know: it cripples it for good."""
-        known = VERSIONS[self._agreed].known_to_hq
+        row = newest((self._agreed,), known=VERSIONS)
+        known = VERSIONS[row].known_to_hq if row is not None else frozenset()
         packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
         if packet_id not in known:
             raise Refused(f"an HQ of version {self._agreed} does not know packet {packet_id}")

@@ -195,16 +195,18 @@ def test_a_datagram_with_a_packet_and_a_half_gives_none() -> None:
 
 
 @pytest.mark.parametrize("flags", ["00010101010101", ALL])
-def test_a_start_that_is_not_due_opens_no_probe(flags: str) -> None:
+def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str) -> None:
+    """The robot sleeps all the same, and wants its 7."""
     timed = Timed(HqSession(limits(0.01), udp=flags != ALL))
     timed.stream(server_settings(block=flags + SIZE_100_10), 0.1)
     assert timed.session.state is State.ESTABLISHED
     timed.stream(START, 0.2)
+    assert timed.session.busy == "handshaking"
     timed.until(6.0)
     assert timed.frames("udp") == []
-    assert len(timed.frames("tcp")) == 1
-    assert timed.session.state is State.ESTABLISHED
-    assert timed.session.traffic.malformed == 1
+    assert timed.frames("tcp")[1:] == [bytes.fromhex("03000000 05 07 00")]
+    assert (timed.session.state, timed.session.busy) == (State.ESTABLISHED, None)
+    assert timed.session.traffic.malformed == 0
 
 
 def test_a_start_before_the_settings_is_not_due() -> None:

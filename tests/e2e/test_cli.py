@@ -44,7 +44,7 @@ def test_a_bad_file_ends_run_with_2_and_names_file_key_and_value(tmp_path: Path)
     )
     ran = zbridge("run", str(file))
     assert ran.returncode == 2
-    assert f"{file}: device.options.gap = 1: unknown key; expected one of gap_s," in ran.stderr
+    assert f"{file}: device.options.gap = 1: unknown key; expected one of udp, gap_s," in ran.stderr
     assert "Traceback" not in ran.stderr
 
 

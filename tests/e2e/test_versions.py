@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import socket
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,7 +38,7 @@ def test_a_robot_of_every_version_is_seen_and_driven(bench: Bench, version: str,
         fleet.put("r1/@cmd/drive", forward=1.0)
         time.sleep(0.05)
     until(lambda: abs(fleet.last("r1/pose")["y"] - before["y"]) > 0.1, what="motion")
-    (answered,) = fleet.get("fleet/r1/@rpc/map")
+    (answered,) = fleet.get("fleet/r1/@rpc/map", timeout_s=8.0)
     assert (answered["rows"], len(answered["cells"])) == (100, 10_000)
 
 
@@ -46,15 +48,17 @@ def test_a_1_4_robot_that_sends_its_map_is_stopped_and_busy(bench: Bench) -> Non
     bench.gateway("r1", port)
     fleet = bench.fleet
     until(lambda: fleet.state("r1") == "established")
-    fleet.get("fleet/r1/@rpc/map")
+    asking = threading.Thread(target=lambda: answers.extend(fleet.get("fleet/r1/@rpc/map", timeout_s=8.0)))
+    answers: list[Any] = []
+    asking.start()
     until(lambda: fleet.last("r1/status")["reason"] == "busy: map")
     assert fleet.state("r1") == "established"
     fleet.put("r1/@cmd/drive")
     fleet.put("r1/@cmd/text", text="hello")
     until(lambda: "busy: map" in {refusal["reason"] for refusal in fleet.last("r1/control")["refusals"]})
     until(lambda: fleet.last("r1/status")["reason"] is None, what="the end of the map")
-    complete = fleet.last("r1/map")["cells"]
-    assert complete.count(1) > 1000
+    asking.join(8)
+    assert answers[0]["cells"].count(1) > 1000
     before = fleet.last("r1/pose")
     fleet.put("r1/@cmd/drive")
     for _ in range(10):
@@ -151,8 +155,8 @@ def test_a_robot_whose_datagrams_never_come_is_used_by_tcp(bench: Bench) -> None
     try:
         gateway = bench.gateway("r1", robot.port)
         until(lambda: bench.fleet.state("r1") == "established", what="established by TCP")
-        assert [data[5] for _, data in robot.reads] == [3, 7]
-        assert robot.reads[-1][1] == bytes.fromhex("03000000020700")
+        assert [data[5] for _, data in robot.reads][:2] == [3, 7]
+        assert robot.reads[1][1] == bytes.fromhex("03000000020700")
         bench.fleet.put("r1/@cmd/drive", forward=0.5)
         until(lambda: robot.packets(11), what="drive by TCP")
         end(gateway)

@@ -33,7 +33,8 @@ def main() -> None:
         else:
             chunks = [wire.positions(low, min(low + JOINED - 1, count)) for low in range(1, count + 1, JOINED)]
             drive(count, rate_hz, lambda number: link.sendall(wire.position(number)), lambda: _flood(link, chunks))
-        link.recv(1)  # until the harness ends the other side, or this one
+        while link.recv(4096):  # until the harness ends the other side, or this one
+            pass
 
 
 def _shake_hands(link: socket.socket) -> None:

@@ -230,3 +230,17 @@ async def test_malformed_messages_are_logged_ever_more_rarely(caplog: pytest.Log
 @jumping
 async def test_a_conversation_prints_its_session() -> None:
     assert repr(Rig().conversation) == "<Conversation <Toy robot connecting>>"
+
+
+@jumping
+async def test_a_timer_that_does_not_tell_when_it_is_due_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """uvloop gives a plain handle for a timer that is due at once."""
+    rig = established()
+    rig.session.send(b"one")
+    rig.session.send(b"two")
+    monkeypatch.setattr(rig.loop, "call_at", lambda when, callback: rig.loop.call_soon(lambda: None))
+    rig.conversation.pump()
+    rig.session.send(b"three")
+    rig.conversation.pump()
+    rig.conversation.close("enough")
+    assert rig.link.written[0] == b"\x03one"

@@ -39,6 +39,7 @@ class Conversation:
         self._changed = changed
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._timer_at: float | None = None
         self._seen = (session.state, session.busy)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
@@ -138,12 +139,13 @@ class Conversation:
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:
-            if deadline is not None and self._timer.when() == deadline:
+            if deadline == self._timer_at:
                 return
             self._timer.cancel()
             self._timer = None
         if deadline is not None:
             self._timer = self._loop.call_at(deadline, self._tick)
+        self._timer_at = deadline  # uvloop's timers that are due at once do not tell when
 
     def _notify(self) -> None:
         """Tell of a change of state, once."""

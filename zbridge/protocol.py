@@ -41,7 +41,6 @@ class Robot(ABC):
     dialect: ClassVar[str | None] = None
     link_names: tuple[str, ...]
     """One name for each configured address; the first link is the one that drives."""
-    unsupported: ClassVar[frozenset[Topic]] = frozenset()
 
     @abstractmethod
     def session(self, link: int, peer: str) -> Session[Any]:

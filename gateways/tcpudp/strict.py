@@ -99,6 +99,7 @@ class StrictRobot:
         self._phase = _Phase.LISTENING
         self._reads = wire.Reads()
         self._conn: socket.socket | None = None
+        self._broken: ConnectionResetError | None = None
         self._udp: socket.socket | None = None
         self._sending = asyncio.Lock()
         self._tasks: asyncio.TaskGroup | None = None
@@ -177,6 +178,8 @@ class StrictRobot:
             while data := await loop.sock_recv(conn, wire.READ_BYTES):
                 await self._read(data)
                 await self._nap()
+            if self._broken:  # a send was told of it first, and the kernel tells once
+                raise self._broken
             self._event("the HQ closed the connection")
         except OSError as error:
             self._event(f"the connection broke: {error!r}")
@@ -212,6 +215,9 @@ class StrictRobot:
             except TimeoutError:
                 self._event(f"the HQ read nothing for {_SEND_S:g} s")
                 conn.shutdown(socket.SHUT_RDWR)
+            except ConnectionResetError as error:
+                self._broken = error
+                raise
 
     # UDP
 

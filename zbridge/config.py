@@ -45,10 +45,19 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[control]``: the most a holder may ask for, in seconds."""
+    """``[control]``: the most a holder may ask for in seconds, limits on motion, and the audit log.
+
+    rate_hz: drives a second that are carried out. slew_per_s: change of each part of a drive, full scales a second.
+    audit: the file of the audit log, rotated at ``audit_bytes``, with ``audit_files`` older ones kept.
+    """
 
     lease_s: Seconds = 3.0
     deadman_s: Seconds = 2.0
+    rate_hz: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    slew_per_s: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    audit: Annotated[str, msgspec.Meta(min_length=1)] | None = None
+    audit_bytes: Annotated[int, msgspec.Meta(ge=1000)] = 1_000_000
+    audit_files: Annotated[int, msgspec.Meta(ge=1)] = 5
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,20 +13,23 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from zbridge.audit import Audit
 from zbridge.bus import Bus, Lane, Publisher, Question
-from zbridge.commands import STOP_REPEAT_S, Commands
+from zbridge.commands import Commands
 from zbridge.endpoint import Connect, Endpoint, Hooks
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
+from zbridge.leases import STOP_REPEAT_S, Leases
 from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot, Translate
 from zbridge.questions import Questions
 from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
+from zbridge.session.motion import MotionLimits
 from zbridge.session.session import Session, State
 
 log = logging.getLogger("zbridge.device")
@@ -35,6 +38,7 @@ HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
 LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
+_LEAVING = "gateway stopped"
 _ASKED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
 
@@ -52,6 +56,8 @@ class Device:
         authority: Authority,
         manager: SessionManager,
         metrics: Metrics,
+        audit: Audit,
+        limits: MotionLimits | None = None,
         connect: Connect = connect,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
@@ -67,7 +73,19 @@ class Device:
         self._busy: str | None = None
         self._greeted: Session[Any] | None = None
         self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
-        self._commands = Commands(robot, authority, keys, metrics, publish=self._publish, pump=self._pump, clock=clock)
+        self._leases = Leases(
+            robot, authority, keys, metrics, audit, publish=self._publish, pump=self._pump, clock=clock
+        )
+        self._commands = Commands(
+            robot,
+            self._leases,
+            limits or MotionLimits(),
+            keys,
+            metrics,
+            publish=self._publish,
+            pump=self._pump,
+            clock=clock,
+        )
         self._published = metrics.count("published")
         self._lost = metrics.count("commands_lost")
         self._untranslatable = metrics.count("untranslatable")
@@ -97,10 +115,11 @@ class Device:
     async def run(self) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it."""
         self._publish_status()
-        self._commands.report()
+        self._leases.report()
+        self._leases.serve(self._bus)
         self._bus.on_relief(self._resume)
         self._bus.subscribe(self._keys.key(topics.CMD_STOP.path), self._commands.take_stop, lane=Lane.STOP)
-        self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=Lane.COMMAND)
+        self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.lane)
         self._bus.watch_connected(self._on_bus)
         for path in _ASKED:
             self._bus.answer(self._keys.key(path), self._on_question)
@@ -118,13 +137,14 @@ class Device:
 
     async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, and say so on the bus; at most 1.7 s."""
-        self._commands.refuse_all("gateway stopped")
-        if self._commands.moving:
-            self._commands.halt("gateway stopped")
-        await asyncio.sleep(min(self._commands.stopping_s, STOP_REPEAT_S))
-        await asyncio.gather(*(endpoint.close("gateway stopped", LEAVE_S) for endpoint in self._endpoints))
+        self._commands.refuse_all(_LEAVING)
+        self._leases.refuse_all(_LEAVING)
+        if self._leases.authority.moving:
+            self._leases.stop(_LEAVING)
+        await asyncio.sleep(min(self._leases.stopping_s, STOP_REPEAT_S))
+        await asyncio.gather(*(endpoint.close(_LEAVING, LEAVE_S) for endpoint in self._endpoints))
         self._publish_status()
-        self._commands.close()
+        self._leases.close()
 
     # Links
 
@@ -135,14 +155,14 @@ class Device:
         if session.over:
             if session.version is not None:
                 self._lost.value += len(session.outbox)
-                self._commands.forbid("robot lost")
+                self._leases.hold_back("robot lost", stops=False)
                 self._questions.refuse_all("the robot was lost")
         elif session.state is State.ESTABLISHED and session is not self._greeted:
             self._greeted = session
             with contextlib.suppress(Refused):  # whoever drove it before, it stands now
-                self._commands.stand_still()
+                self._leases.stand_still()
         elif busy != self._busy:
-            self._commands.halt(self._busy or "no longer busy")
+            self._leases.hold_back(self._busy or "no longer busy", stops=True)
 
     def _pump(self) -> None:
         for endpoint in self._endpoints:
@@ -153,8 +173,8 @@ class Device:
             endpoint.resume()
 
     def _on_bus(self, connected: bool) -> None:
-        if not connected and self._commands.moving:
-            self._commands.halt("bus lost")
+        if not connected:
+            self._leases.bus_lost()
 
     # Telemetry
 
@@ -234,7 +254,7 @@ class Device:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self._publish_status()
-            self._commands.report()
+            self._leases.beat()
 
     # Queries
 

@@ -6,7 +6,19 @@ opened, so that whatever needs no bus starts without it.
 
 from __future__ import annotations
 
-from zbridge.bus.interface import Answer, Batch, Bus, BusSettings, Handle, Lane, Publisher, Question, Sample, Tls
+from zbridge.bus.interface import (
+    Answer,
+    Batch,
+    Bus,
+    BusSettings,
+    Handle,
+    Lane,
+    LaneOf,
+    Publisher,
+    Question,
+    Sample,
+    Tls,
+)
 from zbridge.metrics import Metrics
 
 __all__ = [
@@ -16,6 +28,7 @@ __all__ = [
     "BusSettings",
     "Handle",
     "Lane",
+    "LaneOf",
     "Publisher",
     "Question",
     "Sample",

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
-from zbridge.bus.interface import Answer, Batch, Handle, Lane, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, Handle, Lane, LaneOf, Publisher, Question, Sample
 from zbridge.fleet.topics import Topic
 
 H = TypeVar("H", bound=Handle)
@@ -89,7 +89,12 @@ class FakeBus:
         self._relief.append(handler)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        lane: Lane | LaneOf = Lane.OTHER,
+        history: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
         self._shared.subscribers.append(entry)
@@ -99,7 +104,7 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
         entry = (key, handler)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
@@ -115,10 +120,27 @@ class FakeBus:
 
     def announce(self, key: str) -> Handle:
         self._shared.tokens.append(key)
-        return self._keep(_FakeHandle(lambda: self._shared.tokens.remove(key)))
+        self._shared.tell(key, True)
+
+        def withdraw() -> None:
+            self._shared.tokens.remove(key)
+            self._shared.tell(key, False)
+
+        return self._keep(_FakeHandle(withdraw))
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         return sorted({token for token in self._shared.tokens if matches(key_expr, token)})
+
+    def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
+        entry = (key_expr, handler)
+        self._shared.watchers.append(entry)
+        for token in tuple(self._shared.tokens):
+            if matches(key_expr, token):
+                handler(token, True)
+        return self._keep(_FakeHandle(lambda: self._shared.watchers.remove(entry)))
+
+    async def flush(self) -> None:
+        pass
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
@@ -149,8 +171,15 @@ class _Shared:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
         self.queryables: list[tuple[str, Callable[[Question], None]]] = []
         self.tokens: list[str] = []
+        self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self.last: dict[str, bytes] = {}
         self.history: list[Sample] = []
+
+    def tell(self, key: str, alive: bool) -> None:
+        """Tell those who watch that a liveliness token came or went."""
+        for key_expr, handler in tuple(self.watchers):
+            if matches(key_expr, key):
+                handler(key, alive)
 
 
 class _FakeHandle:

@@ -99,6 +99,10 @@ class Lane(Enum):
     OTHER = 2
 
 
+LaneOf = Callable[[bytes | None], Lane]
+"""Chooses a sample's lane by its attachment; called on the bus's own threads, so it must be quick and sure."""
+
+
 class Bus(Protocol):
     """What gateways and commands use of Zenoh. Handlers are called on the event loop's thread."""
 
@@ -116,11 +120,16 @@ class Bus(Protocol):
         """Call ``handler`` when a source that was asked to pause may go on."""
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        lane: Lane | LaneOf = Lane.OTHER,
+        history: bool = False,
     ) -> Handle:
         """Take samples by way of a lane; ``history`` asks for last values too."""
 
-    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
@@ -131,6 +140,12 @@ class Bus(Protocol):
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         """List the liveliness tokens that exist."""
+
+    def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
+        """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+
+    async def flush(self) -> None:
+        """Wait until what was given to be published is with the bus; raise BusError where that takes too long."""
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""

@@ -19,7 +19,7 @@ import zenoh
 import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, LaneOf, Publisher, Question, Sample
 from zbridge.bus.writer import Writer
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
@@ -34,6 +34,8 @@ PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 LEAVE_S = 0.4
 """Longest time leaving the bus takes."""
+FLUSH_S = 2.0
+"""Longest time the bus may take to accept what blocks."""
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
@@ -139,13 +141,27 @@ class ZenohBus:
         self._relief.append(handler)
 
     def subscribe(
-        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane = Lane.OTHER, history: bool = False
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        lane: Lane | LaneOf = Lane.OTHER,
+        history: bool = False,
     ) -> Handle:
         """Take samples by way of a lane; ``history`` asks for last values too."""
         inbox = self._inbox
 
-        def store(sample: zenoh.Sample) -> None:
-            inbox.put(handler, sample, _read_sample, lane)
+        if isinstance(lane, Lane):
+
+            def store(sample: zenoh.Sample) -> None:
+                inbox.put(handler, sample, _read_sample, lane)
+        else:
+
+            def store(sample: zenoh.Sample) -> None:
+                attachment = sample.attachment
+                inbox.put(
+                    handler, sample, _read_sample, lane(attachment.to_bytes() if attachment is not None else None)
+                )
 
         if not history:
             return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
@@ -154,12 +170,12 @@ class ZenohBus:
             _Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
         )
 
-    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards."""
         inbox, writer = self._inbox, self._writer
 
         def store(query: zenoh.Query) -> None:
-            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), Lane.OTHER)
+            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), lane)
 
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
@@ -190,6 +206,36 @@ class ZenohBus:
             lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
         )
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
+        """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+        inbox = self._inbox
+
+        def tell(change: tuple[str, bool]) -> None:
+            handler(*change)
+
+        def store(sample: zenoh.Sample) -> None:
+            inbox.put(tell, sample, _read_change, Lane.STOP)
+
+        return self._keep(_Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
+
+    async def flush(self) -> None:
+        """Wait until what was given to be published so far was handed to the bus."""
+        loop = self._loop
+        written: asyncio.Future[None] = loop.create_future()
+
+        def tell() -> None:
+            if not written.done():
+                written.set_result(None)
+
+        def ring() -> None:
+            loop.call_soon_threadsafe(tell)
+
+        self._writer.put(ring)
+        try:
+            await asyncio.wait_for(written, FLUSH_S)
+        except TimeoutError:
+            raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
@@ -276,6 +322,10 @@ def _options(topic: Topic) -> dict[str, Any]:
 def _read_sample(raw: zenoh.Sample) -> Sample:
     attachment = raw.attachment
     return Sample(str(raw.key_expr), raw.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None)
+
+
+def _read_change(raw: zenoh.Sample) -> tuple[str, bool]:
+    return str(raw.key_expr), raw.kind == zenoh.SampleKind.PUT
 
 
 def _read_reply(reply: zenoh.Reply) -> Answer:

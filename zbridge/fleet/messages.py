@@ -191,6 +191,11 @@ class Motor(FleetMessage, frozen=True):
 
     value: float
 
+    @property
+    def moving(self) -> bool:
+        """Tell motion from neutral; of a linear motor nobody here knows where it stands, so it counts as motion."""
+        return bool(self.value)
+
 
 class Mode(FleetMessage, frozen=True):
     """Who moves the robot: nobody, a person, or the robot itself."""
@@ -213,3 +218,41 @@ class SensorSetting(FleetMessage, frozen=True):
 
 class Query(FleetMessage, frozen=True):
     """A question without fields."""
+
+
+class Acquire(FleetMessage, frozen=True):
+    """Ask for the lease of a robot, or take it over.
+
+    who: whom others are shown as the holder. priority: a higher one is given the robot of a lower one.
+    lease_s, deadman_s: wishes in seconds, capped by the robot's configuration and its default where None.
+    alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``, whose loss ends the lease.
+    """
+
+    who: str
+    priority: int = 0
+    lease_s: float | None = None
+    deadman_s: float | None = None
+    alive: str | None = None
+
+
+class LeaseToken(FleetMessage, frozen=True):
+    """Renew or release the lease that ``token`` is of."""
+
+    token: bytes
+
+
+class Lease(FleetMessage, frozen=True):
+    """The answer to every question about the lease. token: 16 bytes, for the holder alone; the rest for everybody."""
+
+    ok: bool
+    token: bytes | None = None
+    expires_in_s: float | None = None
+    holder: str | None = None
+    reason: str | None = None
+
+
+class Authorization(msgspec.Struct, frozen=True):
+    """The attachment of a command: the token of the lease, and a number that rises with every command."""
+
+    token: bytes
+    seq: Annotated[int, msgspec.Meta(ge=0)]

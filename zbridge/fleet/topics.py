@@ -14,10 +14,12 @@ from urllib.parse import unquote
 import msgspec
 
 from zbridge.fleet.messages import (
+    Acquire,
     Control,
     Devices,
     Drive,
     FleetMessage,
+    LeaseToken,
     Map,
     Mode,
     Motion,
@@ -151,13 +153,17 @@ CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND)
 
 RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
 RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
+RPC_ACQUIRE = Topic("@rpc/control/acquire", Acquire, Delivery.QUERY)
+RPC_TAKEOVER = Topic("@rpc/control/takeover", Acquire, Delivery.QUERY)
+RPC_RENEW = Topic("@rpc/control/renew", LeaseToken, Delivery.QUERY)
+RPC_RELEASE = Topic("@rpc/control/release", LeaseToken, Delivery.QUERY)
 
 _TOPICS = {
     topic.path: topic
     for topic in (
         *(SCAN, MOTION, POSE, TEXT, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
-        *(RPC_MAP, RPC_POSE),
+        *(RPC_MAP, RPC_POSE, RPC_ACQUIRE, RPC_TAKEOVER, RPC_RENEW, RPC_RELEASE),
     )
 }
 _FAMILIES = {

@@ -1,84 +1,318 @@
-"""Control authority: what may move the robot, and when it must be stopped. Sans-IO.
+"""Control authority: who may move the robot, and when it must be stopped. Sans-IO, time is an argument.
 
-This is where the lease will sit; the deadman is here from the first day. Motion that is not renewed within
-``deadman_s`` ends with a stop. After a stop, of whatever cause, only a neutral drive makes motion possible
-again: nobody's stale stick moves a robot that has just been stopped.
-
-    state      motion             neutral   stop, deadman, robot or bus lost
-    free       applied            applied   -> stopped
-    stopped    refused            -> free   stopped
+One lease per robot. What calls decide comes back at once (a lease, or Refused); what follows from them, and
+from time going by, is in :meth:`Authority.events`: what to write down, and where an event ``stops``, the
+robot is to be sent its stop. The transition table is in ``docs/control.md``.
 """
 
 from __future__ import annotations
 
+import hmac
 import math
 from collections import OrderedDict
+from collections.abc import Callable
+from enum import Enum
+
+import msgspec
 
 from zbridge.errors import Refused
-from zbridge.fleet.messages import Control, Refusal
+from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
 
 REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
-
-
+TOKEN_BYTES = 16
+ENDED = 16
+"""Ended leases whose holders can still be told why."""
+LEAST_S = 0.01
+"""The shortest lease or deadman that can be asked for, seconds."""
 _NAMED, _EXPLAINED = 64, 200
-"""Characters of a command's name and of a reason that are kept."""
+"""Characters of a name and of a reason that are kept."""
+
+_read_authorization = msgspec.msgpack.Decoder(Authorization).decode
+
+
+class What(Enum):
+    """What happened to the right to drive."""
+
+    ACQUIRED = "acquired"
+    TAKEN_OVER = "taken over"
+    RELEASED = "released"
+    REFUSED = "refused"
+    STOPPED = "stopped"
+    ENDED = "ended"
+
+
+class Event(msgspec.Struct, frozen=True):
+    """Something to write down; where it ``stops``, the robot is to be sent its stop."""
+
+    what: What
+    who: str | None = None
+    reason: str | None = None
+    priority: int | None = None
+    command: str | None = None
+    stops: bool = False
+
+    def __str__(self) -> str:
+        who = f" {self.who}" if self.who else ""
+        command = f" {self.command}" if self.command else ""
+        return f"{self.what.value}{who}{command}{f' ({self.reason})' if self.reason else ''}"
+
+
+class _Holder(msgspec.Struct):
+    who: str
+    priority: int
+    token: bytes
+    lease_s: float
+    deadman_s: float
+    alive: str | None
+    expires_at: float
+    seq: int = -1
+
+    @property
+    def described(self) -> str:
+        return f"{self.who} (priority {self.priority})"
 
 
 class Authority:
-    """Decides on commands and watches over motion. ``deadman_s``: seconds that motion outlives its command."""
+    """The lease of one robot, and the watch over its motion.
 
-    def __init__(self, deadman_s: float) -> None:
+    lease_s, deadman_s: the most a holder may ask for, and what it gets without asking, in seconds.
+    new_token: gives TOKEN_BYTES bytes that nobody can guess.
+    """
+
+    def __init__(self, lease_s: float, deadman_s: float, new_token: Callable[[], bytes]) -> None:
+        self.lease_s = lease_s
         self.deadman_s = deadman_s
-        self.moving = False
         self.on_its_own = False
         """Whether the robot was told to move without being driven: no deadman, but every other stop."""
-        self.stop_reason: str | None = None
+        self.token: bytes | None = None
+        """The token of the lease that is held; only for sorting what comes in."""
+        self._new_token = new_token
+        self._holder: _Holder | None = None
+        self._stopped = False
+        self._held_back: str | None = None
+        self._moving: set[str] = set()
         self._stop_at = math.inf
+        self._ended: OrderedDict[bytes, tuple[str, str]] = OrderedDict()
         self._refusals: OrderedDict[tuple[str | None, str, str], int] = OrderedDict()
+        self._events: list[Event] = []
 
     def __repr__(self) -> str:
-        return f"<Authority {'moving' if self.moving else self.stop_reason or 'free'}>"
+        return f"<Authority {self.state}{f' by {self._holder.who}' if self._holder else ''}>"
 
-    def admit(self, *, moving: bool) -> None:
-        """Raise Refused where a drive command must not be carried out now."""
-        if moving and self.stop_reason is not None:
-            raise Refused(f"stopped ({self.stop_reason}): send a neutral drive first")
+    @property
+    def state(self) -> str:
+        """``free``, ``held`` or ``stopped``."""
+        return "held" if self._holder else "stopped" if self._stopped else "free"
 
-    def applied(self, *, moving: bool, now: float) -> None:
-        """Take note of a drive command that was carried out."""
-        self.moving = moving
-        self._stop_at = now + self.deadman_s if moving else math.inf
-        if not moving:
-            self.stop_reason = None
+    @property
+    def moving(self) -> bool:
+        """Whether the robot was told to move, or to move on its own, and not yet to stop."""
+        return bool(self._moving) or self.on_its_own
 
-    def stopped(self, reason: str) -> None:
-        """Take note that the robot is being stopped, or is out of reach."""
-        self.moving = self.on_its_own = False
-        self._stop_at = math.inf
-        self.stop_reason = reason
+    # The lease
 
-    def deadline(self) -> float | None:
-        """Tell when :meth:`overdue` may become true."""
-        return None if self._stop_at == math.inf else self._stop_at
+    def acquire(self, request: Acquire, now: float) -> Lease:
+        """Give the lease of a robot that is free or stopped, or held with a lower priority."""
+        self.expire(now)
+        holder = self._holder
+        if holder is not None and request.priority <= holder.priority:
+            self.refuse("acquire", f"held by {holder.described}", request.who)
+            return self._denied(f"held by {holder.described}", now)
+        return self._grant(request, What.ACQUIRED, now)
 
-    def overdue(self, now: float) -> bool:
-        """Tell whether the robot moves without a fresh command."""
-        return now >= self._stop_at
+    def takeover(self, request: Acquire, now: float) -> Lease:
+        """Give the lease to whoever asks; the one that had it has lost it, and the robot is stopped."""
+        self.expire(now)
+        return self._grant(request, What.TAKEN_OVER, now)
+
+    def renew(self, token: bytes, now: float) -> Lease:
+        """Put the end of a lease off."""
+        self.expire(now)
+        holder = self._holder
+        if holder is None or not hmac.compare_digest(holder.token, token):
+            return self._denied(self._why_not(token), now)
+        holder.expires_at = now + holder.lease_s
+        return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
+
+    def release(self, token: bytes, now: float) -> Lease:
+        """Give a lease back; a robot that moves is stopped."""
+        self.expire(now)
+        holder = self._holder
+        if holder is None or not hmac.compare_digest(holder.token, token):
+            return self._denied(self._why_not(token), now)
+        self._end("released", What.RELEASED, stops=self.moving)
+        self._stopped = False
+        return Lease(ok=True)
+
+    # Commands
+
+    def admit(self, attachment: bytes | None, now: float) -> str:
+        """Give the holder whose command this is, and use its number up; raise Refused where it is nobody's."""
+        self.expire(now)
+        if attachment is None:
+            raise Refused("no lease: acquire first")
+        try:
+            shown = _read_authorization(attachment)
+        except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+            raise Refused("malformed attachment: expected {token, seq}") from error
+        holder = self._holder
+        if holder is None or not hmac.compare_digest(holder.token, shown.token):
+            raise Refused(self._why_not(shown.token))
+        if shown.seq <= holder.seq:
+            raise Refused("repeated or out of order")
+        holder.seq = shown.seq
+        holder.expires_at = now + holder.lease_s
+        if self._moving:
+            self._stop_at = now + holder.deadman_s
+        return holder.who
+
+    def require_motion(self) -> None:
+        """Raise Refused where the holder must send neutral before the robot moves."""
+        if self._held_back is not None:
+            raise Refused(f"{self._held_back}: send a neutral drive first")
+
+    def applied(self, part: str, now: float, *, moving: bool) -> None:
+        """Take note that the holder's command for one part of the robot was carried out."""
+        if moving:
+            self._moving.add(part)
+        else:
+            self._moving.discard(part)
+            self._held_back = None
+        deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
+        self._stop_at = now + deadman_s if self._moving else math.inf
+
+    def owner(self, attachment: bytes | None) -> str | None:
+        """Tell whose a refused command was, as far as its token shows."""
+        try:
+            token = _read_authorization(attachment or b"").token
+        except (msgspec.MsgspecError, RecursionError, ValueError):
+            return None
+        if self._holder is not None and hmac.compare_digest(self._holder.token, token):
+            return self._holder.who
+        return self._ended.get(token, (None, ""))[0]
 
     def refuse(self, command: str, reason: str, who: str | None = None) -> None:
         """Count a refusal; it shows on ``control``."""
-        key = (who, command[:_NAMED], reason[:_EXPLAINED])
+        who, command, reason = who and who[:_NAMED], command[:_NAMED], reason[:_EXPLAINED]
+        key = (who, command, reason)
         self._refusals[key] = self._refusals.pop(key, 0) + 1
         if len(self._refusals) > REFUSALS:
             self._refusals.popitem(last=False)
+        self._events.append(Event(What.REFUSED, who, reason, command=command))
 
-    def report(self) -> Control:
+    # Stops
+
+    def stop(self, reason: str) -> None:
+        """Stop the robot and end the lease, whoever asks: nobody drives before acquiring anew."""
+        self._end(reason, What.STOPPED, stops=True)
+        self._stopped = True
+
+    def hold_back(self, reason: str, *, stops: bool = True) -> None:
+        """Stop the robot, or know that it stands; the lease stays, motion needs a neutral drive."""
+        if stops or self.moving or self._held_back != reason:
+            self._events.append(Event(What.STOPPED, self._holder.who if self._holder else None, reason, stops=stops))
+        self._still()
+        self._held_back = reason
+
+    def vanished(self, alive: str) -> None:
+        """Take note that a liveliness token is gone: if the holder named it, the lease ends."""
+        if self._holder is not None and self._holder.alive == alive:
+            self._lose("holder lost")
+
+    def bus_lost(self) -> None:
+        """Take note that nobody can be heard any more: the lease ends."""
+        if self._holder is not None:
+            self._lose("bus lost")
+
+    # Time
+
+    def deadline(self) -> float | None:
+        """Tell when :meth:`expire` has something to do."""
+        expires_at = self._holder.expires_at if self._holder else math.inf
+        earliest = min(self._stop_at, expires_at)
+        return None if earliest == math.inf else earliest
+
+    def expire(self, now: float) -> None:
+        """Do what is due: end a lease that was not renewed, stop motion that was not."""
+        if self._holder is not None and now >= self._holder.expires_at:
+            self._lose("lease expired")
+        elif now >= self._stop_at:
+            self.hold_back("deadman")
+
+    def events(self) -> list[Event]:
+        """Give what happened since the last call, in order."""
+        events, self._events = self._events, []
+        return events
+
+    def report(self, now: float) -> Control:
         """Say who drives and what was refused."""
+        holder = self._holder
         return Control(
-            state="free" if self.stop_reason is None else "stopped",
+            state=self.state,  # type: ignore[arg-type]
+            holder=holder.who if holder else None,
+            priority=holder.priority if holder else None,
+            expires_in_s=max(0.0, holder.expires_at - now) if holder else None,
             refusals=tuple(
                 Refusal(who=who, command=command, reason=reason, count=count)
                 for (who, command, reason), count in self._refusals.items()
             ),
         )
+
+    def _grant(self, request: Acquire, what: What, now: float) -> Lease:
+        try:
+            if not request.who:
+                raise Refused("who = '': expected a name that others are shown")
+            lease_s = _wish("lease_s", request.lease_s, self.lease_s)
+            deadman_s = _wish("deadman_s", request.deadman_s, self.deadman_s)
+        except Refused as refusal:
+            self.refuse(what.value, str(refusal), request.who)
+            return self._denied(str(refusal), now)
+        who = request.who[:_NAMED]
+        if self._holder is not None:
+            self._end(f"taken over by {who}", What.ENDED, stops=self.moving)
+        token = self._new_token()
+        self._holder = _Holder(who, request.priority, token, lease_s, deadman_s, request.alive, now + lease_s)
+        self.token = token
+        self._stopped, self._held_back = False, None
+        self._events.append(Event(what, who, priority=request.priority))
+        return Lease(ok=True, token=token, expires_in_s=lease_s, holder=who)
+
+    def _denied(self, reason: str, now: float) -> Lease:
+        holder = self._holder
+        expires_in_s = max(0.0, holder.expires_at - now) if holder else None
+        return Lease(ok=False, expires_in_s=expires_in_s, holder=holder.who if holder else None, reason=reason)
+
+    def _why_not(self, token: bytes) -> str:
+        ended = self._ended.get(token)
+        if ended is not None:
+            return f"the lease has ended ({ended[1]})"
+        return f"held by {self._holder.described}" if self._holder else "no lease: acquire first"
+
+    def _lose(self, reason: str) -> None:
+        self._end(reason, What.ENDED, stops=self.moving)
+        self._stopped = True
+
+    def _end(self, reason: str, what: What, *, stops: bool) -> None:
+        holder, self._holder, self.token = self._holder, None, None
+        self._still()
+        self._held_back = None
+        if holder is not None:
+            self._ended[holder.token] = (holder.who, reason)
+            if len(self._ended) > ENDED:
+                self._ended.popitem(last=False)
+        self._events.append(Event(what, holder.who if holder else None, reason, stops=stops))
+
+    def _still(self) -> None:
+        self._moving.clear()
+        self.on_its_own = False
+        self._stop_at = math.inf
+
+
+def _wish(name: str, wish_s: float | None, most_s: float) -> float:
+    """Cap what was asked for; raise Refused where it is no time."""
+    if wish_s is None:
+        return most_s
+    if not wish_s >= LEAST_S:
+        raise Refused(f"{name} = {wish_s:g}: expected at least {LEAST_S:g}")
+    return min(wish_s, most_s)

@@ -4,4 +4,23 @@ This package is the core. It knows no robot: each protocol is a package of its o
 entry-point group ``zbridge.protocols``.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from zbridge.client import blocking as blocking
+    from zbridge.client import connect as connect
+
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Load the client when a program asks for it: a gateway has no use for it."""
+    match name:
+        case "connect":
+            return import_module("zbridge.client").connect
+        case "blocking":
+            return import_module("zbridge.client.blocking")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -5,6 +5,8 @@ ZbridgeError
 ├── EncodeError      we were asked to send what the protocol cannot say
 ├── PayloadError     a payload on the bus is not the message its key promises
 ├── Refused          a command was understood and will not be carried out
+│   ├── Held         ... because somebody else holds the robot
+│   └── LeaseLost    ... because the lease it was given under has ended
 ├── LinkError        a transport connection could not be made
 ├── BusError         the bus could not be opened or asked
 └── ConfigError      a configuration cannot be used
@@ -29,6 +31,18 @@ class PayloadError(ZbridgeError):
 
 class Refused(ZbridgeError):
     """A command will not be carried out; the text says why, for people."""
+
+
+class Held(Refused):
+    """Somebody else holds the robot; ``holder`` names them."""
+
+    def __init__(self, text: str, holder: str) -> None:
+        super().__init__(text)
+        self.holder = holder
+
+
+class LeaseLost(Refused):
+    """The lease has ended; the text says why, and who holds the robot now."""
 
 
 class LinkError(ZbridgeError):

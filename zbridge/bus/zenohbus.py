@@ -39,6 +39,8 @@ FLUSH_S = 2.0
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
+_TIDY = 64
+
 _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
@@ -111,6 +113,7 @@ class ZenohBus:
         self._writer = Writer("states", metrics, lossless=self._lossless, relieved=self._relieve)
         self._streams = Writer("streams", metrics, lossless=self._lossless, relieved=self._relieve)
         self._handles: list[Handle] = []
+        self._tidy_at = _TIDY
 
     def __repr__(self) -> str:
         return f"<ZenohBus {self._session.zid()}>"
@@ -287,7 +290,11 @@ class ZenohBus:
                 self._loop.call_soon_threadsafe(handler)
 
     def _keep(self, handle: H) -> H:
+        """Remember what is to be taken back at the end; a client's comings and goings must not add up."""
         self._handles.append(handle)
+        if len(self._handles) >= self._tidy_at:
+            self._handles = [kept for kept in self._handles if not getattr(kept, "closed", False)]
+            self._tidy_at = 2 * len(self._handles) + _TIDY
         return handle
 
     async def _collect(self, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
@@ -340,6 +347,11 @@ class _Declared:
 
     def __init__(self, entity: Any) -> None:
         self._entity = entity
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was taken back."""
+        return self._entity is None
 
     def close(self) -> None:
         entity, self._entity = self._entity, None

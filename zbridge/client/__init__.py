@@ -1,0 +1,51 @@
+"""The Python client: see and drive robots on the bus from programs, notebooks and scripts.
+
+    async with zbridge.connect(endpoints=["tcp/127.0.0.1:7447"]) as fleet:
+        robot = fleet["r1"]
+        async for scan in robot.scan:
+            ...
+        async with robot.control() as drive:
+            await drive(forward=0.3)
+
+Knows no robot's protocol and nothing of gateways' insides: only keys and fleet messages.
+:mod:`zbridge.client.blocking` is the same for programs without an event loop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Sequence
+
+from zbridge.bus import BusSettings, Tls, open_bus
+from zbridge.client.driver import Driver
+from zbridge.client.feed import Feed, StateFeed
+from zbridge.client.fleet import Fleet, Robot
+from zbridge.metrics import Metrics
+
+__all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect"]
+
+LOCAL_ROUTER = "tcp/127.0.0.1:7447"
+"""Where a router on this machine is looked for."""
+
+
+def bus_settings(endpoints: Sequence[str] = (), tls: Tls | None = None) -> BusSettings:
+    """Choose how a program joins the bus: the given endpoints, else multicast and the router on this machine."""
+    if endpoints:
+        return BusSettings(connect=tuple(endpoints), multicast=False, tls=tls)
+    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,), tls=tls)
+
+
+@contextlib.asynccontextmanager
+async def connect(
+    endpoints: Sequence[str] = (), *, realm: str = "fleet", tls: Tls | None = None
+) -> AsyncIterator[Fleet]:
+    """Be on the bus while the context lasts.
+
+    endpoints: of Zenoh, ``tcp/192.168.0.2:7447``; without any, the local network and the router on this machine.
+    Raises BusError where no given endpoint can be reached.
+    """
+    bus = await open_bus(bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
+    try:
+        yield Fleet(bus, realm)
+    finally:
+        await bus.close()

@@ -1,0 +1,273 @@
+"""The client for scripts and notebooks: the same robots without ``async``, by an event loop on a thread.
+
+with zbridge.blocking.connect(endpoints=["tcp/127.0.0.1:7447"]) as fleet:
+    robot = fleet["r1"]
+    with robot.control() as drive:
+        drive.during(2.0, forward=0.3)
+    for pose in robot.pose:
+        ...
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+from collections.abc import Coroutine, Iterator, Sequence
+from typing import Any, Generic, TypeVar
+
+import zbridge.client
+from zbridge.bus import Tls
+from zbridge.client import driver, feed
+from zbridge.client import fleet as fleets
+from zbridge.errors import BusError, LeaseLost, Refused
+from zbridge.fleet.messages import (
+    Control,
+    Devices,
+    FleetMessage,
+    Map,
+    Motion,
+    Pose,
+    Raw,
+    Reading,
+    Scan,
+    Scanner,
+    SensorSetting,
+    Status,
+    Switch,
+    Text,
+)
+
+T = TypeVar("T")
+F = TypeVar("F", bound=FleetMessage)
+
+
+class _Loop:
+    """An event loop on a thread of its own."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="zbridge-client", daemon=True)
+        self._thread.start()
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine there and wait for it; interrupted, it is cancelled."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            return future.result()
+        except BaseException:
+            future.cancel()
+            raise
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+
+@contextlib.contextmanager
+def connect(endpoints: Sequence[str] = (), *, realm: str = "fleet", tls: Tls | None = None) -> Iterator[Fleet]:
+    """Be on the bus while the context lasts; see :func:`zbridge.client.connect`."""
+    joining = zbridge.client.connect(endpoints, realm=realm, tls=tls)
+    with contextlib.closing(_Loop()) as loop, _entered(loop, joining) as fleet:
+        yield Fleet(loop, fleet)
+
+
+class Fleet:
+    """All robots of one realm: ``fleet["r1"]``."""
+
+    def __init__(self, loop: _Loop, fleet: fleets.Fleet) -> None:
+        self._loop = loop
+        self._fleet = fleet
+
+    def __repr__(self) -> str:
+        return repr(self._fleet)
+
+    def __getitem__(self, name: str) -> Robot:
+        """Give the robot of this name, on the bus or not."""
+        return Robot(self._loop, self._fleet[name])
+
+    def robots(self) -> dict[str, Status | None]:
+        """List the robots that have a gateway or a status."""
+        return self._loop.run(self._fleet.robots())
+
+    def stop(self) -> dict[str, Refused | BusError | None]:
+        """Stop every robot that has a gateway; give for each what is wrong, None where it stands."""
+        return self._loop.run(self._fleet.stop())
+
+
+class Feed(Generic[T]):
+    """One key, or several: ``for message in feed``."""
+
+    def __init__(self, loop: _Loop, source: feed.Feed[T]) -> None:
+        self._loop = loop
+        self._feed = source
+
+    def __repr__(self) -> str:
+        return repr(self._feed)
+
+    def __iter__(self) -> Iterator[T]:
+        messages: Any = self._feed.__aiter__()
+
+        async def following() -> T:
+            message: T = await anext(messages)
+            return message
+
+        try:
+            while True:
+                yield self._loop.run(following())
+        finally:
+            self._loop.run(messages.aclose())
+
+
+class StateFeed(Feed[F]):
+    """A key that keeps its last value."""
+
+    def __init__(self, loop: _Loop, source: feed.StateFeed[F]) -> None:
+        super().__init__(loop, source)
+        self._state = source
+
+    def last(self, timeout_s: float = 1.0) -> F | None:
+        """Give the last value; None where nobody has published one."""
+        return self._loop.run(self._state.last(timeout_s))
+
+
+class ControlFeed(StateFeed[Control]):
+    """The state ``control``; called, the right to drive."""
+
+    def __init__(self, loop: _Loop, source: fleets.ControlFeed) -> None:
+        super().__init__(loop, source)
+        self._control = source
+
+    @contextlib.contextmanager
+    def __call__(self, who: str | None = None, **wishes: Any) -> Iterator[Driver]:
+        """Hold the lease while the context lasts; see :meth:`zbridge.client.fleet.ControlFeed.__call__`."""
+        with _entered(self._loop, self._control(who, **wishes)) as holder:
+            yield Driver(self._loop, holder)
+
+
+class Robot:
+    """One robot: a feed for every key it publishes, questions, commands that need no lease, and the lease."""
+
+    def __init__(self, loop: _Loop, robot: fleets.Robot) -> None:
+        self._loop = loop
+        self._robot = robot
+        self.name = robot.name
+        self.scan: Feed[Scan] = Feed(loop, robot.scan)
+        self.motion: Feed[Motion] = Feed(loop, robot.motion)
+        self.pose: Feed[Pose] = Feed(loop, robot.pose)
+        self.text: Feed[Text] = Feed(loop, robot.text)
+        self.status: StateFeed[Status] = StateFeed(loop, robot.status)
+        self.scanner: StateFeed[Scanner] = StateFeed(loop, robot.scanner)
+        self.map: StateFeed[Map] = StateFeed(loop, robot.map)
+        self.lidar: StateFeed[Switch] = StateFeed(loop, robot.lidar)
+        self.camera: StateFeed[Switch] = StateFeed(loop, robot.camera)
+        self.devices: StateFeed[Devices] = StateFeed(loop, robot.devices)
+        self.control = ControlFeed(loop, robot.control)
+
+    def __repr__(self) -> str:
+        return repr(self._robot)
+
+    def sensor(self, name: str) -> Feed[Reading]:
+        """Give the feed of one sensor."""
+        return Feed(self._loop, self._robot.sensor(name))
+
+    @property
+    def sensors(self) -> Feed[tuple[str, Reading]]:
+        """All sensors: pairs of name and reading."""
+        return Feed(self._loop, self._robot.sensors)
+
+    def raw(self, protocol: str) -> Feed[Raw]:
+        """Give the legacy messages that no fleet message holds."""
+        return Feed(self._loop, self._robot.raw(protocol))
+
+    def ask_pose(self) -> Pose:
+        """Ask the robot where it is, now."""
+        return self._loop.run(self._robot.ask_pose())
+
+    def ask_map(self) -> Map:
+        """Ask the robot for its map, now."""
+        return self._loop.run(self._robot.ask_map())
+
+    def stop(self) -> None:
+        """Stop the robot and end whatever lease there is; return when its gateway has confirmed it."""
+        self._loop.run(self._robot.stop())
+
+    def set_light(self, on: bool) -> None:
+        """Turn the light on or off."""
+        self._loop.run(self._robot.set_light(on))
+
+    def set_lidar(self, on: bool) -> None:
+        """Turn the lidar on or off."""
+        self._loop.run(self._robot.set_lidar(on))
+
+    def set_camera(self, on: bool) -> None:
+        """Turn the camera on or off."""
+        self._loop.run(self._robot.set_camera(on))
+
+    def say(self, text: str) -> None:
+        """Send the robot a text."""
+        self._loop.run(self._robot.say(text))
+
+    def feed_scan(self, scan: Scan) -> None:
+        """Give the robot simulated lidar data."""
+        self._loop.run(self._robot.feed_scan(scan))
+
+    def set_sensor(self, name: str, setting: SensorSetting) -> None:
+        """Change the settings of a sensor."""
+        self._loop.run(self._robot.set_sensor(name, setting))
+
+
+class Driver:
+    """The lease of one robot: ``drive(forward=0.3)``, again and again, for motion lasts ``deadman_s`` only."""
+
+    def __init__(self, loop: _Loop, holder: driver.Driver) -> None:
+        self._loop = loop
+        self._driver = holder
+
+    def __repr__(self) -> str:
+        return repr(self._driver)
+
+    @property
+    def loss(self) -> LeaseLost | None:
+        """Why the lease was lost, None while it is held."""
+        return self._driver.loss
+
+    def __call__(
+        self, forward: float = 0.0, left: float = 0.0, turn: float = 0.0, *, light: bool | None = None
+    ) -> None:
+        """Drive: fractions of full scale, -1 to 1; all zero is neutral."""
+        self._loop.run(self._driver(forward, left, turn, light=light))
+
+    def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
+        """Drive for so many seconds, then stand."""
+        self._loop.run(self._driver.during(seconds, forward, left, turn))
+
+    def motor(self, name: str, value: float) -> None:
+        """Move one motor: rad/s, or metres for a linear motor."""
+        self._loop.run(self._driver.motor(name, value))
+
+    def mode(self, mode: str) -> None:
+        """Say who moves the robot: ``none``, ``manual`` or ``autonomous``."""
+        self._loop.run(self._driver.mode(mode))
+
+    def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
+        """Send a legacy message that no fleet message holds."""
+        self._loop.run(self._driver.raw(protocol, message_id, body))
+
+
+@contextlib.contextmanager
+def _entered(loop: _Loop, context: contextlib.AbstractAsyncContextManager[T]) -> Iterator[T]:
+    """Be inside an asynchronous context whose loop runs on another thread."""
+
+    async def enter() -> T:
+        return await context.__aenter__()
+
+    async def leave() -> None:
+        await context.__aexit__(None, None, None)
+
+    entered = loop.run(enter())
+    try:
+        yield entered
+    finally:
+        loop.run(leave())

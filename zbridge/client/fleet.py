@@ -1,0 +1,251 @@
+"""The robots on the bus as a program sees them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+from zbridge.bus import Bus, Sample
+from zbridge.client.driver import Driver, default_who, holding
+from zbridge.client.feed import Feed, StateFeed, reader
+from zbridge.errors import BusError, PayloadError, Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import (
+    Acquire,
+    Control,
+    Devices,
+    FleetMessage,
+    Map,
+    Motion,
+    Pose,
+    Query,
+    Raw,
+    Reading,
+    Scan,
+    Scanner,
+    SensorSetting,
+    Status,
+    Stop,
+    Switch,
+    Text,
+)
+from zbridge.fleet.topics import KeySpace, Topic, split_key, unescape
+
+CONFIRM_S = 2.0
+"""Seconds within which a stop must be confirmed."""
+ANSWER_S = 5.0
+"""Longest time a robot is given to answer a question."""
+_STOP_EVERY_S = 0.05
+
+
+class Fleet:
+    """All robots of one realm: ``fleet["r1"]``."""
+
+    def __init__(self, bus: Bus, realm: str = "fleet") -> None:
+        self.realm = realm
+        self._bus = bus
+
+    def __repr__(self) -> str:
+        return f"<Fleet {self.realm}>"
+
+    def __getitem__(self, name: str) -> Robot:
+        """Give the robot of this name, on the bus or not."""
+        return Robot(self._bus, KeySpace(self.realm, name))
+
+    async def robots(self) -> dict[str, Status | None]:
+        """List the robots that have a gateway or a status, by name; None where there is no status yet."""
+        tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
+        robots: dict[str, Status | None] = {split[1]: None for key in tokens if (split := split_key(key))}
+        for answer in await self._bus.ask(f"{self.realm}/*/{topics.STATUS.path}"):
+            split = split_key(answer.key)
+            if split is not None and answer.error is None:
+                with contextlib.suppress(PayloadError):
+                    robots[split[1]] = payloads.decode(Status, answer.payload)
+        return dict(sorted(robots.items()))
+
+    async def stop(self) -> dict[str, Refused | BusError | None]:
+        """Stop every robot that has a gateway; give for each what is wrong, None where it stands."""
+        tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
+        names = sorted({split[1] for key in tokens if (split := split_key(key))})
+        return dict(zip(names, await asyncio.gather(*map(self._stop_one, names)), strict=True))
+
+    async def _stop_one(self, name: str) -> Refused | BusError | None:
+        try:
+            await self[name].stop()
+        except (Refused, BusError) as error:
+            return error
+        return None
+
+
+class ControlFeed(StateFeed[Control]):
+    """The state ``control``; called, the right to drive."""
+
+    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+        super().__init__(bus, keys, topics.CONTROL)
+        self._keys = keys
+
+    @contextlib.asynccontextmanager
+    async def __call__(
+        self,
+        who: str | None = None,
+        *,
+        priority: int = 0,
+        lease_s: float | None = None,
+        deadman_s: float = 0.5,
+        takeover: bool = False,
+        wait_s: float = 5.0,
+    ) -> AsyncIterator[Driver]:
+        """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
+
+        who: shown to others as the holder, ``user@host`` by default. priority: a higher one is given the robot of a
+        lower one. deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
+        takeover: take the robot from whoever drives it. wait_s: how long to wait for the robot's gateway.
+        Raises Held naming the holder, BusError where no gateway answers.
+        """
+        request = Acquire(
+            who=who or default_who(),
+            priority=priority,
+            lease_s=lease_s,
+            deadman_s=deadman_s,
+            alive=f"operator.{self._bus.zid}",
+        )
+        async with holding(self._bus, self._keys, request, takeover=takeover, wait_s=wait_s) as driver:
+            yield driver
+
+
+class Robot:
+    """One robot: a feed for every key it publishes, questions, commands that need no lease, and the lease."""
+
+    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+        self.name = keys.robot
+        self._bus = bus
+        self._keys = keys
+        self.scan: Feed[Scan] = self._feed(topics.SCAN)
+        self.motion: Feed[Motion] = self._feed(topics.MOTION)
+        self.pose: Feed[Pose] = self._feed(topics.POSE)
+        self.text: Feed[Text] = self._feed(topics.TEXT)
+        self.status: StateFeed[Status] = StateFeed(bus, keys, topics.STATUS)
+        self.scanner: StateFeed[Scanner] = StateFeed(bus, keys, topics.SCANNER)
+        self.map: StateFeed[Map] = StateFeed(bus, keys, topics.MAP)
+        self.lidar: StateFeed[Switch] = StateFeed(bus, keys, topics.LIDAR)
+        self.camera: StateFeed[Switch] = StateFeed(bus, keys, topics.CAMERA)
+        self.devices: StateFeed[Devices] = StateFeed(bus, keys, topics.DEVICES)
+        self.control = ControlFeed(bus, keys)
+
+    def __repr__(self) -> str:
+        return f"<Robot {self._keys.realm}/{self.name}>"
+
+    def sensor(self, name: str) -> Feed[Reading]:
+        """Give the feed of one sensor."""
+        return self._feed(topics.SENSOR(name))
+
+    @property
+    def sensors(self) -> Feed[tuple[str, Reading]]:
+        """All sensors: pairs of name and reading."""
+
+        def read(sample: Sample) -> tuple[str, Reading]:
+            return unescape(sample.key.rpartition("/")[2]), payloads.decode(Reading, sample.payload)
+
+        return Feed(self._bus, self._keys.key("sensor/*"), read)
+
+    def raw(self, protocol: str) -> Feed[Raw]:
+        """Give the legacy messages that no fleet message holds."""
+        return self._feed(topics.RAW(protocol))
+
+    # Questions
+
+    async def ask_pose(self) -> Pose:
+        """Ask the robot where it is, now; raise Refused with the gateway's reason, BusError where none answers."""
+        pose: Pose = await self._ask(topics.RPC_POSE, Pose)
+        return pose
+
+    async def ask_map(self) -> Map:
+        """Ask the robot for its map, now; raise Refused with the gateway's reason, BusError where none answers."""
+        answer: Map = await self._ask(topics.RPC_MAP, Map)
+        return answer
+
+    # Commands that everybody may give
+
+    async def stop(self) -> None:
+        """Stop the robot and end whatever lease there is; return when its gateway has confirmed it.
+
+        Raises BusError where none does within 2 s, Refused where the robot cannot be stopped or reached.
+        """
+        refused = _stops_refused(await self.control.last())
+        control = await self._stop_until_shown()
+        if _stops_refused(control) > refused:
+            reason = next(refusal.reason for refusal in control.refusals if refusal.command == "stop")
+            raise Refused(f"{self.name}: cannot be stopped: {reason}")
+        status = await self.status.last()
+        if status is not None and status.state != "established":
+            why = status.reason or "no reason known"
+            raise Refused(f"{self.name}: stop taken, but the robot is {status.state}: {why}")
+
+    async def set_light(self, on: bool) -> None:
+        """Turn the light on or off."""
+        await self._put(topics.CMD_LIGHT, Switch(on))
+
+    async def set_lidar(self, on: bool) -> None:
+        """Turn the lidar on or off."""
+        await self._put(topics.CMD_LIDAR, Switch(on))
+
+    async def set_camera(self, on: bool) -> None:
+        """Turn the camera on or off."""
+        await self._put(topics.CMD_CAMERA, Switch(on))
+
+    async def say(self, text: str) -> None:
+        """Send the robot a text."""
+        await self._put(topics.CMD_TEXT, Text(text))
+
+    async def feed_scan(self, scan: Scan) -> None:
+        """Give the robot simulated lidar data."""
+        await self._put(topics.CMD_SCAN, scan)
+
+    async def set_sensor(self, name: str, setting: SensorSetting) -> None:
+        """Change the settings of a sensor."""
+        await self._put(topics.CMD_SENSOR(name), setting)
+
+    def _feed(self, topic: Topic) -> Feed[Any]:
+        return Feed(self._bus, self._keys.key(topic.path), reader(topic))
+
+    async def _put(self, topic: Topic, message: FleetMessage) -> None:
+        with contextlib.closing(self._bus.publisher(self._keys.key(topic.path), topic)) as publisher:
+            publisher.put(payloads.encode(message))
+            await self._bus.flush()
+
+    async def _ask(self, topic: Topic, message: Any) -> Any:
+        question = payloads.encode(Query())
+        for answer in await self._bus.ask(self._keys.key(topic.path), question, timeout_s=ANSWER_S):
+            if answer.error is not None:
+                raise Refused(f"{self.name}: {answer.error}")
+            return payloads.decode(message, answer.payload)
+        raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
+
+    async def _stop_until_shown(self) -> Control:
+        """Send the stop again and again until ``control`` shows it."""
+        shown: asyncio.Future[Control] = asyncio.get_running_loop().create_future()
+
+        def look(sample: Sample) -> None:
+            with contextlib.suppress(PayloadError):
+                control = payloads.decode(Control, sample.payload)
+                if control.state == "stopped" and not shown.done():
+                    shown.set_result(control)
+
+        with (
+            contextlib.closing(self._bus.subscribe(self.control.key_expr, look)),
+            contextlib.closing(self._bus.publisher(self._keys.key(topics.CMD_STOP.path), topics.CMD_STOP)) as stop,
+        ):
+            for _ in range(int(CONFIRM_S / _STOP_EVERY_S)):
+                stop.put(payloads.encode(Stop()))
+                done, _ = await asyncio.wait((shown,), timeout=_STOP_EVERY_S)
+                if done:
+                    return shown.result()
+        raise BusError(f"{self.name}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
+
+
+def _stops_refused(control: Control | None) -> int:
+    refusals = control.refusals if control is not None else ()
+    return sum(refusal.count for refusal in refusals if refusal.command == "stop")

@@ -1,4 +1,4 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, ls, echo, stop``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, ls, echo, drive, stop``.
 
 Only this package imports typer and rich, and this module does not: a gateway runs for months, and carries none
 of the command line's libraries. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
@@ -18,9 +18,6 @@ from typing import Any, NoReturn
 from zbridge.config import load
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.gateway import Gateway, until_signal
-
-LOCAL_ROUTER = "tcp/127.0.0.1:7447"
-"""Where commands look for a router, and the demo opens one."""
 
 
 def main() -> None:

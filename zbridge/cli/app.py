@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from zbridge.bus import BusSettings
-from zbridge.cli import LOCAL_ROUTER, give_up, run_gateway, run_loop, set_up_log
+from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
+from zbridge.client import bus_settings
 from zbridge.config import load
 from zbridge.gateway import until_signal
 from zbridge.link import Address
@@ -99,7 +99,7 @@ def probe(
 
     set_up_log(verbose=False, level=logging.ERROR)
     found, at = find_protocol(protocol), Address.parse(address)
-    code = run_loop(ask(client_settings(connect), found, at, realm=realm, sure=yes))
+    code = run_loop(ask(bus_settings(connect), found, at, realm=realm, sure=yes))
     if code:
         raise typer.Exit(code)
 
@@ -124,7 +124,7 @@ def ls(
     """List the robots on the bus."""
     from zbridge.cli import bus
 
-    run_loop(bus.list_robots(client_settings(connect), realm, as_json=json))
+    run_loop(bus.list_robots(bus_settings(connect), realm, as_json=json))
 
 
 @app.command()
@@ -137,7 +137,24 @@ def echo(
     """Print what comes on a key, decoded."""
     from zbridge.cli import bus
 
-    run_loop(until_signal(bus.echo(client_settings(connect), key, as_json=json, count=count)))
+    run_loop(until_signal(bus.echo(bus_settings(connect), key, as_json=json, count=count)))
+
+
+@app.command()
+def drive(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)],
+    speed: Annotated[float, typer.Option(help="fraction of full scale", min=0.1, max=1.0)] = 0.3,
+    who: Annotated[str, typer.Option(help="shown to others as the driver; user@host by default")] = "",
+    takeover: Annotated[bool, typer.Option("--takeover", help="take it from whoever drives it")] = False,
+    connect: Connect = [],
+    realm: Realm = "fleet",
+) -> None:
+    """Drive a robot by keyboard: it moves only while a key is held; space stops it."""
+    from zbridge.cli.drive import drive_robot
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    work = drive_robot(bus_settings(connect), realm, robot, speed, who=who or None, takeover=takeover)
+    run_loop(until_signal(work))
 
 
 @app.command()
@@ -152,12 +169,5 @@ def stop(
 
     if bool(robot) == everything:
         give_up(2, "name one ROBOT, or give --all")
-    if not run_loop(bus.stop(client_settings(connect), realm, robot or None)):
+    if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):
         raise typer.Exit(1)
-
-
-def client_settings(connect: list[str]) -> BusSettings:
-    """Choose how a command joins the bus: the given endpoints, else multicast and the local router."""
-    if connect:
-        return BusSettings(connect=tuple(connect), multicast=False)
-    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,))

@@ -15,15 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
-from zbridge.errors import BusError, PayloadError
+from zbridge.client import connect
+from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, FleetMessage, Status, Stop
-from zbridge.fleet.topics import KeySpace, split_key
+from zbridge.fleet.messages import FleetMessage, Status
+from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
 
-CONFIRM_S = 2.0
-"""Seconds within which a stop must be confirmed."""
 _SHOWN = 8
 
 console = Console(highlight=False, soft_wrap=True)
@@ -42,17 +41,10 @@ async def joined(settings: BusSettings) -> AsyncIterator[Bus]:
 
 async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> None:
     """Print every robot that has a gateway or a status."""
-    async with joined(settings) as bus:
-        tokens = await bus.alive(f"{realm}/*/@alive/gateway")
-        answers = await bus.ask(f"{realm}/*/status")
-    robots: dict[str, Status | None] = {split[1]: None for key in tokens if (split := split_key(key))}
-    for answer in answers:
-        split = split_key(answer.key)
-        if split is not None and answer.error is None:
-            with contextlib.suppress(PayloadError):
-                robots[split[1]] = payloads.decode(Status, answer.payload)
+    async with connect(settings=settings, realm=realm) as fleet:
+        robots = await fleet.robots()
     if as_json:
-        for name, status in sorted(robots.items()):
+        for name, status in robots.items():
             fields = msgspec.to_builtins(status) if status is not None else {"state": None}
             console.print(json.dumps({"robot": name, **fields}), markup=False)
     elif robots:
@@ -63,7 +55,7 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
 
 def _robot_table(robots: dict[str, Status | None]) -> Table:
     table = Table("robot", "state", "protocol", "version", "features", "reason", box=None)
-    for name, status in sorted(robots.items()):
+    for name, status in robots.items():
         if status is None:
             table.add_row(name, "?", "", "", "", "the gateway has published no status yet")
         else:
@@ -145,46 +137,13 @@ def _plain(value: Any, *, shorten: bool) -> Any:
 
 async def stop(settings: BusSettings, realm: str, robot: str | None) -> bool:
     """Stop one robot or all; tell whether every one of them confirmed it."""
-    async with joined(settings) as bus:
-        if robot is None:
-            tokens = await bus.alive(f"{realm}/*/@alive/gateway")
-            names = sorted({split[1] for key in tokens if (split := split_key(key))})
-            if not names:
-                errors.print(f"no gateways on {realm}/")
-                return False
+    async with connect(settings=settings, realm=realm) as fleet:
+        outcomes = await fleet.stop([robot] if robot is not None else None)
+    for name, error in outcomes.items():
+        if error is None:
+            console.print(f"{name}: stopped")
         else:
-            names = [robot]
-        confirmed = await asyncio.gather(*(_stop_one(bus, KeySpace(realm, name)) for name in names))
-    return all(confirmed)
-
-
-async def _stop_one(bus: Bus, keys: KeySpace) -> bool:
-    """Send the stop again and again until ``control`` shows it."""
-    publisher = bus.publisher(keys.key(topics.CMD_STOP.path), topics.CMD_STOP)
-    payload = payloads.encode(Stop())
-    deadline = asyncio.get_running_loop().time() + CONFIRM_S
-    while asyncio.get_running_loop().time() < deadline:
-        publisher.put(payload)
-        await asyncio.sleep(0.05)
-        with contextlib.suppress(BusError, PayloadError):
-            for answer in await bus.ask(keys.key(topics.CONTROL.path), timeout_s=0.3):
-                if answer.error is None and payloads.decode(Control, answer.payload).state == "stopped":
-                    return await _reached(bus, keys, payloads.decode(Control, answer.payload))
-    errors.print(f"{keys.robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
-    return False
-
-
-async def _reached(bus: Bus, keys: KeySpace, control: Control) -> bool:
-    """Say whether the stop that a gateway took could reach its robot."""
-    for refusal in control.refusals:
-        if refusal.command == "stop":
-            errors.print(f"{keys.robot}: cannot be stopped: {refusal.reason}")
-            return False
-    for answer in await bus.ask(keys.key(topics.STATUS.path), timeout_s=0.3):
-        status = payloads.decode(Status, answer.payload)
-        if status.state != "established":
-            why = status.reason or "no reason known"
-            errors.print(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
-            return False
-    console.print(f"{keys.robot}: stopped")
-    return True
+            errors.print(str(error))
+    if not outcomes:
+        errors.print(f"no gateways on {realm}/")
+    return bool(outcomes) and not any(outcomes.values())

@@ -20,12 +20,12 @@ from rich.live import Live
 from rich.table import Table
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
-from zbridge.cli import LOCAL_ROUTER
-from zbridge.errors import BusError, PayloadError, ZbridgeError
+from zbridge.client import LOCAL_ROUTER, Fleet, Robot
+from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, Pose, Status
-from zbridge.fleet.topics import KeySpace, split_key
+from zbridge.fleet.messages import Control, Pose, Status
+from zbridge.fleet.topics import split_key
 from zbridge.gateway import until_signal
 from zbridge.metrics import Metrics
 from zbridge.protocol import protocol_names
@@ -36,8 +36,8 @@ START_S = 20.0
 REALM = "fleet"
 FIGURE_S = 2.0
 """Seconds the robots go straight on, then turn, then go straight on."""
-NEUTRAL = payloads.encode(Drive())
-_OWN_DRIVES = (payloads.encode(Drive(forward=0.6)), payloads.encode(Drive(turn=0.5)), NEUTRAL)
+PRIORITY = -1
+"""Less than everybody's, so that whoever asks for a robot is given it."""
 _RATES = ("pose", "map", "text")
 
 
@@ -45,6 +45,7 @@ class Row(msgspec.Struct):
     """What the table shows of one robot."""
 
     status: Status | None = None
+    control: Control | None = None
     pose: Pose | None = None
     counts: Counter[str] = msgspec.field(default_factory=Counter)
 
@@ -65,21 +66,24 @@ class Watch:
         with contextlib.suppress(PayloadError):
             if split[2] == topics.STATUS.path:
                 row.status = payloads.decode(Status, sample.payload)
+            elif split[2] == topics.CONTROL.path:
+                row.control = payloads.decode(Control, sample.payload)
             elif split[2] == topics.POSE.path:
                 row.pose = payloads.decode(Pose, sample.payload)
 
     def table(self, seconds: float) -> Table:
         """Draw the table; the counts since the last drawing become rates."""
         table = Table(title="zbridge demo", expand=False, padding=(0, 0))
-        for title in ("robot", "state", "version", *(f"{name}/s" for name in _RATES), "x m", "y m", "turn"):
-            table.add_column(title, justify="left" if title in ("robot", "state") else "right", no_wrap=True)
+        for title in ("robot", "state", "version", "driver", *(f"{name}/s" for name in _RATES), "x m", "y m", "turn"):
+            table.add_column(title, justify="left" if title in ("robot", "state", "driver") else "right", no_wrap=True)
         for robot, row in self.rows.items():
             state = row.status.state if row.status else "no gateway yet"
             version = (row.status.version or "") if row.status else ""
+            driver = (row.control.holder or row.control.state) if row.control else ""
             rates = [f"{row.counts[name] / seconds:.1f}" for name in _RATES]
             pose = row.pose
             where = [f"{pose.x:.2f}", f"{pose.y:.2f}", f"{math.degrees(pose.heading):.0f}°"] if pose else ["", "", ""]
-            table.add_row(robot, state, version, *rates, *where)
+            table.add_row(robot, state, version, driver, *rates, *where)
             row.counts.clear()
         return table
 
@@ -166,26 +170,25 @@ async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> Async
 
 async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
     """Draw the table, and drive the robots about until somebody else does."""
-    drives = {
-        robot: bus.publisher(KeySpace(REALM, robot).key(topics.CMD_DRIVE.path), topics.CMD_DRIVE)
-        for robot in watch.rows
-    }
-
-    def leave_alone(sample: Sample) -> None:
-        split = split_key(sample.key)
-        if split is not None and sample.payload not in _OWN_DRIVES:
-            drives.pop(split[1], None)
-
-    for robot in drives:
-        bus.subscribe(KeySpace(REALM, robot).key(topics.CMD_DRIVE.path), leave_alone)
+    fleet = Fleet(bus, REALM)
     loop = asyncio.get_running_loop()
     started = loop.time()
-    with Live(console=Console(), auto_refresh=False) as live:
-        while not seconds or loop.time() - started < seconds:
-            await asyncio.sleep(REFRESH_S)
-            figure = _OWN_DRIVES[int((loop.time() - started) / FIGURE_S) % 2]
-            for drive in drives.values():
-                drive.put(figure)
-            live.update(watch.table(REFRESH_S), refresh=True)
-    for drive in drives.values():
-        drive.put(NEUTRAL)
+    wandering = [asyncio.create_task(_wander(fleet[robot])) for robot in watch.rows]
+    try:
+        with Live(console=Console(), auto_refresh=False) as live:
+            while not seconds or loop.time() - started < seconds:
+                await asyncio.sleep(REFRESH_S)
+                live.update(watch.table(REFRESH_S), refresh=True)
+    finally:
+        for task in wandering:
+            task.cancel()
+        await asyncio.gather(*wandering, return_exceptions=True)
+
+
+async def _wander(robot: Robot) -> None:
+    """Drive straight on, turn, and so on, until anybody else takes the robot: anybody may."""
+    with contextlib.suppress(Refused, BusError):
+        async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
+            while True:
+                await drive.during(FIGURE_S, forward=0.6)
+                await drive.during(FIGURE_S, turn=0.5)

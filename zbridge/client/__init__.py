@@ -37,14 +37,19 @@ def bus_settings(endpoints: Sequence[str] = (), tls: Tls | None = None) -> BusSe
 
 @contextlib.asynccontextmanager
 async def connect(
-    endpoints: Sequence[str] = (), *, realm: str = "fleet", tls: Tls | None = None
+    endpoints: Sequence[str] = (),
+    *,
+    realm: str = "fleet",
+    tls: Tls | None = None,
+    settings: BusSettings | None = None,
 ) -> AsyncIterator[Fleet]:
     """Be on the bus while the context lasts.
 
     endpoints: of Zenoh, ``tcp/192.168.0.2:7447``; without any, the local network and the router on this machine.
+    settings: all there is to set, instead of ``endpoints`` and ``tls``.
     Raises BusError where no given endpoint can be reached.
     """
-    bus = await open_bus(bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
+    bus = await open_bus(settings or bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
     try:
         yield Fleet(bus, realm)
     finally:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Coroutine, Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar
 
 import zbridge.client
@@ -91,9 +91,9 @@ class Fleet:
         """List the robots that have a gateway or a status."""
         return self._loop.run(self._fleet.robots())
 
-    def stop(self) -> dict[str, Refused | BusError | None]:
-        """Stop every robot that has a gateway; give for each what is wrong, None where it stands."""
-        return self._loop.run(self._fleet.stop())
+    def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
+        """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""
+        return self._loop.run(self._fleet.stop(names))
 
 
 class Feed(Generic[T]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from typing import Any
 
 from zbridge.bus import Bus, Sample
@@ -66,10 +66,12 @@ class Fleet:
                     robots[split[1]] = payloads.decode(Status, answer.payload)
         return dict(sorted(robots.items()))
 
-    async def stop(self) -> dict[str, Refused | BusError | None]:
-        """Stop every robot that has a gateway; give for each what is wrong, None where it stands."""
-        tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
-        names = sorted({split[1] for key in tokens if (split := split_key(key))})
+    async def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
+        """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""
+        if names is None:
+            tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
+            names = {split[1] for key in tokens if (split := split_key(key))}
+        names = sorted(names)
         return dict(zip(names, await asyncio.gather(*map(self._stop_one, names)), strict=True))
 
     async def _stop_one(self, name: str) -> Refused | BusError | None:

@@ -1,0 +1,139 @@
+"""``zbridge drive``: one robot by keyboard. The lease is held while the command runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator
+
+from zbridge.bus import BusSettings
+from zbridge.cli.keyboard import Keyboard, split_keys
+from zbridge.client import Driver, Robot, connect
+from zbridge.errors import BusError, LeaseLost, Refused, ZbridgeError
+from zbridge.fleet.messages import Drive
+
+EVERY_S = 0.05
+DEADMAN_S = 0.3
+_READ_BYTES = 1024
+_HELP = """hold a key to move, let go to stand
+  w s, arrows  forward, backward     a d  turn left, right     q e  sideways
+  space  STOP (whoever drives)       + -  speed                Enter  take the lease again     x  end"""
+
+
+class Session:
+    """One sitting at the keyboard."""
+
+    def __init__(self, robot: Robot, speed: float, *, who: str | None, takeover: bool) -> None:
+        self._robot = robot
+        self._keyboard = Keyboard(speed)
+        self._who = who
+        self._takeover = takeover
+        self._keys: asyncio.Queue[str] = asyncio.Queue(_READ_BYTES)
+        self._loop = asyncio.get_running_loop()
+        self._line = ""
+
+    async def run(self) -> None:
+        """Drive until ``x``; a lost lease is taken again with Enter."""
+        print(_HELP)  # noqa: T201
+        with _raw_keys(self._loop, self._take):
+            while True:
+                try:
+                    async with self._robot.control(self._who, deadman_s=DEADMAN_S, takeover=self._takeover) as drive:
+                        await self._drive(drive)
+                        return
+                except LeaseLost as loss:
+                    self._say(f"{loss}. Enter: take the lease again, x: end")
+                if not await self._again():
+                    return
+
+    async def _drive(self, drive: Driver) -> None:
+        """Send what the keys say until ``x``."""
+        while True:
+            while not self._keys.empty():
+                key = self._keys.get_nowait()
+                if key == "x":
+                    return
+                if key == " ":
+                    await self._stop()
+                else:
+                    self._keyboard.press(key, self._loop.time())
+            command = self._keyboard.drive(self._loop.time())
+            try:
+                await drive(command.forward, command.left, command.turn)
+                self._show(command)
+            except LeaseLost:
+                raise
+            except Refused as refusal:
+                self._say(str(refusal))
+            await asyncio.sleep(EVERY_S)
+
+    async def _again(self) -> bool:
+        while True:
+            match await self._keys.get():
+                case "\r" | "\n":
+                    return True
+                case "x":
+                    return False
+                case " ":
+                    await self._stop()
+
+    async def _stop(self) -> None:
+        try:
+            await self._robot.stop()
+            self._say(f"{self._robot.name}: stopped")
+        except (Refused, BusError) as error:
+            self._say(str(error))
+
+    def _take(self, text: str) -> None:
+        for key in split_keys(text):
+            with contextlib.suppress(asyncio.QueueFull):
+                self._keys.put_nowait(key)
+
+    def _show(self, command: Drive) -> None:
+        line = (
+            f"{self._robot.name}  forward {command.forward:+.2f}  left {command.left:+.2f}  "
+            f"turn {command.turn:+.2f}  speed {self._keyboard.speed:.1f}"
+        )
+        if line != self._line:
+            self._line = line
+            sys.stdout.write(f"\r\x1b[K{line}")
+            sys.stdout.flush()
+
+    def _say(self, text: str) -> None:
+        self._line = ""
+        sys.stdout.write(f"\r\x1b[K{text}\n")
+        sys.stdout.flush()
+
+
+async def drive_robot(
+    settings: BusSettings, realm: str, name: str, speed: float, *, who: str | None, takeover: bool
+) -> None:
+    """Drive one robot by keyboard; raise ZbridgeError where there is no terminal, Held where somebody has it."""
+    if not sys.stdin.isatty():
+        raise ZbridgeError("drive needs a terminal to read keys from")
+    async with connect(settings=settings, realm=realm) as fleet:
+        await Session(fleet[name], speed, who=who, takeover=takeover).run()
+    print()  # noqa: T201
+
+
+@contextlib.contextmanager
+def _raw_keys(loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> Iterator[None]:
+    """Have keys delivered one by one, unechoed, while the context lasts."""
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+
+    def readable() -> None:
+        data = os.read(descriptor, _READ_BYTES)
+        take(data.decode("utf-8", "replace") if data else "x")
+
+    tty.setcbreak(descriptor)
+    loop.add_reader(descriptor, readable)
+    try:
+        yield
+    finally:
+        loop.remove_reader(descriptor)
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)

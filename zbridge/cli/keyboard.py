@@ -1,0 +1,66 @@
+"""Keys to drive commands: motion only while a key repeats. Knows no terminal; time is an argument."""
+
+from __future__ import annotations
+
+import msgspec
+
+from zbridge.fleet.messages import Drive
+
+FIRST_REPEAT_S = 0.8
+"""Longest time a keyboard waits before it begins to repeat a key that is held."""
+NEXT_REPEAT_S = 0.15
+"""Longest time between two repetitions, a slow network included."""
+STEP = 0.1
+"""What ``+`` and ``-`` change the speed by."""
+
+DRIVES = {
+    "w": Drive(forward=1.0),
+    "s": Drive(forward=-1.0),
+    "a": Drive(turn=1.0),
+    "d": Drive(turn=-1.0),
+    "q": Drive(left=1.0),
+    "e": Drive(left=-1.0),
+}
+ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
+_ESCAPE = "\x1b"
+
+
+def split_keys(text: str) -> list[str]:
+    """Cut what a terminal sent into keys; the arrows, three characters each, become their letters."""
+    keys = []
+    while text:
+        length = 3 if text[:3] in ARROWS else 1
+        keys.append(ARROWS.get(text[:length], text[:length]))
+        text = text[length:]
+    return [key for key in keys if key != _ESCAPE]
+
+
+class Keyboard:
+    """What the keys pressed until now mean. A single press moves nothing: a stuck terminal sends no repetition."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self._key = ""
+        self._pressed_at = 0.0
+        self._moves_until = 0.0
+
+    def press(self, key: str, now: float) -> None:
+        """Take one key."""
+        if key in ("+", "-"):
+            self.speed = min(1.0, max(STEP, round(self.speed + (STEP if key == "+" else -STEP), 2)))
+            return
+        if key == self._key and now - self._pressed_at <= FIRST_REPEAT_S:
+            self._moves_until = now + NEXT_REPEAT_S
+        else:
+            self._moves_until = 0.0
+        self._key, self._pressed_at = key, now
+
+    def drive(self, now: float) -> Drive:
+        """Give the command for now."""
+        wanted = DRIVES.get(self._key)
+        if wanted is None or now >= self._moves_until:
+            return Drive()
+        speed = self.speed
+        return msgspec.structs.replace(
+            wanted, forward=wanted.forward * speed, left=wanted.left * speed, turn=wanted.turn * speed
+        )

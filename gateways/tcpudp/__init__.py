@@ -45,8 +45,13 @@ multicast = true                        # find peers on the local network
 stream = "drop"                         # "block": lose nothing when the bus is slower than the robot
 
 [control]
-lease_s = 3.0
-deadman_s = 2.0                         # motion without a fresh command ends after so many seconds
+lease_s = 3.0                           # the most a holder may ask for: a lease not renewed for so long ends
+deadman_s = 2.0                         # the most a holder may ask for: motion without a fresh command ends
+# rate_hz = 50.0                        # drives a second that are carried out, the others are refused
+# slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is never slowed
+audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it: a file in the working directory,
+audit_bytes = 1000000                   # rotated at this size,
+audit_files = 5                         # with so many older ones kept
 
 # [metrics]
 # listen = "127.0.0.1:9100"             # counters for Prometheus

@@ -1,4 +1,4 @@
-"""The README's program, run as it stands (only the router's address is the test's)."""
+"""The README's programs, run as they stand (only the router's address is the test's)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from tests.e2e.conftest import Bench, free_port, until
 README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
-def test_the_readme_program_prints_poses_and_drives(bench: Bench) -> None:
-    (program,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PROGRAMS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def run_program(bench: Bench, program: str) -> list[str]:
+    """Run one of the README's programs against a simulated robot; give the lines it printed."""
     port = free_port()
     bench.simulator(port)
     bench.gateway("tcpudp1", port)
@@ -25,7 +28,23 @@ def test_the_readme_program_prints_poses_and_drives(bench: Bench) -> None:
         timeout=30,
     )
     assert ran.returncode == 0, ran.stderr
-    poses = [eval(line) for line in ran.stdout.splitlines()]
+    return ran.stdout.splitlines()
+
+
+def test_the_readmes_client_drives(bench: Bench) -> None:
+    first, last = run_program(bench, PROGRAMS[0])
+    state, x, *shape = first.split()
+    assert state == "established"
+    assert " ".join(shape) == "(100, 100)"
+    assert abs(float(x)) < 5
+    assert len(last.split()) == 3
+    poses = bench.fleet.seen["fleet/tcpudp1/pose"]
+    assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
+    assert bench.fleet.last("tcpudp1/control")["state"] == "free"
+
+
+def test_the_readmes_plain_program_prints_poses_and_drives(bench: Bench) -> None:
+    poses = [eval(line) for line in run_program(bench, PROGRAMS[1])]
     assert len(poses) > 10
     assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
 

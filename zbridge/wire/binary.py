@@ -7,13 +7,22 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar, get_args, get_type_hints
+from typing import Any, Generic, TypeVar
 
-import msgspec
 import numpy as np
 
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.wire.fields import CountedArray, CountedBytes, CountedText, Message, Remainder, Scalar, WireType
+from zbridge.wire.fields import (
+    CountedArray,
+    CountedBytes,
+    CountedText,
+    Field,
+    Filling,
+    Message,
+    Remainder,
+    Scalar,
+    declared_fields,
+)
 
 M = TypeVar("M", bound=Message)
 
@@ -35,12 +44,12 @@ class BinaryCodec(Generic[M]):
 
     def __init__(self, message: type[M]) -> None:
         self.message = message
-        fields = _declared(message)
+        fields = declared_fields(message)
         scalars = _all_scalars(fields)
         if any(field.optional for field in fields[:-1]):
             raise TypeError(f"{message.__name__}: only the last field may be missing")
         if scalars is None:
-            self._steps = [_Step(field) for field in fields]
+            self._steps = [_Step(field, fields[place + 1 :]) for place, field in enumerate(fields)]
             self.decode, self.encode = self._decode_steps, self._encode_steps
         else:
             self._fixed = struct.Struct("<" + scalars)
@@ -85,35 +94,22 @@ class BinaryCodec(Generic[M]):
         return b"".join(parts)
 
 
-class _Field(msgspec.Struct, frozen=True):
-    name: str
-    wire: WireType
-    optional: bool
-
-
 class _Step:
     """One field of a message whose length is not fixed."""
 
-    def __init__(self, field: _Field) -> None:
+    def __init__(self, field: Field, behind: Sequence[Field]) -> None:
         self.name = field.name
         self.optional = field.optional
-        self.decode, self.encode = _CODERS[type(field.wire)](field.wire)
+        if isinstance(field.wire, Filling):
+            scalars = _all_scalars(behind)
+            if scalars is None:
+                raise TypeError(f"{field.name}: only fields of fixed width may follow it")
+            self.decode, self.encode = _filling(field.wire, struct.calcsize("<" + scalars))
+        else:
+            self.decode, self.encode = _CODERS[type(field.wire)](field.wire)
 
 
-def _declared(message: type[Message]) -> list[_Field]:
-    hints = get_type_hints(message, include_extras=True)
-    return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
-
-
-def _field(name: str, hint: Any) -> _Field:
-    for candidate in (hint, *get_args(hint)):
-        for extra in getattr(candidate, "__metadata__", ()):
-            if isinstance(extra, WireType):
-                return _Field(name, extra, optional=type(None) in get_args(hint))
-    raise TypeError(f"{name}: {hint} is no wire type")
-
-
-def _all_scalars(fields: Sequence[_Field]) -> str | None:
+def _all_scalars(fields: Sequence[Field]) -> str | None:
     codes = [field.wire.code for field in fields if isinstance(field.wire, Scalar) and not field.optional]
     return "".join(codes) if len(codes) == len(fields) else None
 
@@ -194,6 +190,18 @@ def _counted_array(wire: CountedArray) -> tuple[Decode, Encode]:
         return count.pack(len(value)) + np.ascontiguousarray(value, dtype).tobytes()
 
     return decode, encode
+
+
+def _filling(wire: Filling, behind: int) -> tuple[Decode, Encode]:
+    dtype = np.dtype(wire.dtype)
+
+    def decode(data: bytes, position: int) -> tuple[Any, int]:
+        count, rest = divmod(len(data) - behind - position, dtype.itemsize)
+        if count < 0 or rest:
+            raise ValueError(f"{len(data) - position} bytes, expected {behind} and a multiple of {dtype.itemsize}")
+        return np.frombuffer(data, dtype, count, position), position + count * dtype.itemsize
+
+    return decode, lambda value: np.ascontiguousarray(value, dtype).tobytes()
 
 
 def _remainder(wire: Remainder) -> tuple[Decode, Encode]:

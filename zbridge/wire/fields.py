@@ -6,12 +6,14 @@
         heading_deg: F32
 
 The last field may be declared ``Blob | None = None``: then it may be missing. A message may define ``check()``,
-which raises ProtocolError for decoded values that do not go together. Sans-IO; a codec makes the bytes.
+which raises ProtocolError for decoded values that do not go together. Where a protocol has a dialect of text whose
+numbers are others than the binary ones, a field says so: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a
+codec makes the bytes.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -54,9 +56,32 @@ class Remainder(msgspec.Struct, frozen=True):
     """All bytes that are left of the body."""
 
 
-WireType = Scalar | CountedText | CountedBytes | CountedArray | Remainder
+class Filling(msgspec.Struct, frozen=True):
+    """As many items of one little-endian dtype as the fields around it leave room for."""
+
+    dtype: str
+
+
+class Whole(msgspec.Struct, frozen=True):
+    """In text: an integer from ``low`` to ``high``."""
+
+    low: int
+    high: int
+
+    def __str__(self) -> str:
+        return f"{self.low} to {self.high}"
+
+
+class Decimal(msgspec.Struct, frozen=True):
+    """In text: a number with six decimals, never an exponent."""
+
+
+WireType = Scalar | CountedText | CountedBytes | CountedArray | Remainder | Filling
+TextType = Whole | Decimal
 
 U8 = Annotated[int, Scalar("B")]
+I16 = Annotated[int, Scalar("h")]
+U32 = Annotated[int, Scalar("I")]
 I32 = Annotated[int, Scalar("i")]
 F32 = Annotated[float, Scalar("f")]
 F64 = Annotated[float, Scalar("d")]
@@ -65,3 +90,28 @@ Text = Annotated[str, CountedText("i")]
 Blob = Annotated[bytes, CountedBytes("i")]
 F32Array = Annotated[npt.NDArray[np.float32], CountedArray("i", "<f4")]
 Rest = Annotated[bytes, Remainder()]
+I64Fill = Annotated[npt.NDArray[np.int64], Filling("<i8")]
+
+
+class Field(msgspec.Struct, frozen=True):
+    """One field of a declaration: what it is on the wire, and in text where that differs."""
+
+    name: str
+    wire: WireType
+    text: TextType | None
+    optional: bool
+
+
+def declared_fields(message: type[Message]) -> list[Field]:
+    """Read the fields of a declaration; raise TypeError where one has no wire type."""
+    hints = get_type_hints(message, include_extras=True)
+    return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
+
+
+def _field(name: str, hint: Any) -> Field:
+    extras = [extra for candidate in (hint, *get_args(hint)) for extra in getattr(candidate, "__metadata__", ())]
+    wire = next((extra for extra in extras if isinstance(extra, WireType)), None)
+    if wire is None:
+        raise TypeError(f"{name}: {hint} is no wire type")
+    text = next((extra for extra in extras if isinstance(extra, TextType)), None)
+    return Field(name, wire, text, optional=type(None) in get_args(hint))

@@ -11,6 +11,7 @@ from zbridge import protocol
 from zbridge.errors import ConfigError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Protocol, Robot, find_protocol, protocol_names
 
 
@@ -72,7 +73,7 @@ def test_every_protocol_says_what_it_is_and_makes_robots_with_its_default_option
     assert found.name == name
     assert found.summary
     assert "{name}" in found.template
-    robot = found.robot(found.options(), found.links)
+    robot = found.robot(found.options(), found.links, Metrics())
     assert len(robot.link_names) == found.links
     assert robot.driving is None
 

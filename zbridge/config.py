@@ -29,6 +29,29 @@ _VARIABLE = re.compile(r"\$\{(\w+)\}")
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
+COMMON_TEMPLATE = """\
+[bus]
+mode = "peer"                           # peer, client, router (embedded); client when only connect is given
+connect = []                            # for example ["tcp/127.0.0.1:7447"]
+listen = []
+multicast = true                        # find peers on the local network
+stream = "drop"                         # "block": lose nothing when the bus is slower than the robot
+
+[control]
+lease_s = 3.0                           # the most a holder may ask for: a lease not renewed for so long ends
+deadman_s = 2.0                         # the most a holder may ask for: motion without a fresh command ends
+# rate_hz = 50.0                        # drives a second that are carried out, the others are refused
+# slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is never slowed
+audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it: a file in the working directory,
+audit_bytes = 1000000                   # rotated at this size,
+audit_files = 5                         # with so many older ones kept
+
+# [metrics]
+# listen = "127.0.0.1:9100"             # counters for Prometheus
+"""
+"""The part of a commented configuration that all protocols share."""
+
+
 class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[robot]``: how the robot is named on the bus."""
 

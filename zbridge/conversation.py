@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from zbridge.link import Link
+from zbridge.link import Link, Receiver
 from zbridge.metrics import Count
 from zbridge.session.session import Datagram, Session, State
 
@@ -169,3 +169,52 @@ class Conversation:
         if count.bit_length() != self._malformed_logged.bit_length():
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count
+
+
+class Accepted(Receiver):
+    """The receiver of a link that was accepted: its conversation is made by ``admit``, which may refuse one."""
+
+    def __init__(self, admit: Callable[[Link], Conversation | None]) -> None:
+        self._admit = admit
+        self._conversation: Conversation | None = None
+
+    def __repr__(self) -> str:
+        return f"<Accepted {self._conversation!r}>"
+
+    def attached(self, link: Link) -> None:
+        """Begin a conversation, or close the link."""
+        self._conversation = self._admit(link)
+        if self._conversation is None:
+            link.close()
+        else:
+            self._conversation.attached(link)
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the link."""
+        if self._conversation is not None:
+            self._conversation.received(data)
+
+    def lost(self, reason: str) -> None:
+        """Take note that the link is gone."""
+        if self._conversation is not None:
+            log.info("%s: %s", self._conversation.session.peer, reason)
+            self._conversation.lost(reason)
+
+    def received_datagram(self, datagram: bytes) -> None:
+        """Take a datagram from the link."""
+        if self._conversation is not None:
+            self._conversation.received_datagram(datagram)
+
+    def claims(self, datagram: bytes) -> bool:
+        """Tell whether the first datagram of an unknown source is this conversation's."""
+        return self._conversation is not None and self._conversation.claims(datagram)
+
+    def foreign_datagram(self) -> None:
+        """Count a datagram that came from elsewhere."""
+        if self._conversation is not None:
+            self._conversation.foreign_datagram()
+
+    def writable(self) -> None:
+        """Go on writing."""
+        if self._conversation is not None:
+            self._conversation.writable()

@@ -244,7 +244,7 @@ class Device:
                 reason=first.reason,
                 protocol=self._protocol,
                 dialect=self._robot.dialect,
-                version=agreed.version if agreed is not None else None,
+                version=(agreed.version or None) if agreed is not None else None,
                 features=agreed.features if agreed is not None else (),
                 links=tuple(endpoint.status() for endpoint in self._endpoints),
             ),

@@ -152,8 +152,9 @@ class Endpoint:
 
     def _on_session(self, session: Session[Any]) -> None:
         if session.state is State.ESTABLISHED and self.state != "established":
-            features = ", ".join(session.features) or "none"
-            log.info("%s: established, version %s, features %s", self._label, session.version, features)
+            agreed = [f"version {session.version}"] if session.version else []
+            agreed += [f"features {', '.join(session.features)}"] if session.features else []
+            log.info("%s: %s", self._label, ", ".join(["established", *agreed]))
         self._hooks.session_changed(session)
         self._set_state(_STATES[session.state], session.busy or session.reason)
 

@@ -83,7 +83,7 @@ class Gateway:
         plan, config = self._plan, self._plan.config
         control = config.control
         return Device(
-            plan.protocol.robot(plan.options, len(plan.addresses)),
+            plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,
             keys=KeySpace(config.robot.realm, config.robot.name),

@@ -16,6 +16,7 @@ from zbridge.errors import ConfigError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.link import Address
+from zbridge.metrics import Metrics
 from zbridge.session.session import Session, State
 
 GROUP = "zbridge.protocols"
@@ -79,14 +80,19 @@ class Robot(ABC):
 
 
 class Simulation(msgspec.Struct, frozen=True):
-    """How a simulated robot is started. ``ready`` is called with the address it listens on."""
+    """How a simulated robot is started: one address for each of its links.
 
-    address: Address
+    ``ready`` is called with the addresses it listens on. What a protocol does not have (versions, dialects,
+    datagrams) it refuses with ConfigError.
+    """
+
+    addresses: tuple[Address, ...]
     seed: int = 1
     version: str | None = None
+    dialect: str | None = None
     udp: bool = False
     strict: bool = False
-    ready: Callable[[Address], None] = lambda address: None
+    ready: Callable[[tuple[Address, ...]], None] = lambda addresses: None
 
 
 class Protocol(msgspec.Struct, frozen=True):
@@ -96,8 +102,8 @@ class Protocol(msgspec.Struct, frozen=True):
     summary: str
     options: type[msgspec.Struct]
     links: int
-    robot: Callable[[Any, int], Robot]
-    """``robot(options, links)``: the device side for a robot with so many links."""
+    robot: Callable[[Any, int, Metrics], Robot]
+    """``robot(options, links, metrics)``: the device side for a robot with so many links."""
     simulate: Callable[[Simulation], Coroutine[Any, Any, None]]
     """Be a robot of this protocol until cancelled."""
     template: str

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
+from zbridge.config import COMMON_TEMPLATE
 from zbridge.errors import ConfigError
 from zbridge.link import Address
 from zbridge.protocol import Protocol, Simulation
 
-TEMPLATE = """\
+TEMPLATE = (
+    """\
 # A gateway for one robot of the TCP/UDP package protocol. Start it with: zbridge run FILE
 
 [robot]
@@ -37,37 +39,23 @@ heading_offset = 1.5707963267948966     # added to the robot's heading, radians
 map_cell_m = 0.01                       # side of a map cell where the robot does not announce it
 # map_origin = [0.0, 0.0]               # x, y of map cell (0, 0) in metres; left out: the map is centred
 
-[bus]
-mode = "peer"                           # peer, client, router (embedded); client when only connect is given
-connect = []                            # for example ["tcp/127.0.0.1:7447"]
-listen = []
-multicast = true                        # find peers on the local network
-stream = "drop"                         # "block": lose nothing when the bus is slower than the robot
-
-[control]
-lease_s = 3.0                           # the most a holder may ask for: a lease not renewed for so long ends
-deadman_s = 2.0                         # the most a holder may ask for: motion without a fresh command ends
-# rate_hz = 50.0                        # drives a second that are carried out, the others are refused
-# slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is never slowed
-audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it: a file in the working directory,
-audit_bytes = 1000000                   # rotated at this size,
-audit_files = 5                         # with so many older ones kept
-
-# [metrics]
-# listen = "127.0.0.1:9100"             # counters for Prometheus
 """
+    + COMMON_TEMPLATE
+)
 
 
 async def _simulate(simulation: Simulation) -> None:
+    if len(simulation.addresses) > 1 or simulation.dialect is not None:
+        raise ConfigError("a TCP/UDP robot has one link and no dialects")
     if simulation.version is not None and simulation.version not in VERSIONS:
         raise ConfigError(f"version {simulation.version!r}: expected one of {', '.join(VERSIONS)}")
     if simulation.strict:
         from gateways.tcpudp.strict import simulate_strict
 
-        address, version = simulation.address, simulation.version or "1.3"
+        (address,), version = simulation.addresses, simulation.version or "1.3"
 
         def ready(port: int) -> None:
-            simulation.ready(Address(address.host, port))
+            simulation.ready((Address(address.host, port),))
 
         await simulate_strict(
             address.host, address.port, version=version, udp=simulation.udp, seed=simulation.seed, ready=ready

@@ -38,9 +38,9 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.conversation import Conversation
+from zbridge.conversation import Accepted, Conversation
 from zbridge.errors import EncodeError, Refused
-from zbridge.link import Link, Receiver, listen
+from zbridge.link import Link, listen
 from zbridge.protocol import Simulation
 from zbridge.session.manager import ClientIds
 from zbridge.session.session import State
@@ -183,8 +183,9 @@ class Simulator:
 
     async def run(self, simulation: Simulation) -> None:
         """Listen and live until cancelled."""
-        async with listen(simulation.address, lambda: _Peer(self), datagrams=self._settings.udp) as address:
-            simulation.ready(address)
+        (wanted,) = simulation.addresses
+        async with listen(wanted, lambda: Accepted(self.admit), datagrams=self._settings.udp) as address:
+            simulation.ready((address,))
             await self._live()
 
     def admit(self, link: Link) -> Conversation | None:
@@ -253,44 +254,6 @@ class Simulator:
             if steps == _ASK_EVERY:
                 self._tell_all(ServerCamMode(2))
                 self._tell_all(ServerLidarStatus(1))
-
-
-class _Peer(Receiver):
-    """The receiver of an accepted link, which finds its conversation when it is attached."""
-
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
-        self._conversation: Conversation | None = None
-
-    def attached(self, link: Link) -> None:
-        self._conversation = self._simulator.admit(link)
-        if self._conversation is None:
-            link.close()
-        else:
-            self._conversation.attached(link)
-
-    def received(self, data: bytes) -> None:
-        if self._conversation is not None:
-            self._conversation.received(data)
-
-    def lost(self, reason: str) -> None:
-        if self._conversation is not None:
-            log.info("%s: %s", self._conversation.session.peer, reason)
-            self._conversation.lost(reason)
-
-    def received_datagram(self, datagram: bytes) -> None:
-        if self._conversation is not None:
-            self._conversation.received_datagram(datagram)
-
-    def claims(self, datagram: bytes) -> bool:
-        return self._conversation is not None and self._conversation.claims(datagram)
-
-    def foreign_datagram(self) -> None:
-        pass
-
-    def writable(self) -> None:
-        if self._conversation is not None:
-            self._conversation.writable()
 
 
 def _send(conversation: Conversation, message: Packet) -> None:

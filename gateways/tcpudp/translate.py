@@ -42,6 +42,7 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot, Telemetry, Translate
 
 NAME = "tcpudp"
@@ -83,7 +84,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TcpUdpRobot(Robot):
     """One robot of the TCP/UDP package protocol, seen from its HQ."""
 
-    def __init__(self, options: Options, links: int = 1) -> None:
+    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)

@@ -65,9 +65,12 @@ def init(
 @app.command()
 def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    listen: Annotated[str, typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one")],
+    listen: Annotated[
+        list[str], typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one; one for each link")
+    ],
     seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
+    dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="be as fragile as a deployed robot")] = False,
     verbose: Verbose = False,
@@ -76,12 +79,13 @@ def simulate(
     set_up_log(verbose=verbose)
     simulated = find_protocol(protocol)
     simulation = Simulation(
-        Address.parse(listen),
+        tuple(map(Address.parse, listen)),
         seed,
         version or None,
+        dialect or None,
         udp,
         strict,
-        lambda address: print(f"listening on {address}", flush=True),  # noqa: T201
+        lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
     )
     run_loop(until_signal(simulated.simulate(simulation)))
 

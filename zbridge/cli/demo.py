@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import math
 import os
 import socket
@@ -28,7 +29,7 @@ from zbridge.fleet.messages import Control, Pose, Status
 from zbridge.fleet.topics import split_key
 from zbridge.gateway import until_signal
 from zbridge.metrics import Metrics
-from zbridge.protocol import protocol_names
+from zbridge.protocol import find_protocol, protocol_names
 
 REFRESH_S = 0.5
 START_S = 20.0
@@ -129,16 +130,18 @@ def _free_port() -> int:
 @contextlib.asynccontextmanager
 async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str) -> AsyncIterator[None]:
     """Run a simulator and its gateway, each a process of its own."""
-    async with _process(log, "simulate", protocol, "--listen", "tcp://127.0.0.1:0", read=True) as simulator:
+    listen = find_protocol(protocol).links * ("--listen", "tcp://127.0.0.1:0")
+    async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
         assert simulator.stdout is not None
         async with asyncio.timeout(START_S):
             line = (await simulator.stdout.readline()).decode()
-        if "tcp://" not in line:
+        addresses = [word for word in line.split() if word.startswith("tcp://")]
+        if not addresses:
             raise ZbridgeError(f"the {protocol} simulator did not start")
         file = folder / f"{robot}.toml"
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
-            f'[device]\nprotocol = "{protocol}"\nconnect = ["{line.split()[-1]}"]\n'
+            f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\n'
             f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
         async with _process(log, "run", str(file)):

@@ -17,6 +17,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Status
 from zbridge.fleet.topics import split_key
 from zbridge.link import Address, connect
+from zbridge.metrics import Metrics
 from zbridge.protocol import Protocol
 from zbridge.session.session import State
 
@@ -62,7 +63,7 @@ async def _served(settings: BusSettings, address: Address, realm: str) -> tuple[
 async def _talk(protocol: Protocol, address: Address) -> int:
     """Shake hands with the device, say what was agreed, and leave."""
     loop = asyncio.get_running_loop()
-    robot = protocol.robot(protocol.options(), 1)
+    robot = protocol.robot(protocol.options(), 1, Metrics())
     session = robot.session(0, str(address))
     settled = asyncio.Event()
 
@@ -88,7 +89,8 @@ async def _talk(protocol: Protocol, address: Address) -> int:
     _show(
         {
             "protocol": protocol.name,
-            "version": seen.version,
+            "dialect": robot.dialect,
+            "version": seen.version or None,
             "features": list(seen.features),
             "transport": seen.transport,
             "reason": seen.reason,

@@ -107,7 +107,7 @@ class Session(ABC, Generic[M]):
         self.last_malformed: str | None = None
         self.outbox = Outbox(limits.gap_s)
         self.tap: Tap | None = None
-        self._frames = FrameBuffer(type(self).frame_end, limits.frame_bytes)
+        self._frames = FrameBuffer(self.frame_end, limits.frame_bytes)
         self._limit_at = math.inf
 
     def __repr__(self) -> str:
@@ -207,7 +207,7 @@ class Session(ABC, Generic[M]):
         if self.tap is not None:
             self.tap("in", datagram)
         try:
-            end = type(self).frame_end(datagram, 0)
+            end = self.frame_end(datagram, 0)
             if end != len(datagram):
                 raise ProtocolError(f"datagram of {len(datagram)} bytes holds a frame of {end}")
             message = self.decode(datagram)

@@ -45,6 +45,9 @@ class BinaryCodec(Generic[M]):
     def __init__(self, message: type[M]) -> None:
         self.message = message
         fields = declared_fields(message)
+        widths = [struct.calcsize("<" + field.wire.code) for field in fields if isinstance(field.wire, Scalar)]
+        self.fixed_size = sum(widths)
+        """Bytes of the fields of fixed width."""
         scalars = _all_scalars(fields)
         if any(field.optional for field in fields[:-1]):
             raise TypeError(f"{message.__name__}: only the last field may be missing")

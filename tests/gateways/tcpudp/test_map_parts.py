@@ -233,7 +233,7 @@ async def test_the_first_part_stops_the_robot_and_commands_are_refused_until_the
         assert rig.written() == [STOP_2]
         status = rig.last("status")
         assert (status["state"], status["reason"]) == ("established", "busy: map")
-        assert rig.last("control")["state"] == "stopped"
+        assert rig.last("control")["state"] == "held"
         for name, fields in (("drive", {}), ("mode", {"mode": "manual"}), ("drive", DRIVE_LEFT)):
             rig.command(name, fields)
         refusals = await rig.refusals()
@@ -279,7 +279,7 @@ async def assert_motion_needs_neutral(rig: Rig) -> None:
     rig.command("drive", DRIVE_LEFT)
     await asyncio.sleep(0.1)
     assert {frame[5] for frame in rig.written()} <= {13}
-    assert rig.last("control")["state"] == "stopped"
+    assert rig.last("control")["state"] == "held"
     rig.command("drive", {})
     rig.command("drive", DRIVE_LEFT)
     await asyncio.sleep(0.1)

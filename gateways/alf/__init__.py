@@ -1,0 +1,80 @@
+"""ALF: a vehicle with a laser scanner, in the document's binary form or the field's text form.
+
+``messages`` declares the five messages for both dialects, ``session`` holds the conversation in both roles,
+``translate`` turns messages into fleet messages and commands into messages, ``simulator`` is a vehicle to play with,
+``strict`` one that is as fragile as the deployed ones and shares no code with the others.
+"""
+
+from __future__ import annotations
+
+from gateways.alf.messages import Dialect
+from gateways.alf.translate import NAME, AlfRobot, Options
+from zbridge.config import COMMON_TEMPLATE
+from zbridge.errors import ConfigError
+from zbridge.link import Address
+from zbridge.protocol import Protocol, Simulation
+
+LINKS = 2
+
+TEMPLATE = (
+    """\
+# A gateway for one ALF vehicle. Start it with: zbridge run FILE
+
+[robot]
+name = "{name}"                         # its keys begin with fleet/{name}/
+realm = "fleet"
+
+[device]
+protocol = "alf"
+connect = ["tcp://127.0.0.1:6666"]      # the vehicle; or its drive server, then its laser server
+
+[device.options]
+dialect = "text"                        # what vehicles in the field speak; "binary": the document's packed fields
+points = 769                            # points of a measurement; binary framing depends on it
+points_from_scanner = false             # reckon them from scanner init instead (the deployed scanner's is wrong)
+speed_full = 100                        # the speed that is full scale
+# acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
+# gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
+gap_s = 0.0                             # least time between two messages
+
+"""
+    + COMMON_TEMPLATE
+)
+
+
+async def _simulate(simulation: Simulation) -> None:
+    if simulation.version is not None or simulation.udp:
+        raise ConfigError("an ALF vehicle has no versions and no datagrams")
+    if len(simulation.addresses) > LINKS:
+        raise ConfigError(f"an ALF vehicle has at most {LINKS} links")
+    try:
+        dialect = Dialect(simulation.dialect or "text")
+    except ValueError:
+        names = ", ".join(dialect.value for dialect in Dialect)
+        raise ConfigError(f"dialect {simulation.dialect!r}: expected one of {names}") from None
+    if simulation.strict:
+        from gateways.alf.strict import simulate_strict
+
+        host, port = simulation.addresses[0].host, simulation.addresses[0].port
+        laser = simulation.addresses[1].port if len(simulation.addresses) > 1 else None
+
+        def ready(drive_port: int, laser_port: int | None) -> None:
+            ports = (drive_port,) if laser_port is None else (drive_port, laser_port)
+            simulation.ready(tuple(Address(host, port) for port in ports))
+
+        await simulate_strict(host, port, dialect=dialect.value, laser_port=laser, seed=simulation.seed, ready=ready)
+    else:
+        from gateways.alf.simulator import simulate
+
+        await simulate(simulation)
+
+
+PROTOCOL = Protocol(
+    name=NAME,
+    summary="ALF: a vehicle with a laser scanner",
+    options=Options,
+    links=LINKS,
+    robot=AlfRobot,
+    simulate=_simulate,
+    template=TEMPLATE,
+)

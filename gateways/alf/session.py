@@ -1,0 +1,110 @@
+"""Sessions of ALF in both roles and dialects: framing, END, and the drive command that is never silent. Sans-IO.
+
+Source: "Roles", "The gateway as HQ" and the dialects of the protocol page. There is no handshake: who is connected
+is established.
+"""
+
+from __future__ import annotations
+
+from gateways.alf.messages import (
+    MOST_POINTS,
+    POINTS,
+    AlfMessage,
+    Dialect,
+    DriveCommand,
+    End,
+    Measurement,
+    Sender,
+    binary_frame_end,
+    binary_size,
+    read_binary,
+    read_text,
+    sent_by,
+    text_frame_end,
+    text_limit,
+    write_binary,
+    write_text,
+)
+from zbridge.errors import ProtocolError
+from zbridge.session.session import Limits, Role, Session, State
+
+REPEAT_S = 0.02
+"""Seconds between repetitions of the drive command."""
+ENDED = "ended"
+HANDSHAKE_S = 5.0
+_DRIVE = "drive"
+
+
+class AlfSession(Session[AlfMessage]):
+    """What both roles share. points: of a measurement, which binary framing has to know."""
+
+    handled = frozenset({End})
+    _SENT_BY_PEER: frozenset[int]
+
+    def __init__(self, dialect: Dialect, *, points: int = POINTS, gap_s: float = 0.0) -> None:
+        self.dialect = dialect
+        self.points = points
+        self._ids = self._SENT_BY_PEER
+        if dialect is Dialect.TEXT:
+            limit = text_limit(max(points, POINTS))
+            self.frame_end = text_frame_end(limit)
+            self._read, self._write = read_text, write_text
+        else:
+            limit = binary_size(Measurement.spec.id, MOST_POINTS)
+            self.frame_end = binary_frame_end(self._ids, lambda: self.points)
+            self._read, self._write = read_binary, write_binary
+        super().__init__(Limits(frame_bytes=limit, handshake_s=HANDSHAKE_S, gap_s=gap_s))
+
+    def encode(self, message: AlfMessage) -> bytes:
+        return self._write(message)
+
+    def decode(self, frame: bytes) -> AlfMessage:
+        message = self._read(frame, self._ids)
+        if isinstance(message, Measurement) and len(message.points) != self.points:
+            raise ProtocolError(f"measurement of {len(message.points)} points, expected {self.points}")
+        return message
+
+    def opened(self, now: float) -> None:
+        self.establish("", ())
+
+    def accept(self, message: AlfMessage, now: float) -> bool:
+        if isinstance(message, End):
+            self.close(ENDED, now)
+            return False
+        return True
+
+    def close(self, reason: str, now: float) -> None:
+        """Say END, once, and nothing after it."""
+        if self.state is State.ESTABLISHED:
+            self.outbox.clear(_DRIVE)
+            self.send(End())
+        super().close(reason, now)
+
+
+class HqSession(AlfSession):
+    """We play HQ towards a vehicle. drives: this link takes drive commands, so it always gets one, neutral at first."""
+
+    role = Role.HQ
+    _SENT_BY_PEER = sent_by(Sender.VEHICLE)
+
+    def __init__(
+        self, dialect: Dialect, *, points: int = POINTS, gap_s: float = 0.0, drives: DriveCommand | None = None
+    ) -> None:
+        super().__init__(dialect, points=points, gap_s=gap_s)
+        self._at_first = drives
+
+    def opened(self, now: float) -> None:
+        super().opened(now)
+        if self._at_first is not None:
+            self.drive(self._at_first, now)
+
+    def drive(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
+        """Send a command at once, and again every 20 ms until the next one."""
+        self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
+
+
+class VehicleSession(AlfSession):
+    """We play the vehicle towards an HQ."""
+
+    role = Role.ROBOT
+    _SENT_BY_PEER = sent_by(Sender.HQ)

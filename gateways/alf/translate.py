@@ -1,0 +1,233 @@
+"""Between ALF messages and fleet messages, both ways, and one vehicle as a robot. Sans-IO.
+
+Source: "Translation" and "The gateway as HQ" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from gateways.alf.messages import (
+    MOST_POINTS,
+    POINTS,
+    AlfMessage,
+    Dialect,
+    DriveCommand,
+    DriveInfo,
+    Measurement,
+    ScannerInit,
+)
+from gateways.alf.session import HqSession
+from zbridge.errors import ProtocolError, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
+from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
+from zbridge.protocol import Outcome, Robot, Telemetry, Translate
+from zbridge.session.deviceclock import DeviceClock
+
+NAME = "alf"
+STANDARD_GRAVITY = 9.80665
+FULL_LOCK_DEG = 90
+"""The steering angle at ``turn`` = -1 or 1."""
+
+_M_PER_MM = 1e-3
+_FORWARD, _BACKWARD = 0, 1
+_COUNTER_ENDS = 2**32
+_UNITS = {
+    Dialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
+    Dialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
+}
+"""What one unit of acceleration (m/s2) and of gyro (rad/s) is where the options do not say."""
+
+Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    dialect: Literal["text", "binary"] = "text"
+    points: Annotated[int, msgspec.Meta(ge=1, le=MOST_POINTS)] = POINTS
+    points_from_scanner: bool = False
+    speed_full: Annotated[int, msgspec.Meta(ge=1, le=255)] = 100
+    acceleration_m_s2: Scale | None = None
+    gyro_rad_s: Scale | None = None
+    gap_s: Annotated[float, msgspec.Meta(ge=0, le=0.02)] = 0.0
+
+
+class AlfRobot(Robot):
+    """One vehicle, with one link or two: the first drives."""
+
+    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+        metrics = metrics or Metrics()
+        self.options = options
+        self.link_names = ("vehicle",) if links == 1 else ("drive", "laser")
+        self.dialect = options.dialect  # type: ignore[misc]
+        self._dialect = Dialect(options.dialect)
+        self._sessions: list[HqSession | None] = [None] * links
+        acceleration, gyro = _UNITS[self._dialect]
+        self._acceleration = options.acceleration_m_s2 or acceleration
+        self._gyro = options.gyro_rad_s or gyro
+        self._scanner: ScannerInit | None = None
+        self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is Dialect.BINARY else None)
+        self._sequence: int | None = None
+        self._gaps = metrics.count("sequence_gaps")
+        self._duplicates = metrics.count("sequence_duplicates")
+        self._light = False
+        self._backward = False
+        self._command = self._neutral()
+
+    @property
+    def driving(self) -> HqSession | None:
+        return self._sessions[0]
+
+    def session(self, link: int, peer: str) -> HqSession:
+        if link == 0:
+            self._backward = False
+            self._command = self._neutral()
+        points = self.options.points
+        session = HqSession(
+            self._dialect, points=points, gap_s=self.options.gap_s, drives=self._command if link == 0 else None
+        )
+        self._sessions[link] = session
+        return session
+
+    # Messages to telemetry
+
+    def translator(self, kind: type) -> Translate:
+        return partial(_TELEMETRY[kind], self)
+
+    def _scan(self, message: Measurement, stamp_ns: int) -> tuple[Telemetry, ...]:
+        scanner = self._scanner
+        if scanner is None:
+            raise ProtocolError("measurement before scanner init")
+        self._count(message.sequence)
+        scan = Scan(
+            math.radians(scanner.angle_min_deg),
+            math.radians(scanner.angle_increment_deg),
+            scanner.range_min_mm * _M_PER_MM,
+            scanner.range_max_mm * _M_PER_MM,
+            ranges_m(message, scanner),
+            stamp_ns=self._clock.stamp_ns(message.timestamp_ms, stamp_ns),
+            seq=message.sequence,
+            device_ms=message.timestamp_ms,
+        )
+        return ((topics.SCAN, scan),)
+
+    def _count(self, sequence: int) -> None:
+        """Count what a sequence number shows: measurements that never came, and those that came twice."""
+        before, self._sequence = self._sequence, sequence
+        if before is None or sequence < before:  # the first, or a vehicle that was started anew
+            return
+        if sequence == before:
+            self._duplicates.value += 1
+        else:
+            self._gaps.value += sequence - before - 1
+
+    def _geometry(self, message: ScannerInit, stamp_ns: int) -> tuple[Telemetry, ...]:
+        self._scanner = message
+        points = self.options.points
+        if self.options.points_from_scanner:
+            points = points_of(message)
+            for session in filter(None, self._sessions):
+                session.points = points
+        scanner = Scanner(
+            math.radians(message.angle_min_deg),
+            math.radians(message.angle_max_deg),
+            math.radians(message.angle_increment_deg),
+            message.time_increment_ms / 1000,
+            message.range_min_mm * _M_PER_MM,
+            message.range_max_mm * _M_PER_MM,
+            points,
+            stamp_ns=stamp_ns,
+        )
+        return ((topics.SCANNER, scanner),)
+
+    def _motion(self, message: DriveInfo, stamp_ns: int) -> tuple[Telemetry, ...]:
+        speed = min(1.0, message.speed / self.options.speed_full)
+        a, g = self._acceleration, self._gyro
+        motion = Motion(
+            -speed if self._backward and speed else speed,
+            (message.longitudinal * a, -message.lateral * a, message.vertical * a),
+            (message.gyro_x * g, message.gyro_y * g, message.gyro_z * g),
+            message.temperature,
+            stamp_ns=stamp_ns,
+        )
+        return ((topics.MOTION, motion),)
+
+    # Commands to messages
+
+    def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
+        if isinstance(command, Drive):
+            return self._drive(command, now)
+        if topic is topics.CMD_LIGHT and isinstance(command, Switch):
+            self._light = command.on
+            self._send(msgspec.structs.replace(self._command, light=command.on), now)
+            return Outcome()
+        raise Refused("an ALF vehicle has no such command")
+
+    def stop(self, now: float, until: float) -> None:
+        self._send(self._neutral(), now, urgent=True)
+
+    def ask(self, topic: Topic) -> None:
+        raise Refused(f"an ALF vehicle cannot be asked for its {topic.path}")
+
+    def _drive(self, command: Drive, now: float) -> Outcome:
+        if command.left and not (command.forward or command.turn):
+            raise Refused("left: an ALF vehicle steers, it does not move sideways")
+        if command.light is not None:
+            self._light = command.light
+        backward = command.forward < 0 or (self._backward and not command.forward)
+        steering_deg = round((command.turn if command.forward < 0 else -command.turn) * FULL_LOCK_DEG)
+        speed = round(abs(command.forward) * self.options.speed_full)
+        self._send(self._written(speed, backward=backward, steering_deg=steering_deg), now)
+        return Outcome(left_out="left: an ALF vehicle steers, it does not move sideways" if command.left else None)
+
+    def _neutral(self) -> DriveCommand:
+        """Stand, wheels straight; the direction stays, for a vehicle that still rolls."""
+        return self._written(0, backward=self._backward, steering_deg=0)
+
+    def _written(self, speed: int, *, backward: bool, steering_deg: int) -> DriveCommand:
+        """Make a command; steering_deg: to the right positive."""
+        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        return DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
+
+    def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
+        session = self._sessions[0]
+        if session is None:
+            raise Refused("offline")
+        session.drive(command, now, urgent=urgent)
+        self._command = command
+        self._backward = command.direction == _BACKWARD
+
+
+def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
+    """Give the ranges in metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
+    points = message.points
+    ranges: Floats = np.multiply(points, _M_PER_MM, dtype=np.float32, casting="unsafe")
+    least = max(1, scanner.range_min_mm)
+    ranges[(points < least) | (points > scanner.range_max_mm)] = np.nan
+    ranges[: message.first_valid] = np.nan
+    ranges[message.last_valid + 1 :] = np.nan
+    return ranges
+
+
+def points_of(scanner: ScannerInit) -> int:
+    """Reckon how many points a scanner's geometry gives; raise ProtocolError where that is absurd."""
+    points = round((scanner.angle_max_deg - scanner.angle_min_deg) / scanner.angle_increment_deg) + 1
+    if not 1 <= points <= MOST_POINTS:
+        raise ProtocolError(f"scanner init with {points} points, expected 1 to {MOST_POINTS}")
+    return points
+
+
+_TELEMETRY: dict[type[AlfMessage], Callable[[AlfRobot, Any, int], tuple[Telemetry, ...]]] = {
+    Measurement: AlfRobot._scan,
+    ScannerInit: AlfRobot._geometry,
+    DriveInfo: AlfRobot._motion,
+}

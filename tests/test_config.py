@@ -44,7 +44,10 @@ def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
     assert made.addresses == (Address("127.0.0.1", 11001),)
     assert made.protocol.name == "tcpudp"
     assert made.options == made.protocol.options()
-    assert (made.config.control.lease_s, made.config.control.deadman_s) == (3.0, 2.0)
+    control = made.config.control
+    assert (control.lease_s, control.deadman_s) == (3.0, 2.0)
+    assert (control.rate_hz, control.slew_per_s) == (None, None)
+    assert (control.audit, control.audit_bytes, control.audit_files) == (None, 1_000_000, 5)
     assert made.config.bus.effective_mode == "peer"
     assert made.config.bus.multicast
     assert made.config.bus.stream == "drop"
@@ -72,7 +75,13 @@ multicast = false
 stream = "block"
 tls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }
 [control]
+lease_s = 10
 deadman_s = 0.5
+rate_hz = 50
+slew_per_s = 0.5
+audit = "/var/log/zbridge/audit.jsonl"
+audit_bytes = 5000
+audit_files = 2
 [metrics]
 listen = "127.0.0.1:9100"
 """,
@@ -82,7 +91,9 @@ listen = "127.0.0.1:9100"
     assert made.config.bus.connect == ("tcp/10.0.0.1:7447",)
     assert made.config.bus.tls is not None
     assert made.config.bus.tls.key == "k.pem"
-    assert made.config.control.deadman_s == 0.5
+    control = made.config.control
+    assert (control.lease_s, control.deadman_s, control.rate_hz, control.slew_per_s) == (10.0, 0.5, 50.0, 0.5)
+    assert (control.audit, control.audit_bytes, control.audit_files) == ("/var/log/zbridge/audit.jsonl", 5000, 2)
     assert made.metrics == Address("127.0.0.1", 9100)
 
 
@@ -102,12 +113,15 @@ def test_the_mode_of_the_bus_is_client_when_only_connect_is_given(bus: dict[str,
 
 
 def test_variables_of_the_environment_are_put_into_strings_wherever_they_stand() -> None:
-    raw = minimal(robot={"name": "r-${N}${N}"}, bus={"connect": ["tcp/${HOST}:7447"]})
+    raw = minimal(
+        robot={"name": "r-${N}${N}"}, bus={"connect": ["tcp/${HOST}:7447"]}, control={"audit": "/log/${N}.jsonl"}
+    )
     raw["device"]["connect"] = ["tcp://${HOST}:${PORT}"]
     made = plan(raw, {"N": "7", "HOST": "robot.test", "PORT": "11001"})
     assert made.config.robot.name == "r-77"
     assert made.addresses == (Address("robot.test", 11001),)
     assert made.config.bus.connect == ("tcp/robot.test:7447",)
+    assert made.config.control.audit == "/log/7.jsonl"
 
 
 def test_a_value_of_the_environment_is_not_substituted_again() -> None:
@@ -153,6 +167,18 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (minimal(control={"lease_s": 0}), "control.lease_s = 0: expected `float` > 0"),
     (minimal(control={"deadman_s": float("nan")}), "control.deadman_s = nan: expected"),
     (minimal(control={"deadman_s": float("inf")}), "control.deadman_s = inf: expected"),
+    (minimal(control={"lease_s": 3601}), "control.lease_s = 3601: expected `float` <= 3600"),
+    (minimal(control={"rate_hz": 0}), "control.rate_hz = 0: expected `float` > 0"),
+    (minimal(control={"rate_hz": math.nan}), "control.rate_hz = nan: expected `float` > 0"),
+    (minimal(control={"slew_per_s": -1.0}), "control.slew_per_s = -1.0: expected `float` > 0"),
+    (minimal(control={"slew_per_s": math.nan}), "control.slew_per_s = nan: expected `float` > 0"),
+    (minimal(control={"slew_per_s": "fast"}), "control.slew_per_s = 'fast': expected `float"),
+    (minimal(control={"audit": ""}), "control.audit = '': expected `str` of length >= 1"),
+    (minimal(control={"audit": True}), "control.audit = True: expected `str"),
+    (minimal(control={"audit_bytes": 999}), "control.audit_bytes = 999: expected `int` >= 1000"),
+    (minimal(control={"audit_bytes": 1e6 + 0.5}), "control.audit_bytes = 1000000.5: expected `int`"),
+    (minimal(control={"audit_files": 0}), "control.audit_files = 0: expected `int` >= 1"),
+    (minimal(control={"audit_file": "x"}), "control.audit_file = 'x': unknown key"),
     *[
         (device(options={name: value}), f"device.options.{name} = {value}: expected `float` ")
         for name in ("speed_full", "turn_full", "length_unit_m", "map_cell_m", "heading_offset")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import json
 import math
 import struct
 from collections.abc import AsyncIterator, Callable
@@ -14,19 +15,22 @@ import msgpack
 import pytest
 
 from gateways.tcpudp.translate import Options, TcpUdpRobot
-from tests.clock import jumping
-from zbridge.bus import Handle, Question
+from tests.clock import JumpingLoop, jumping
+from zbridge.audit import Audit
+from zbridge.bus import Handle, Lane, Question, Sample
 from zbridge.bus.fake import FakeBus, FakeQuestion
-from zbridge.commands import STOP_REPEAT_S
+from zbridge.bus.interface import LaneOf
 from zbridge.conversation import Conversation
 from zbridge.device import HEARTBEAT_S, Device
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
+from zbridge.leases import STOP_REPEAT_S
 from zbridge.link import Address, FakeLink
 from zbridge.metrics import Metrics
 from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
+from zbridge.session.motion import MotionLimits
 from zbridge.session.session import State
 
 ADDRESS = Address("robot.test", 11001)
@@ -43,8 +47,14 @@ POSITION = bytes.fromhex("0e000000 01 37 00001643 000048c2 0000b442")
 MAP = bytes.fromhex("0f000000 01 35 09000000 000102 020200 010001")
 BYE = bytes.fromhex("09000000 01 01 03000000 627965")
 
+AUTONOMOUS = bytes.fromhex("06000000 02 0a 03000000")
+
 DRIVE_LEFT = {"left": 1.0}
 NEUTRAL: dict[str, Any] = {}
+FOREVER_S = 1e6
+"""A lease that no test outlives."""
+NEED_A_LEASE = {"drive", "motor", "mode", "raw"}
+DENIED = {"ok": False, "token": None, "expires_in_s": None, "holder": None, "reason": None}
 
 
 class TimedLink(FakeLink):
@@ -61,41 +71,115 @@ class TimedLink(FakeLink):
 
 
 class OpenBus(FakeBus):
-    """Lets a test put a question whose answer comes later."""
+    """Lets a test put a question whose answer comes later, and keeps the lanes that were asked for."""
 
     def __init__(self) -> None:
         super().__init__("1")
         self.answers: dict[str, Callable[[Question], None]] = {}
+        self.lanes: dict[str, Lane | LaneOf] = {}
 
-    def answer(self, key: str, handler: Callable[[Question], None]) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
         self.answers[key] = handler
-        return super().answer(key, handler)
+        self.lanes[key] = lane
+        return super().answer(key, handler, lane=lane)
+
+    def subscribe(
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        lane: Lane | LaneOf = Lane.OTHER,
+        history: bool = False,
+    ) -> Handle:
+        self.lanes[key_expr] = lane
+        return super().subscribe(key_expr, handler, lane=lane, history=history)
+
+
+class Program:
+    """A program on the bus that drives: its lease, and the number of its last command."""
+
+    def __init__(self, rig: Rig, who: str) -> None:
+        self.who = who
+        self.token: bytes | None = None
+        self.seq = 0
+        self._rig = rig
+        self._bus = rig.bus.join(who)
+
+    def ask(self, name: str, **fields: Any) -> dict[str, Any]:
+        """Ask something about the lease."""
+        (reply,) = self._rig.ask(f"control/{name}", msgpack.packb(fields)).replies
+        assert reply.error is None
+        lease: dict[str, Any] = msgpack.unpackb(reply.payload)
+        return lease
+
+    def acquire(self, how: str = "acquire", **wishes: Any) -> dict[str, Any]:
+        """Ask for the lease, and keep its token."""
+        lease = self.ask(how, who=self.who, **wishes)
+        if lease["ok"]:
+            self.token = lease["token"]
+        return lease
+
+    def renew(self) -> dict[str, Any]:
+        return self.ask("renew", token=self.token)
+
+    def release(self) -> dict[str, Any]:
+        return self.ask("release", token=self.token)
+
+    def attachment(self) -> bytes | None:
+        """What goes with the next command of a holder."""
+        self.seq += 1
+        packed: bytes | None = msgpack.packb({"token": self.token, "seq": self.seq}) if self.token else None
+        return packed
+
+    def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
+        """Command the robot, with the lease where the command needs it."""
+        self.put(name, fields, self.attachment() if name.split("/")[0] in NEED_A_LEASE else None)
+
+    def put(self, name: str, fields: dict[str, Any] | bytes, attachment: bytes | None) -> None:
+        """Command the robot with this attachment."""
+        payload = fields if isinstance(fields, bytes) else msgpack.packb(fields)
+        self._bus.publisher(f"fleet/r1/@cmd/{name}", topics.CMD_MODE).put(payload, attachment)
 
 
 class Rig:
-    """A device with everything around it played by the test."""
+    """A device with everything around it played by the test; ``driver`` is the program that commands it."""
 
-    def __init__(self, options: Options, deadman_s: float, bus: OpenBus) -> None:
+    def __init__(
+        self,
+        options: Options | None = None,
+        *,
+        lease_s: float = FOREVER_S,
+        deadman_s: float = 2.0,
+        limits: MotionLimits | None = None,
+        bus: OpenBus | None = None,
+    ) -> None:
         self.loop = asyncio.get_running_loop()
-        self.bus = bus
+        self.bus = bus or OpenBus()
         self.hq = self.bus.join("2")
         self.metrics = Metrics()
         self.manager = SessionManager()
         self.links: list[TimedLink] = []
         self.conversations: list[Conversation] = []
         self.unreachable: str | None = None
+        self.audit_lines: list[str] = []
+        tokens = (bytes([number]) * 16 for number in itertools.count(1))
         self.device = Device(
-            TcpUdpRobot(options),
+            TcpUdpRobot(options or Options()),
             (ADDRESS,),
             protocol="tcpudp",
             keys=KeySpace("fleet", "r1"),
             bus=self.bus,
-            authority=Authority(deadman_s),
+            authority=Authority(lease_s, deadman_s, lambda: next(tokens)),
             manager=self.manager,
             metrics=self.metrics,
+            audit=Audit("r1", self.audit_lines.append),
+            limits=limits,
             connect=self._connect,
             clock_ns=lambda: 1234,
         )
+        self.driver = Program(self, "driver")
+        self.hold = self.driver.acquire
+        self.command = self.driver.command
         self._read = 0
 
     async def _connect(self, address: Address, conversation: Conversation) -> None:
@@ -131,14 +215,14 @@ class Rig:
         """Play the loss of the connection."""
         self.conversations[-1].lost(reason)
 
-    def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
-        """Play a program on the bus that commands the robot."""
-        payload = fields if isinstance(fields, bytes) else msgpack.packb(fields)
-        self.hq.publisher(f"fleet/r1/@cmd/{name}", topics.CMD_MODE).put(payload)
+    def freeze(self, seconds: float) -> None:
+        """Let time pass in which the gateway does nothing, as if its process stood still."""
+        assert isinstance(self.loop, JumpingLoop)
+        self.loop._jumping.now += seconds
 
-    def ask(self, name: str) -> FakeQuestion:
+    def ask(self, name: str, payload: bytes = b"") -> FakeQuestion:
         """Play a program on the bus that asks the robot."""
-        question = FakeQuestion(f"fleet/r1/@rpc/{name}")
+        question = FakeQuestion(f"fleet/r1/@rpc/{name}", payload)
         self.bus.answers[question.key](question)
         return question
 
@@ -156,25 +240,47 @@ class Rig:
         start, self._read = self._read, len(self.link.written)
         return self.link.written[start:]
 
+    @property
+    def control(self) -> dict[str, Any]:
+        """What ``control`` shows, without the refusals."""
+        return {name: value for name, value in self.last("control").items() if name != "refusals"}
+
     async def refusals(self) -> list[tuple[str, str, int]]:
         """What ``control`` shows: command, reason, count."""
+        return [(command, reason, count) for _, command, reason, count in await self.refused()]
+
+    async def refused(self) -> list[tuple[str | None, str, str, int]]:
+        """What ``control`` shows: who, command, reason, count."""
         await asyncio.sleep(0.06)
-        return [(entry["command"], entry["reason"], entry["count"]) for entry in self.last("control")["refusals"]]
+        return [tuple(entry.values()) for entry in self.last("control")["refusals"]]  # type: ignore[misc]
+
+    @property
+    def audited(self) -> list[dict[str, Any]]:
+        """The audit log without the times."""
+        lines = [json.loads(line) for line in self.audit_lines]
+        return [{name: value for name, value in line.items() if name not in ("time", "robot")} for line in lines]
+
+    def counted(self, what: str) -> int:
+        """How often the right to drive changed in this way."""
+        return self.metrics.count("control", what=what).value
 
 
 @contextlib.asynccontextmanager
 async def serving(
     options: Options | None = None,
     *,
-    deadman_s: float = 2.0,
     unreachable: str | None = None,
-    bus: OpenBus | None = None,
+    hold: bool = True,
+    **more: Any,
 ) -> AsyncIterator[Rig]:
-    rig = Rig(options or Options(), deadman_s, bus or OpenBus())
+    """Run a device; unless told otherwise, a program holds the lease."""
+    rig = Rig(options, **more)
     rig.unreachable = unreachable
     task = asyncio.create_task(rig.device.run())
     try:
         await rig.settle()
+        if hold:
+            assert rig.hold()["ok"]
         yield rig
     finally:
         task.cancel()
@@ -183,8 +289,8 @@ async def serving(
 
 
 @contextlib.asynccontextmanager
-async def established(options: Options | None = None, *, deadman_s: float = 2.0) -> AsyncIterator[Rig]:
-    async with serving(options, deadman_s=deadman_s) as rig:
+async def established(options: Options | None = None, **more: Any) -> AsyncIterator[Rig]:
+    async with serving(options, **more) as rig:
         await rig.establish()
         yield rig
 
@@ -530,11 +636,12 @@ async def test_a_stop_stops_the_robot_whatever_its_payload(payload: bytes) -> No
 
 
 @jumping
-async def test_a_stop_leaves_before_neutral_and_motion_that_follow_at_once() -> None:
+async def test_a_stop_leaves_before_neutral_and_motion_of_the_next_holder_that_follow_at_once() -> None:
     async with established() as rig:
         rig.command("drive", DRIVE_LEFT)
         rig.forget_written()
         rig.command("stop")
+        rig.hold()
         rig.command("drive", NEUTRAL)
         rig.command("drive", {"turn": 0.5})
         await asyncio.sleep(0.05)
@@ -589,21 +696,20 @@ async def test_a_stop_shows_on_control_at_once() -> None:
 
 
 @jumping
-async def test_motion_after_a_stop_needs_neutral() -> None:
+async def test_nobody_drives_after_a_stop_before_acquiring_anew() -> None:
     async with established() as rig:
         rig.command("stop")
         await asyncio.sleep(2.0)
         rig.forget_written()
-        rig.command("drive", DRIVE_LEFT)
+        for fields in (DRIVE_LEFT, NEUTRAL, DRIVE_LEFT):
+            rig.command("drive", fields)
+            await asyncio.sleep(0.1)
         assert rig.written() == []
-        ((command, reason, count),) = await rig.refusals()
-        assert (command, count) == ("drive", 1)
-        assert "neutral" in reason
-        rig.command("drive", NEUTRAL)
-        assert rig.written() == [STOP]
-        await asyncio.sleep(0.1)
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (stop)", 3)]
+        assert rig.driver.renew() == {**DENIED, "reason": "the lease has ended (stop)"}
+        rig.hold()
         rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+        assert rig.written() == [MOVE_LEFT], "whoever acquires needs no neutral"
 
 
 @jumping
@@ -618,18 +724,18 @@ async def test_a_refused_drive_does_not_end_the_stop_that_is_repeated() -> None:
 
 @jumping
 async def test_silence_while_moving_stops_the_robot_after_the_deadman_time() -> None:
-    async with established(deadman_s=0.5) as rig:
+    async with established(deadman_s=0.6) as rig:
         start = rig.loop.time()
         rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.49)
+        await asyncio.sleep(0.59)
         assert set(rig.written()) == {MOVE_LEFT}
         await asyncio.sleep(3.0)
         stops = rig.written()
         assert set(stops) == {STOP}
         assert 10 <= len(stops) <= 11
-        assert rig.link.times[-len(stops)] == pytest.approx(start + 0.5)
+        assert rig.link.times[-len(stops)] == pytest.approx(start + 0.6)
         assert rig.link.times[-1] - rig.link.times[-len(stops)] >= STOP_REPEAT_S - 0.11
-        assert rig.last("control")["state"] == "stopped"
+        assert rig.control["holder"] == "driver", "the lease stays until it expires"
 
 
 @jumping
@@ -642,14 +748,23 @@ async def test_fresh_commands_keep_the_robot_moving() -> None:
 
 
 @jumping
-async def test_other_commands_do_not_keep_the_robot_moving() -> None:
-    async with established(deadman_s=0.5) as rig:
-        rig.command("drive", DRIVE_LEFT)
+async def test_nothing_but_the_holders_fresh_commands_keeps_the_robot_moving() -> None:
+    async with established(deadman_s=0.6) as rig:
+        other = Program(rig, "other")
+        seen = rig.driver.attachment()
+        rig.driver.put("drive", DRIVE_LEFT, seen)
         for _ in range(4):
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.145)
             rig.command("text", {"text": "hi"})
-            rig.command("drive", {"left": 9.0})
-        assert rig.last("control")["state"] == "stopped"
+            rig.command("dance")
+            rig.driver.put("drive", DRIVE_LEFT, seen)
+            rig.driver.put("drive", DRIVE_LEFT, None)
+            rig.driver.renew()
+            rig.ask("pose")
+            other.command("drive", DRIVE_LEFT)
+            other.acquire()
+        assert STOP not in rig.written()
+        await asyncio.sleep(0.03)
         assert STOP in rig.written()
 
 
@@ -658,7 +773,10 @@ async def test_a_standing_robot_is_not_stopped_by_the_deadman() -> None:
     async with established(deadman_s=0.5) as rig:
         rig.command("drive", NEUTRAL)
         await asyncio.sleep(5.0)
-        assert rig.last("control")["state"] == "free"
+        assert rig.control["state"] == "held"
+        assert rig.counted("stopped") == 0
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written()[-1] == MOVE_LEFT
 
 
 @jumping
@@ -678,7 +796,7 @@ async def test_motion_after_the_deadman_needs_neutral() -> None:
 
 
 @jumping
-async def test_the_loss_of_the_bus_stops_a_moving_robot() -> None:
+async def test_the_loss_of_the_bus_stops_a_moving_robot_and_ends_the_lease() -> None:
     async with established() as rig:
         rig.command("drive", DRIVE_LEFT)
         await asyncio.sleep(0.1)
@@ -688,16 +806,792 @@ async def test_the_loss_of_the_bus_stops_a_moving_robot() -> None:
         await asyncio.sleep(2.0)
         assert len(rig.written()) >= 9
         rig.bus.connection(True)
-        rig.command("drive", DRIVE_LEFT)
+        for fields in (NEUTRAL, DRIVE_LEFT):
+            rig.command("drive", fields)
         assert rig.written() == []
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (bus lost)", 2)]
+        rig.hold()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
 
 
 @jumping
-async def test_the_loss_of_the_bus_does_not_touch_a_standing_robot() -> None:
+async def test_the_loss_of_the_bus_ends_the_lease_of_a_standing_robot_and_sends_it_nothing() -> None:
     async with established() as rig:
         rig.bus.connection(False)
         await asyncio.sleep(1.0)
         assert rig.written() == []
+        assert (rig.control["state"], rig.control["holder"]) == ("stopped", None)
+        rig.bus.connection(True)
+        assert rig.driver.renew()["reason"] == "the lease has ended (bus lost)"
+
+
+@jumping
+async def test_the_loss_of_the_bus_is_nothing_to_a_robot_nobody_holds() -> None:
+    async with established(hold=False) as rig:
+        rig.bus.connection(False)
+        await asyncio.sleep(1.0)
+        assert rig.control["state"] == "free"
+        assert rig.audit_lines == []
+
+
+# The lease
+
+
+OF_THE_HOLDER = [
+    ("drive", DRIVE_LEFT),
+    ("drive", NEUTRAL),
+    ("mode", {"mode": "manual"}),
+    ("raw/tcpudp", {"id": 40, "body": b"hi"}),
+    ("motor/left", {"value": 1.0}),
+]
+
+
+@jumping
+async def test_whoever_acquires_a_free_robot_is_given_its_lease_and_shown_as_the_holder() -> None:
+    async with established(hold=False, lease_s=3.0) as rig:
+        assert rig.control == {"state": "free", "holder": None, "priority": None, "expires_in_s": None}
+        lease = rig.hold(priority=4)
+        assert lease == {"ok": True, "token": bytes([1]) * 16, "expires_in_s": 3.0, "holder": "driver", "reason": None}
+        assert rig.control == {"state": "held", "holder": "driver", "priority": 4, "expires_in_s": 3.0}
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+        assert (rig.counted("acquired"), rig.metrics.total("refused")) == (1, 0)
+
+
+@jumping
+async def test_control_counts_the_time_that_is_left_down_and_never_shows_the_token() -> None:
+    async with established(lease_s=5.0) as rig:
+        rig.hold("takeover")
+        assert rig.driver.token is not None
+        start = rig.loop.time()
+        await asyncio.sleep(3 * HEARTBEAT_S)
+        left = rig.control["expires_in_s"]
+        assert 5.0 - 3 * HEARTBEAT_S <= left < 5.0 - 2 * HEARTBEAT_S + 1e-6
+        assert rig.loop.time() == pytest.approx(start + 3.0)
+        assert not any(rig.driver.token in payload for payload in rig.bus.values("fleet/r1/*"))
+
+
+@pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
+@jumping
+async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(
+    name: str, fields: dict[str, Any]
+) -> None:
+    async with established(hold=False) as rig:
+        rig.command(name, fields)
+        assert rig.written() == []
+        assert rig.metrics.total("refused") == 1
+        assert await rig.refused() == [(None, name, "no lease: acquire first", 1)]
+        assert rig.counted("stopped") == 0
+
+
+@pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
+@jumping
+async def test_of_two_programs_only_the_holders_commands_are_carried_out(name: str, fields: dict[str, Any]) -> None:
+    async with established() as rig:
+        other = Program(rig, "other")
+        assert other.acquire("takeover")["ok"]
+        assert rig.hold("takeover")["ok"]
+        rig.command("drive", {"turn": 0.5})
+        await asyncio.sleep(0.05)
+        assert rig.written() == [TURN_LEFT]
+        for _ in range(3):
+            other.command(name, fields)
+        assert rig.written() == []
+        assert await rig.refused() == [("other", name, "the lease has ended (taken over by driver)", 3)]
+        assert rig.metrics.total("refused") == 3
+        assert rig.control["holder"] == "driver"
+        rig.command("drive", {"turn": 0.5})
+        assert rig.written() == [TURN_LEFT], "the holder drives on"
+
+
+@jumping
+async def test_a_guessed_token_is_nobodys() -> None:
+    async with established() as rig:
+        forger = Program(rig, "forger")
+        for token in (bytes(16), bytes([1]) * 15, bytes([1]) * 17, b""):
+            forger.put("drive", DRIVE_LEFT, msgpack.packb({"token": token, "seq": 1_000}))
+        assert rig.written() == []
+        assert await rig.refused() == [(None, "drive", "held by driver (priority 0)", 4)]
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT], "their numbers are not the holder's"
+
+
+@pytest.mark.parametrize(
+    "attachment",
+    [
+        b"",
+        b"\xc1",
+        b"\x90",
+        b"\x91" * 100_000,
+        msgpack.packb({}),
+        msgpack.packb({"token": bytes([1]) * 16}),
+        msgpack.packb({"seq": 1}),
+        msgpack.packb({"token": "text", "seq": 1}),
+        msgpack.packb({"token": bytes([1]) * 16, "seq": -1}),
+        msgpack.packb({"token": bytes([1]) * 16, "seq": 1.5}),
+    ],
+)
+@jumping
+async def test_a_malformed_attachment_is_refused(attachment: bytes) -> None:
+    async with established() as rig:
+        rig.driver.put("drive", DRIVE_LEFT, attachment)
+        assert rig.written() == []
+        assert await rig.refused() == [(None, "drive", "malformed attachment: expected {token, seq}", 1)]
+
+
+@jumping
+async def test_a_command_repeated_or_out_of_order_is_refused() -> None:
+    async with established() as rig:
+        late, first = rig.driver.attachment(), rig.driver.attachment()
+        rig.driver.put("drive", {"turn": 0.5}, first)
+        for attachment in (first, late, first):
+            rig.driver.put("drive", DRIVE_LEFT, attachment)
+        await asyncio.sleep(0.1)
+        assert rig.written() == [TURN_LEFT]
+        assert await rig.refused() == [("driver", "drive", "repeated or out of order", 3)]
+
+
+@jumping
+async def test_a_late_neutral_of_the_holder_does_not_end_its_motion() -> None:
+    async with established(deadman_s=60.0) as rig:
+        neutral = rig.driver.attachment()
+        rig.command("drive", DRIVE_LEFT)
+        rig.driver.put("drive", NEUTRAL, neutral)
+        await asyncio.sleep(2.0)
+        assert set(rig.written()) == {MOVE_LEFT}
+
+
+@jumping
+async def test_the_numbers_of_a_new_lease_begin_anew() -> None:
+    async with established() as rig:
+        rig.driver.seq = 1_000_000
+        rig.command("drive", NEUTRAL)
+        rig.hold("takeover")
+        rig.driver.seq = -1
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        assert rig.written() == [STOP, MOVE_LEFT]
+        assert rig.metrics.total("refused") == 0
+
+
+@jumping
+async def test_neutral_of_anybody_else_has_no_effect() -> None:
+    async with established(deadman_s=60.0) as rig:
+        other = Program(rig, "other")
+        other.acquire("takeover")
+        rig.hold("takeover")
+        rig.command("drive", DRIVE_LEFT)
+        other.command("drive", NEUTRAL)
+        other.put("drive", NEUTRAL, None)
+        await asyncio.sleep(2.0)
+        assert set(rig.written()) == {MOVE_LEFT}
+        assert rig.control["holder"] == "driver"
+
+
+@jumping
+async def test_neutral_of_anybody_else_does_not_make_motion_possible() -> None:
+    async with established(deadman_s=0.2) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(3.0)
+        rig.forget_written()
+        Program(rig, "other").command("drive", NEUTRAL)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+
+
+@pytest.mark.parametrize(
+    ("name", "fields"),
+    [
+        ("text", {"text": "hi"}),
+        ("lidar", {"on": True}),
+        (
+            "scan",
+            {"angle_min": 0.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": bytes(8)},
+        ),
+        ("stop", {}),
+    ],
+)
+@pytest.mark.parametrize("hold", [False, True])
+@jumping
+async def test_what_moves_nothing_needs_no_lease(name: str, fields: dict[str, Any], hold: bool) -> None:
+    async with established(hold=hold) as rig:
+        Program(rig, "other").command(name, fields)
+        assert len(rig.written()) == 1
+        assert rig.metrics.total("refused") == 0
+
+
+@jumping
+async def test_a_light_that_the_robot_has_not_is_refused_for_that_and_not_for_want_of_a_lease() -> None:
+    async with established(hold=False) as rig:
+        rig.command("light", {"on": True})
+        assert await rig.refusals() == [("light", "a TCP/UDP robot has no such command", 1)]
+
+
+@jumping
+async def test_a_robot_that_is_held_is_not_given_to_another_of_the_same_priority() -> None:
+    async with established(lease_s=3.0) as rig:
+        other = Program(rig, "other")
+        assert other.acquire() == {
+            **DENIED,
+            "expires_in_s": pytest.approx(3.0 - 1.15),
+            "holder": "driver",
+            "reason": "held by driver (priority 0)",
+        }
+        assert await rig.refused() == [("other", "acquire", "held by driver (priority 0)", 1)]
+        assert rig.metrics.total("refused") == 1
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@pytest.mark.parametrize(("how", "priority"), [("takeover", 0), ("takeover", -5), ("acquire", 1)])
+@jumping
+async def test_the_stop_of_a_moving_robot_that_changes_hands_goes_before_the_new_holders_motion(
+    how: str, priority: int
+) -> None:
+    async with established(deadman_s=60.0) as rig:
+        other = Program(rig, "other")
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        assert other.acquire(how, priority=priority)["ok"]
+        other.command("drive", {"turn": 0.5})
+        assert rig.written() == [STOP]
+        await asyncio.sleep(2.0)
+        assert set(rig.written()) == {TURN_LEFT}
+        rig.command("drive", DRIVE_LEFT)
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (taken over by other)", 1)]
+        assert (rig.control["holder"], rig.control["priority"]) == ("other", priority)
+        assert rig.counted("taken over" if how == "takeover" else "acquired") == (1 if how == "takeover" else 2)
+
+
+@jumping
+async def test_a_standing_robot_that_changes_hands_is_sent_nothing() -> None:
+    async with established() as rig:
+        Program(rig, "other").acquire("takeover")
+        await asyncio.sleep(1.0)
+        assert rig.written() == []
+
+
+@jumping
+async def test_a_moving_robot_that_is_released_is_stopped_for_a_second_and_free() -> None:
+    async with established(deadman_s=60.0) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        assert rig.driver.release() == {**DENIED, "ok": True}
+        assert rig.written() == [STOP]
+        assert rig.control["state"] == "free"
+        await asyncio.sleep(2.0)
+        stops = rig.written()
+        assert set(stops) == {STOP}
+        assert 9 <= len(stops) <= 10
+        rig.command("drive", DRIVE_LEFT)
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (released)", 1)]
+        assert Program(rig, "other").acquire()["ok"]
+
+
+@jumping
+async def test_a_standing_robot_that_is_released_is_sent_nothing() -> None:
+    async with established() as rig:
+        rig.driver.release()
+        await asyncio.sleep(1.0)
+        assert rig.written() == []
+        assert rig.control["state"] == "free"
+
+
+@jumping
+async def test_a_lease_that_has_ended_or_never_was_is_neither_renewed_nor_released() -> None:
+    async with established() as rig:
+        rig.driver.release()
+        ended = {**DENIED, "reason": "the lease has ended (released)"}
+        assert (rig.driver.renew(), rig.driver.release()) == (ended, ended)
+        assert rig.driver.ask("renew", token=bytes(16)) == {**DENIED, "reason": "no lease: acquire first"}
+        other = Program(rig, "other")
+        other.acquire()
+        for name in ("renew", "release"):
+            denied = other.ask(name, token=bytes(16))
+            assert (denied["ok"], denied["token"], denied["holder"]) == (False, None, "other")
+            assert denied["reason"] == "held by other (priority 0)"
+        assert rig.control["holder"] == "other"
+
+
+@pytest.mark.parametrize("name", ["acquire", "takeover", "renew", "release"])
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x90", b"\x81", msgpack.packb({"who": 5, "token": 5})])
+@jumping
+async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(
+    name: str, payload: bytes
+) -> None:
+    async with established(hold=False) as rig:
+        (reply,) = rig.ask(f"control/{name}", payload).replies
+        assert reply.error is not None
+        expected = "Acquire" if name in ("acquire", "takeover") else "LeaseToken"
+        assert reply.error.startswith(f"{expected}: "), "the message that was expected"
+        assert len(reply.error) > len(expected) + 5
+        assert rig.control["state"] == "free"
+
+
+@pytest.mark.parametrize(
+    ("wishes", "reason"),
+    [
+        ({"who": ""}, "who = ''"),
+        ({"lease_s": 0.0}, "lease_s = 0"),
+        ({"deadman_s": -1.0}, "deadman_s = -1"),
+        ({"lease_s": math.nan}, "lease_s = nan"),
+    ],
+)
+@pytest.mark.parametrize("how", ["acquire", "takeover"])
+@jumping
+async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_holder(
+    how: str, wishes: dict[str, Any], reason: str
+) -> None:
+    async with established() as rig:
+        denied = rig.driver.ask(how, **{"who": "other", "priority": 9, **wishes})
+        assert (denied["ok"], denied["token"]) == (False, None)
+        assert denied["reason"].startswith(reason)
+        assert rig.control["holder"] == "driver"
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_wishes_are_capped_by_the_robots_own() -> None:
+    async with established(hold=False, lease_s=3.0, deadman_s=0.5) as rig:
+        assert rig.hold(lease_s=100.0, deadman_s=100.0)["expires_in_s"] == 3.0
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.55)
+        assert rig.written()[-1] == STOP
+        assert rig.hold("takeover", lease_s=1.0, deadman_s=0.1)["expires_in_s"] == 1.0
+        await asyncio.sleep(0.01)
+        rig.command("drive", DRIVE_LEFT)
+        rig.forget_written()
+        await asyncio.sleep(0.15)
+        assert STOP in rig.written()
+        await asyncio.sleep(1.0)
+        assert rig.control["state"] == "stopped"
+
+
+# The end of a lease
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "sent"),
+    [
+        ("drive", DRIVE_LEFT, MOVE_LEFT),
+        ("mode", {"mode": "autonomous"}, AUTONOMOUS),
+        ("raw/tcpudp", {"id": 21, "body": b"\x01"}, bytes.fromhex("03000000 02 15 01")),
+    ],
+)
+@jumping
+async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(
+    name: str, fields: dict[str, Any], sent: bytes
+) -> None:
+    async with established(lease_s=1.0, deadman_s=5.0, hold=False) as rig:
+        rig.hold()
+        await asyncio.sleep(0.5)
+        start = rig.loop.time()
+        rig.command(name, fields)
+        await asyncio.sleep(0.99)
+        assert set(rig.written()) == {sent}
+        await asyncio.sleep(3.0)
+        stops = rig.written()
+        assert set(stops) == {STOP}
+        assert 10 <= len(stops) <= 11
+        assert rig.link.times[-len(stops)] == pytest.approx(start + 1.0)
+        assert rig.control == {"state": "stopped", "holder": None, "priority": None, "expires_in_s": None}
+        for again in (NEUTRAL, DRIVE_LEFT):
+            rig.command("drive", again)
+        assert rig.written() == []
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (lease expired)", 2)]
+        rig.hold()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@pytest.mark.parametrize("mode", ["none", "manual"])
+@jumping
+async def test_a_lease_that_expires_ends_and_sends_a_standing_robot_nothing(mode: str) -> None:
+    async with established(lease_s=1.0, hold=False) as rig:
+        rig.hold()
+        rig.command("mode", {"mode": mode})
+        rig.forget_written()
+        await asyncio.sleep(3.0)
+        assert rig.written() == []
+        assert rig.control["state"] == "stopped"
+        assert rig.counted("ended") == 1
+
+
+@jumping
+async def test_renewing_keeps_a_robot_going_that_moves_on_its_own() -> None:
+    async with established(lease_s=1.0, deadman_s=0.3, hold=False) as rig:
+        rig.hold()
+        rig.command("mode", {"mode": "autonomous"})
+        for _ in range(10):
+            await asyncio.sleep(0.9)
+            assert rig.driver.renew() == {**DENIED, "ok": True, "expires_in_s": 1.0, "holder": "driver"}
+        assert rig.written() == [AUTONOMOUS]
+
+
+@jumping
+async def test_a_drive_renews_the_lease() -> None:
+    async with established(lease_s=1.0, hold=False) as rig:
+        rig.hold()
+        for _ in range(10):
+            await asyncio.sleep(0.9)
+            rig.command("drive", DRIVE_LEFT)
+        assert rig.driver.renew()["ok"]
+        assert STOP not in rig.written()
+
+
+@jumping
+async def test_the_commands_of_others_renew_no_lease() -> None:
+    async with established(lease_s=1.0, hold=False) as rig:
+        rig.hold()
+        other = Program(rig, "other")
+        for _ in range(4):
+            await asyncio.sleep(0.3)
+            rig.command("text", {"text": "hi"})
+            other.command("drive", NEUTRAL)
+            other.acquire()
+        assert rig.control["holder"] == "other", "free after a second, and asked for"
+
+
+@jumping
+async def test_a_holder_whose_liveliness_token_goes_is_lost_and_the_robot_stopped_in_the_same_moment() -> None:
+    async with established(deadman_s=60.0, hold=False) as rig:
+        token = rig.hq.announce("fleet/r1/@alive/operator.7")
+        rig.hold(alive="operator.7")
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        token.close()
+        assert rig.written() == [STOP]
+        assert rig.control["state"] == "stopped"
+        for fields in (NEUTRAL, DRIVE_LEFT):
+            rig.command("drive", fields)
+        assert await rig.refused() == [("driver", "drive", "the lease has ended (holder lost)", 2)]
+        await asyncio.sleep(2.0)
+        assert set(rig.written()) == {STOP}
+        rig.hold()
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_the_liveliness_token_of_anybody_else_is_nothing_to_the_holder() -> None:
+    async with established(deadman_s=60.0, hold=False) as rig:
+        own = rig.hq.announce("fleet/r1/@alive/operator.7")
+        others = [
+            rig.hq.announce(key)
+            for key in ("fleet/r1/@alive/operator.8", "fleet/r2/@alive/operator.7", "fleet/r1/@alive/gateway")
+        ]
+        rig.hold(alive="operator.7")
+        rig.command("drive", DRIVE_LEFT)
+        for token in others:
+            token.close()
+        await asyncio.sleep(0.1)
+        assert set(rig.written()) == {MOVE_LEFT}
+        rig.driver.release()
+        Program(rig, "other").acquire()
+        own.close()
+        assert rig.control["holder"] == "other", "the token of a lease that has ended"
+
+
+@jumping
+async def test_a_holder_without_a_liveliness_token_is_not_refused() -> None:
+    async with established(hold=False) as rig:
+        assert rig.hold(alive="operator.7")["ok"]
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@jumping
+async def test_a_lease_outlives_the_loss_of_the_robot() -> None:
+    async with established() as rig:
+        rig.goes()
+        await asyncio.sleep(1.0)
+        assert rig.driver.renew()["ok"]
+        assert Program(rig, "other").acquire()["reason"] == "held by driver (priority 0)"
+        await rig.establish()
+        rig.command("drive", DRIVE_LEFT)
+        assert [reason for _, reason, _ in await rig.refusals()] == [
+            "held by driver (priority 0)",
+            "robot lost: send a neutral drive first",
+        ]
+        rig.command("drive", NEUTRAL)
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.05)
+        assert rig.written()[-1] == MOVE_LEFT
+
+
+@jumping
+async def test_a_robot_that_is_busy_is_stopped_and_the_lease_stays_but_needs_neutral() -> None:
+    async with established(deadman_s=60.0) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.sends(bytes.fromhex("02000000 01 04"))  # serverStartUDP, unasked: it takes nothing for two seconds
+        assert rig.last("status")["reason"] == "handshaking"
+        assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["handshaking"]
+        rig.command("drive", DRIVE_LEFT)
+        rig.command("drive", NEUTRAL)
+        assert await rig.refused() == [("driver", "drive", "handshaking", 2)]
+        await asyncio.sleep(2.5)
+        report, *rest = rig.written()
+        assert report == bytes.fromhex("03000000 02 07 00"), "all that such a robot may be sent at first"
+        assert set(rest) == {STOP}
+        rig.command("drive", DRIVE_LEFT)
+        assert (await rig.refused())[-1] == ("driver", "drive", "no longer busy: send a neutral drive first", 1)
+        assert rig.control["holder"] == "driver"
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written()[-1] == MOVE_LEFT
+
+
+@jumping
+async def test_a_lease_that_expires_while_the_robot_is_away_has_ended_when_it_returns() -> None:
+    async with established(lease_s=2.0, hold=False) as rig:
+        rig.hold()
+        rig.command("drive", DRIVE_LEFT)
+        rig.goes()
+        rig.unreachable = "no route"
+        await asyncio.sleep(3.0)
+        rig.unreachable = None
+        await asyncio.sleep(3.0)
+        await rig.establish()
+        assert rig.control["state"] == "stopped"
+        assert rig.metrics.total("refused") == 0, "a stop for a robot that is away is none that failed"
+        rig.command("drive", NEUTRAL)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == []
+
+
+# A gateway that stood still itself
+
+
+@jumping
+async def test_motion_that_comes_after_the_deadman_time_is_refused_although_the_gateway_was_frozen_meanwhile() -> None:
+    async with established(deadman_s=0.6) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.freeze(5.0)
+        rig.command("drive", {"turn": 0.5})
+        assert rig.written() == [STOP]
+        assert await rig.refusals() == [("drive", "deadman: send a neutral drive first", 1)]
+        await asyncio.sleep(2.0)
+        assert set(rig.written()) == {STOP}
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.1)
+        rig.command("drive", {"turn": 0.5})
+        assert rig.written()[-1] == TURN_LEFT
+        assert rig.counted("stopped") == 1
+
+
+@pytest.mark.parametrize("attachment", [None, b"\xc1", msgpack.packb({"token": bytes(16), "seq": 1})])
+@jumping
+async def test_a_late_command_of_anybody_lets_the_deadman_act(attachment: bytes | None) -> None:
+    async with established(deadman_s=0.6) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.freeze(5.0)
+        rig.driver.put("drive", NEUTRAL, attachment)
+        assert rig.written() == [STOP]
+
+
+@jumping
+async def test_a_late_neutral_is_taken_behind_the_stop_that_was_due() -> None:
+    async with established(deadman_s=0.6) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.freeze(5.0)
+        rig.command("drive", NEUTRAL)
+        rig.command("drive", {"turn": 0.5})
+        await asyncio.sleep(0.05)
+        assert rig.written() == [STOP, TURN_LEFT]
+        assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["deadman"]
+
+
+@pytest.mark.parametrize("how", ["drive", "renew", "release"])
+@jumping
+async def test_what_the_holder_does_after_its_lease_expired_comes_too_late(how: str) -> None:
+    async with established(lease_s=3.0, hold=False) as rig:
+        rig.hold()
+        rig.command("mode", {"mode": "autonomous"})
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.freeze(5.0)
+        if how == "drive":
+            rig.command("drive", DRIVE_LEFT)
+            assert rig.written() == [STOP]
+            ((_, reason, _),) = await rig.refusals()
+        else:
+            reason = rig.driver.ask(how, token=rig.driver.token)["reason"]
+            assert rig.written() == [STOP]
+        assert reason == "the lease has ended (lease expired)"
+        assert rig.control["state"] == "stopped"
+        assert rig.counted("ended") == 1
+
+
+@jumping
+async def test_a_gateway_that_wakes_from_being_frozen_sends_the_stop_before_any_repetition() -> None:
+    async with established(deadman_s=0.6) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.freeze(5.0)
+        await asyncio.sleep(0.5)
+        assert set(rig.written()) == {STOP}
+
+
+@pytest.mark.parametrize(("name", "fields"), [("drive", {"left": 9.0}), ("motor/x", {"value": 1.0})])
+@jumping
+async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(name: str, fields: dict[str, Any]) -> None:
+    async with established(deadman_s=0.6) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        for _ in range(4):
+            await asyncio.sleep(0.2)
+            rig.command(name, fields)
+        assert rig.written()[-1] == STOP
+        assert rig.counted("stopped") == 1
+
+
+@pytest.mark.parametrize(("mode", "stops"), [("autonomous", True), ("manual", False), ("none", False)])
+@jumping
+async def test_a_release_stops_a_robot_only_while_it_may_move_by_itself(mode: str, stops: bool) -> None:
+    async with established() as rig:
+        rig.command("mode", {"mode": "autonomous"})
+        rig.command("mode", {"mode": mode})
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        rig.driver.ask("release", token=rig.driver.token)
+        assert (STOP in rig.written()) is stops
+
+
+# Limits on motion
+
+
+def forward_drive(speed: float) -> bytes:
+    return bytes.fromhex("0e000000 02 0b 00000000 0000803f") + struct.pack("<f", speed)
+
+
+@jumping
+async def test_a_robot_is_not_sent_faster_changes_than_its_owner_allows() -> None:
+    async with established(limits=MotionLimits(slew_per_s=1.0)) as rig:
+        for _ in range(5):
+            rig.command("drive", {"forward": 0.6})
+            await asyncio.sleep(0.1)
+        speeds = [round(struct.unpack("<f", data[-4:])[0], 3) for data in rig.written() if data[5] == 11]
+        assert list(dict.fromkeys(speeds)) == [0.25, 0.35, 0.45, 0.55, 0.6]
+        assert rig.metrics.total("drives_slowed") == 4
+        rig.command("drive", {"forward": 0.1})
+        assert rig.written() == [forward_drive(0.1)], "slowing down is never slowed"
+        assert rig.metrics.total("drives_slowed") == 4
+
+
+@jumping
+async def test_after_a_stop_a_robot_starts_from_standing_again() -> None:
+    async with established(limits=MotionLimits(slew_per_s=1.0), deadman_s=0.3) as rig:
+        for _ in range(8):
+            rig.command("drive", {"forward": 1.0})
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(2.0)
+        rig.hold("takeover")
+        rig.forget_written()
+        rig.command("drive", {"forward": 1.0})
+        assert rig.written() == [forward_drive(0.25)]
+
+
+@jumping
+async def test_drives_that_come_too_fast_are_refused_and_neutral_never_is() -> None:
+    async with established(limits=MotionLimits(rate_hz=10.0)) as rig:
+        for _ in range(5):
+            rig.command("drive", DRIVE_LEFT)
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(0.05)
+        assert rig.written() == [MOVE_LEFT, STOP]
+        assert await rig.refused() == [("driver", "drive", "more than 10 commands a second", 3)]
+        await asyncio.sleep(0.1)
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written()[-1] == MOVE_LEFT
+
+
+# What is written down, counted, and put in which lane
+
+
+@jumping
+async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_the_robot() -> None:
+    async with established(hold=False, deadman_s=0.5) as rig:
+        other = Program(rig, "other")
+        rig.hold(priority=2)
+        other.acquire()
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(1.0)
+        rig.command("drive", NEUTRAL)
+        rig.command("drive", DRIVE_LEFT)
+        other.acquire("takeover")
+        other.release()
+        rig.hold()
+        other.command("stop")
+        assert rig.audited == [
+            {"event": "acquired", "who": "driver", "priority": 2},
+            {"event": "refused", "who": "other", "command": "acquire", "reason": "held by driver (priority 2)"},
+            {"event": "stopped", "who": "driver", "reason": "deadman", "stops": True},
+            {"event": "ended", "who": "driver", "reason": "taken over by other", "stops": True},
+            {"event": "taken over", "who": "other", "priority": 0},
+            {"event": "released", "who": "other", "reason": "released"},
+            {"event": "acquired", "who": "driver", "priority": 0},
+            {"event": "stopped", "who": "driver", "reason": "stop", "stops": True},
+        ]
+        assert {json.loads(line)["robot"] for line in rig.audit_lines} == {"r1"}
+        counted = {labels[0][1]: value for name, labels, value in rig.metrics if name == "control"}
+        assert counted == {"acquired": 2, "stopped": 2, "ended": 1, "taken over": 1, "released": 1}
+        assert rig.metrics.total("refused") == 1
+
+
+@jumping
+async def test_a_flood_of_refusals_is_one_line_and_then_one_a_second() -> None:
+    async with established() as rig:
+        before = len(rig.audit_lines)
+        for _ in range(3):
+            for _ in range(50):
+                rig.driver.put("drive", DRIVE_LEFT, None)
+            await asyncio.sleep(HEARTBEAT_S)
+        lines = rig.audited[before:]
+        assert 3 <= len(lines) <= 6
+        assert sum(line.get("count", 1) for line in lines) == 150
+        assert {line["reason"] for line in lines} == {"no lease: acquire first"}
+
+
+@jumping
+async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too() -> None:
+    async with established(hold=False) as rig:
+        rig.command("stop")
+        rig.goes()
+        assert [(line["event"], line["reason"]) for line in rig.audited] == [
+            ("stopped", "stop"),
+            ("stopped", "robot lost"),
+        ]
+
+
+@jumping
+async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing() -> None:
+    async with established() as rig:
+        assert rig.bus.lanes["fleet/r1/@cmd/stop"] is Lane.STOP
+        lane = rig.bus.lanes["fleet/r1/@cmd/**"]
+        assert not isinstance(lane, Lane)
+        old = rig.driver.attachment()
+        assert lane(old) is Lane.COMMAND
+        for other in (None, b"", b"\xc1", msgpack.packb({"token": bytes(16), "seq": 1})):
+            assert lane(other) is Lane.OTHER
+        Program(rig, "other").acquire("takeover")
+        assert lane(old) is Lane.OTHER
+        rig.command("stop")
+        assert lane(old) is Lane.OTHER
+        assert lane(b"") is Lane.OTHER
 
 
 # Refusals
@@ -844,7 +1738,7 @@ async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() 
         shown = await rig.refusals()
         assert [command for command, _, _ in shown] == ["drive", "mode", "lidar", "raw/tcpudp"]
         assert all("does not announce" in reason for _, reason, _ in shown)
-        assert rig.last("control")["state"] == "free"
+        assert not rig.device._leases.authority.moving, "there is nothing to stop"
 
 
 @jumping
@@ -901,7 +1795,7 @@ async def test_a_scan_of_absurd_geometry_does_no_harm() -> None:
 async def test_a_robot_lost_before_it_was_established_needs_no_neutral() -> None:
     async with serving() as rig:
         rig.goes("reset")
-        assert rig.last("control")["state"] == "free"
+        assert rig.counted("stopped") == 0
         await asyncio.sleep(1.0)
         await rig.establish()
         rig.command("drive", DRIVE_LEFT)
@@ -936,12 +1830,14 @@ async def test_a_robot_lost_while_moving_needs_neutral_when_it_returns_and_gets_
         rig.command("drive", DRIVE_LEFT)
         await asyncio.sleep(0.1)
         rig.goes()
-        assert rig.last("control")["state"] == "stopped"
+        assert rig.counted("stopped") == 1
         await asyncio.sleep(1.0)
         await rig.establish()
         await asyncio.sleep(1.0)
         assert rig.written() == []
+        assert rig.control["holder"] == "driver", "the lease stays"
         rig.command("drive", DRIVE_LEFT)
+        rig.command("mode", {"mode": "autonomous"})
         assert rig.written() == []
         assert "robot lost" in (await rig.refusals())[-1][1]
         rig.command("drive", NEUTRAL)
@@ -1106,9 +2002,10 @@ async def test_a_link_made_while_the_bus_is_full_is_read_until_the_bus_says_so_a
 
 @jumping
 async def test_a_second_cancellation_does_not_cut_the_leave_taking_short() -> None:
-    rig = Rig(Options(), 60.0, OpenBus())
+    rig = Rig(deadman_s=60.0)
     task = asyncio.create_task(rig.device.run())
     await rig.establish()
+    rig.hold()
     rig.command("drive", DRIVE_LEFT)
     await asyncio.sleep(0.1)
     rig.forget_written()
@@ -1139,6 +2036,53 @@ async def test_a_moving_robot_is_stopped_before_the_gateway_ends() -> None:
 
 
 @jumping
+async def test_a_gateway_that_ends_gives_no_lease_any_more_and_ends_the_one_of_a_moving_robot() -> None:
+    rig = Rig(deadman_s=60.0)
+    task = asyncio.create_task(rig.device.run())
+    await rig.establish()
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    task.cancel()
+    await rig.settle()
+    rig.forget_written()
+    for name in ("acquire", "takeover", "renew", "release"):
+        (reply,) = rig.ask(f"control/{name}", msgpack.packb({"who": "driver", "token": rig.driver.token})).replies
+        assert reply.error == "gateway stopped"
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", {"turn": 0.5})
+    assert rig.control["state"] == "stopped"
+    assert rig.audited[-2:] == [
+        {"event": "stopped", "who": "driver", "reason": "gateway stopped", "stops": True},
+        {"event": "refused", "who": "driver", "command": "drive", "reason": "gateway stopped"},
+    ]
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert set(rig.written()) == {STOP}
+
+
+@jumping
+async def test_a_robot_in_autonomous_mode_is_stopped_before_the_gateway_ends() -> None:
+    async with established() as rig:
+        rig.command("mode", {"mode": "autonomous"})
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+    assert set(rig.written()) == {STOP}
+
+
+@jumping
+async def test_a_neutral_shortly_before_the_gateway_ends_is_repeated_for_its_second() -> None:
+    async with established() as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.command("drive", NEUTRAL)
+        start = rig.loop.time()
+        rig.forget_written()
+    assert set(rig.written()) == {STOP}
+    assert 1.0 <= rig.loop.time() - start < 1.1
+
+
+@jumping
 async def test_a_standing_robot_is_left_at_once() -> None:
     async with established() as rig:
         start = rig.loop.time()
@@ -1146,6 +2090,18 @@ async def test_a_standing_robot_is_left_at_once() -> None:
     assert rig.loop.time() - start < 0.1
     assert rig.link.closed
     assert rig.last("status")["reason"] == "gateway stopped"
+
+
+@jumping
+async def test_a_gateway_that_ends_leaves_the_robots_keys_to_others_and_writes_no_loss_down() -> None:
+    async with established() as rig:
+        pass
+    assert await rig.hq.ask("fleet/r1/@rpc/control/acquire", msgpack.packb({"who": "ann"})) == []
+    before = len(rig.values("control"))
+    rig.driver.put("stop", NEUTRAL, None)
+    await rig.settle()
+    assert len(rig.values("control")) == before
+    assert [line for line in rig.audited if line["event"] == "stopped"] == []
 
 
 @jumping

@@ -1,14 +1,119 @@
-"""How a gateway process ends: a signal cancels the work once, and its tidying up is waited for."""
+"""What a gateway process makes of its configuration, and how it ends: a signal cancels the work once."""
 
 import asyncio
+import contextlib
+import json
 import os
 import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
 
+import msgpack
 import pytest
 
-from zbridge.gateway import until_signal
+from tests.clock import jumping
+from zbridge.bus import Bus
+from zbridge.bus.fake import FakeBus
+from zbridge.config import plan
+from zbridge.errors import ConfigError
+from zbridge.gateway import Gateway, until_signal
 
 SOON_S = 5.0
+NOWHERE = "tcp://127.0.0.1:1"
+
+
+def configured(**control: Any) -> Gateway:
+    return Gateway(
+        plan(
+            {
+                "robot": {"name": "r1"},
+                "device": {"protocol": "tcpudp", "connect": [NOWHERE]},
+                "control": control,
+            }
+        )
+    )
+
+
+@contextlib.asynccontextmanager
+async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[FakeBus]:
+    """Run a gateway on a fake bus; its robot is not there."""
+    bus = FakeBus("1")
+
+    async def open_bus(*_: object) -> Bus:
+        return bus
+
+    monkeypatch.setattr("zbridge.gateway.open_bus", open_bus)
+    running = asyncio.create_task(gateway.run())
+    await asyncio.sleep(1.0)
+    try:
+        yield bus.join("2")
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def asked(bus: FakeBus, name: str, **fields: Any) -> dict[str, Any]:
+    (reply,) = await bus.ask(f"fleet/r1/@rpc/control/{name}", msgpack.packb(fields))
+    assert reply.error is None
+    lease: dict[str, Any] = msgpack.unpackb(reply.payload)
+    return lease
+
+
+def sizes_in(folder: Path) -> dict[str, int]:
+    return {file.name: file.stat().st_size for file in folder.iterdir()}
+
+
+@jumping
+async def test_the_configuration_says_how_long_a_lease_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving(configured(lease_s=1.5), monkeypatch) as bus:
+        assert (await asked(bus, "acquire", who="hq", lease_s=60.0))["expires_in_s"] == 1.5
+
+
+@jumping
+async def test_every_lease_has_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving(configured(), monkeypatch) as bus:
+        tokens = [(await asked(bus, "takeover", who="hq"))["token"] for _ in range(20)]
+        assert {len(token) for token in tokens} == {16}
+        assert len(set(tokens)) == 20
+        assert len({byte for token in tokens for byte in token}) > 100, "nothing that could be guessed"
+
+
+@jumping
+async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "log" / "r1.jsonl"
+    async with serving(configured(audit=str(file)), monkeypatch) as bus:
+        token = (await asked(bus, "acquire", who="hq"))["token"]
+        await asked(bus, "release", token=token)
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(line["robot"], line["event"], line["who"]) for line in lines] == [
+        ("r1", "acquired", "hq"),
+        ("r1", "released", "hq"),
+    ]
+
+
+@jumping
+async def test_the_audit_log_is_rotated_as_the_configuration_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2)
+    async with serving(gateway, monkeypatch) as bus:
+        for _ in range(50):
+            await asked(bus, "takeover", who="hq")
+    sizes = sizes_in(tmp_path)
+    assert sorted(sizes) == ["r1.jsonl", "r1.jsonl.1", "r1.jsonl.2"]
+    assert max(sizes.values()) <= 1000
+
+
+@jumping
+async def test_an_audit_log_that_cannot_be_written_keeps_the_gateway_from_starting(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ConfigError, match=r"control\.audit = '.*/file/r1\.jsonl': "):
+        await configured(audit=str(file / "r1.jsonl")).run()
 
 
 class Work:

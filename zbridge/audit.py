@@ -19,12 +19,14 @@ from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.session.control import Event, What
 
+CLOSE_S = 1.0
+"""Longest time a full queue is given to empty at the end."""
 WAITING = 4096
 """Lines that may wait for the disk; what is more is dropped and counted."""
 KINDS = 256
 """Different refusals counted at a time; the rest is counted as one kind."""
 
-_Kind = tuple[str | None, str | None, str | None]
+_Kind = tuple[What, str | None, str | None, str | None]
 
 
 class Audit:
@@ -44,10 +46,10 @@ class Audit:
         if event.who is not None and event.what is not What.REFUSED:
             self._line(event, 1)
             return
-        kind = (event.who, event.command, event.reason)
-        if kind not in self._repeated and len(self._repeated) >= KINDS:
-            kind = (None, None, None)
-            event = Event(event.what, reason="others")
+        kind = (event.what, event.who, event.command, event.reason)
+        if event.what is What.REFUSED and kind not in self._repeated and len(self._repeated) >= KINDS:
+            event = Event(What.REFUSED, reason="others")
+            kind = (What.REFUSED, None, None, "others")
         if kind in self._repeated:
             self._repeated[kind][1] += 1
         else:
@@ -56,10 +58,10 @@ class Audit:
 
     def flush(self) -> None:
         """Write what repeated itself since the last call; to be called about once a second."""
-        repeated, self._repeated = self._repeated, {}
-        for event, count in repeated.values():
+        for event, count in self._repeated.values():
             if count:
                 self._line(event, count)
+        self._repeated = {kind: [event, 0] for kind, (event, count) in self._repeated.items() if count}
 
     def _line(self, event: Event, count: int) -> None:
         fields = {
@@ -87,7 +89,7 @@ class AuditFile:
             raise ConfigError(f"control.audit = {str(path)!r}: {error.strerror or error}") from error
         lines: Queue[Any] = Queue(WAITING)
         self._inlet = _Inlet(lines, metrics)
-        self._listener = QueueListener(lines, self._file)
+        self._listener: _Outlet | None = _Outlet(lines, self._file)
         self._listener.start()
 
     def write(self, line: str) -> None:
@@ -95,9 +97,11 @@ class AuditFile:
         self._inlet.handle(logging.makeLogRecord({"msg": line}))
 
     def close(self) -> None:
-        """Write what waits, and close the file."""
-        self._listener.stop()
-        self._file.close()
+        """Write what waits, for a few seconds at most, and close the file; idempotent."""
+        listener, self._listener = self._listener, None
+        if listener is not None:
+            listener.stop()
+            self._file.close()
 
 
 class _Inlet(QueueHandler):
@@ -112,3 +116,18 @@ class _Inlet(QueueHandler):
             self.queue.put_nowait(record)
         except Full:
             self._dropped.value += 1
+
+
+class _Outlet(QueueListener):
+    """Ends when it has written what waits, also where the queue is full."""
+
+    def __init__(self, lines: Queue[Any], file: logging.Handler) -> None:
+        super().__init__(lines, file)
+        self._lines = lines
+
+    def enqueue_sentinel(self) -> None:
+        try:
+            self._lines.put(None, timeout=CLOSE_S)  # None is the listener's own sign of the end
+        except Full:
+            self._lines.get_nowait()
+            self._lines.put_nowait(None)

@@ -85,23 +85,24 @@ class Commands:
             raise Refused("no such command")
         if self._closing is not None:
             raise Refused(self._closing)
-        now = self._clock()
+        now, who = self._clock(), None
         if topic.message in _OF_THE_HOLDER:
-            self._authority.admit(sample.attachment, now)
+            who = self._authority.admit(sample.attachment, now)
             self._leases.settle()
         command = payloads.decode(topic.message, sample.payload)
         if isinstance(command, Drive | Motor):
-            self._move(topic, command, now)
+            self._move(topic, command, now, who)
         else:
             self.require_ready()
             on_its_own = _moves_by_itself(command)
             if on_its_own:
                 self._authority.require_motion()
-            self._show(topic, self._robot.command(topic, command, now))
-            self._authority.on_its_own = self._authority.on_its_own or on_its_own
+            self._show(topic, self._robot.command(topic, command, now), who)
+            if on_its_own or isinstance(command, Mode):
+                self._authority.on_its_own = on_its_own
         self._pump()
 
-    def _move(self, topic: Topic, command: Drive | Motor, now: float) -> None:
+    def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
         try:
             self.require_ready()
         except Refused as refusal:
@@ -120,13 +121,13 @@ class Commands:
         self._authority.applied(topic.path, now, moving=command.moving)
         if not command.moving:
             self._leases.stands(now)
-        self._show(topic, outcome)
+        self._show(topic, outcome, who)
 
-    def _show(self, topic: Topic, outcome: Outcome) -> None:
+    def _show(self, topic: Topic, outcome: Outcome, who: str | None) -> None:
         for shown, message in outcome.telemetry:
             self._publish(shown, message)
         if outcome.left_out:
-            self._authority.refuse(topic.path.removeprefix("@cmd/"), outcome.left_out)
+            self._authority.refuse(topic.path.removeprefix("@cmd/"), outcome.left_out, who)
 
 
 def _moves_by_itself(command: FleetMessage) -> bool:

@@ -17,6 +17,7 @@ log = logging.getLogger("zbridge.link")
 class Conversation:
     """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
 
+    ``before`` is called before anything is written: it may have something that must be written first.
     ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
     """
 
@@ -30,8 +31,10 @@ class Conversation:
         malformed: Count | None = None,
         foreign: Count | None = None,
         clock: Callable[[], float] | None = None,
+        before: Callable[[], object] = lambda: None,
     ) -> None:
         self.session = session
+        self._before = before
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._clock = clock or loop.time
@@ -96,6 +99,7 @@ class Conversation:
 
     def pump(self) -> None:
         """Write what may be written now, and set the timer for what may not."""
+        self._before()
         session, link = self.session, self._link
         while link is not None and link.ready:
             frame = session.outgoing(self._clock())

@@ -14,10 +14,10 @@ from functools import partial
 from typing import Any
 
 from zbridge.audit import Audit
-from zbridge.bus import Bus, Lane, Publisher, Question
+from zbridge.bus import Bus, Handle, Lane, Publisher, Question
 from zbridge.commands import Commands
 from zbridge.endpoint import Connect, Endpoint, Hooks
-from zbridge.errors import ProtocolError, Refused
+from zbridge.errors import BusError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Status
@@ -38,6 +38,8 @@ HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
 LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
+FLUSH_S = 0.2
+"""Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
 _ASKED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
@@ -71,6 +73,7 @@ class Device:
         self._publishers: dict[str, Publisher] = {}
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
+        self._leaving = False
         self._greeted: Session[Any] | None = None
         self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
         self._leases = Leases(
@@ -104,6 +107,7 @@ class Device:
                     malformed=metrics.count("malformed"),
                     foreign=metrics.count("foreign_datagrams"),
                     clock=clock,
+                    before=self._leases.look_at_time,
                 ),
             )
             for index, (name, address) in enumerate(zip(robot.link_names, addresses, strict=True))
@@ -116,13 +120,14 @@ class Device:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it."""
         self._publish_status()
         self._leases.report()
-        self._leases.serve(self._bus)
         self._bus.on_relief(self._resume)
-        self._bus.subscribe(self._keys.key(topics.CMD_STOP.path), self._commands.take_stop, lane=Lane.STOP)
-        self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.lane)
-        self._bus.watch_connected(self._on_bus)
-        for path in _ASKED:
-            self._bus.answer(self._keys.key(path), self._on_question)
+        declared = [
+            *self._leases.serve(self._bus),
+            self._bus.subscribe(self._keys.key(topics.CMD_STOP.path), self._commands.take_stop, lane=Lane.STOP),
+            self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.lane),
+            self._bus.watch_connected(self._on_bus),
+            *(self._bus.answer(self._keys.key(path), self._on_question) for path in _ASKED),
+        ]
         for endpoint in self._endpoints:
             for direction in ("in", "out"):
                 self._watch_frames(endpoint, direction)
@@ -133,10 +138,11 @@ class Device:
             try:
                 await asyncio.Event().wait()
             finally:  # the links' tasks still run: the group ends them only after this
-                await asyncio.shield(self._shut_down())
+                await asyncio.shield(self._shut_down(declared))
 
-    async def _shut_down(self) -> None:
-        """Stop a moving robot, take leave of it, and say so on the bus; at most 1.7 s."""
+    async def _shut_down(self, declared: list[Handle]) -> None:
+        """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
+        self._leaving = True
         self._commands.refuse_all(_LEAVING)
         self._leases.refuse_all(_LEAVING)
         if self._leases.authority.moving:
@@ -145,6 +151,10 @@ class Device:
         await asyncio.gather(*(endpoint.close(_LEAVING, LEAVE_S) for endpoint in self._endpoints))
         self._publish_status()
         self._leases.close()
+        with contextlib.suppress(BusError, TimeoutError):
+            await asyncio.wait_for(self._bus.flush(), FLUSH_S)
+        for handle in (*declared, *self._publishers.values()):
+            handle.close()
 
     # Links
 
@@ -155,7 +165,8 @@ class Device:
         if session.over:
             if session.version is not None:
                 self._lost.value += len(session.outbox)
-                self._leases.hold_back("robot lost", stops=False)
+                if not self._leaving:
+                    self._leases.hold_back("robot lost", stops=False)
                 self._questions.refuse_all("the robot was lost")
         elif session.state is State.ESTABLISHED and session is not self._greeted:
             self._greeted = session

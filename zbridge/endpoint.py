@@ -44,6 +44,8 @@ class Hooks(msgspec.Struct, frozen=True):
     malformed: Count
     foreign: Count
     clock: Callable[[], float]
+    before: Callable[[], object] = lambda: None
+    """Called before anything is written."""
 
 
 class Endpoint:
@@ -135,6 +137,7 @@ class Endpoint:
             malformed=hooks.malformed,
             foreign=hooks.foreign,
             clock=hooks.clock,
+            before=hooks.before,
         )
         self._set_state("connecting", None)
         self.conversation = conversation

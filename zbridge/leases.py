@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 
 from zbridge.audit import Audit
-from zbridge.bus import Bus, Lane, Question
+from zbridge.bus import Bus, Handle, Lane, Question
 from zbridge.errors import PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -65,21 +65,23 @@ class Leases:
     def __repr__(self) -> str:
         return f"<Leases {self._keys.robot} {self.authority!r}>"
 
-    def serve(self, bus: Bus) -> None:
+    def serve(self, bus: Bus) -> list[Handle]:
         """Answer questions about the lease, and watch whether its holder lives."""
-        for topic in (topics.RPC_ACQUIRE, topics.RPC_TAKEOVER, topics.RPC_RENEW, topics.RPC_RELEASE):
-            bus.answer(self._keys.key(topic.path), self._on_question, lane=Lane.COMMAND)
-        bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive)
+        asked = (topics.RPC_ACQUIRE, topics.RPC_TAKEOVER, topics.RPC_RENEW, topics.RPC_RELEASE)
+        return [
+            *(bus.answer(self._keys.key(topic.path), self._on_question, lane=self.lane) for topic in asked),
+            bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
+        ]
 
     @property
     def stopping_s(self) -> float:
         """Seconds for which a stop or a neutral is still being repeated."""
         return max(0.0, self._stands_at - self._clock())
 
-    def lane(self, attachment: bytes | None) -> Lane:
-        """Let the holder's commands wait for nobody else's; called on the bus's threads."""
+    def lane(self, shown: bytes | None) -> Lane:
+        """Let what shows the holder's token wait for nobody else's; called on the bus's threads."""
         token = self.authority.token
-        return Lane.COMMAND if token and attachment and token in attachment else Lane.OTHER
+        return Lane.COMMAND if token and shown and token in shown else Lane.OTHER
 
     def stop(self, reason: str) -> None:
         """Stop the robot at once and for a second, and end the lease."""
@@ -157,6 +159,12 @@ class Leases:
             self.stand_still()
         except Refused as refusal:
             self.authority.refuse("stop", str(refusal))
+
+    def look_at_time(self) -> None:
+        """Do what is due, before anything else is done: the loop may come back late, from a process that was frozen."""
+        self.authority.expire(self._clock())
+        if self.authority.eventful:
+            self.settle()
 
     def _watch_time(self) -> None:
         """Have a timer at the deadline or before it: commands put the deadline off far more often than it comes."""

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.clock import jumping
-from zbridge.bus import Answer, Question, Sample
+from zbridge.bus import Answer, Lane, LaneOf, Question, Sample
 from zbridge.bus.fake import FakeBus, FakeQuestion, matches
 from zbridge.fleet import topics
 
@@ -139,6 +139,57 @@ async def test_tokens_are_seen_while_they_last() -> None:
     assert await bus.alive("fleet/*/@alive/*") == ["fleet/r1/@alive/gateway", "fleet/r2/@alive/gateway"]
     handle.close()
     assert await bus.alive("fleet/*/@alive/*") == ["fleet/r2/@alive/gateway"]
+
+
+def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_those_that_go() -> None:
+    bus = FakeBus()
+    other = bus.join("2")
+    first = other.announce("fleet/r1/@alive/first")
+    other.announce("fleet/r2/@alive/elsewhere")
+    seen: list[tuple[str, bool]] = []
+    handle = bus.watch_alive("fleet/r1/@alive/*", lambda key, alive: seen.append((key, alive)))
+    assert seen == [("fleet/r1/@alive/first", True)]
+    second = bus.announce("fleet/r1/@alive/second")
+    bus.announce("fleet/r1/@alive/a/b")
+    first.close()
+    first.close()
+    assert seen[1:] == [("fleet/r1/@alive/second", True), ("fleet/r1/@alive/first", False)]
+    handle.close()
+    handle.close()
+    second.close()
+    assert len(seen) == 3
+
+
+@jumping
+async def test_who_watches_tokens_is_told_when_a_session_leaves_and_not_after_leaving_itself() -> None:
+    bus = FakeBus()
+    other, third = bus.join("2"), bus.join("3")
+    seen: list[tuple[str, bool]] = []
+    left: list[tuple[str, bool]] = []
+    bus.watch_alive("fleet/*/@alive/*", lambda key, alive: seen.append((key, alive)))
+    third.watch_alive("fleet/*/@alive/*", lambda key, alive: left.append((key, alive)))
+    other.announce("fleet/r1/@alive/hq")
+    await third.close()
+    await other.close()
+    assert seen == [("fleet/r1/@alive/hq", True), ("fleet/r1/@alive/hq", False)]
+    assert left == [("fleet/r1/@alive/hq", True)]
+
+
+@jumping
+async def test_what_was_put_is_with_the_bus_at_once() -> None:
+    bus = FakeBus()
+    bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE).put(b"1")
+    await bus.flush()
+    assert bus.values("fleet/r1/@cmd/drive") == [b"1"]
+
+
+@pytest.mark.parametrize("lane", [Lane.STOP, Lane.OTHER, lambda attachment: Lane.COMMAND])
+def test_a_sample_comes_by_whatever_lane(lane: Lane | LaneOf) -> None:
+    bus = FakeBus()
+    seen: list[Sample] = []
+    bus.subscribe("fleet/r1/@cmd/**", seen.append, lane=lane)
+    bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE).put(b"1", b"token")
+    assert seen == [Sample("fleet/r1/@cmd/drive", b"1", b"token")]
 
 
 @jumping

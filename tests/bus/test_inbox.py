@@ -98,6 +98,24 @@ async def test_a_flood_of_commands_costs_no_stop() -> None:
     assert (await rig.drained())[0] == "stop"
 
 
+async def test_the_lanes_are_served_in_their_order_whatever_came_first() -> None:
+    rig = Rig()
+    for lane in (Lane.OTHER, Lane.COMMAND, Lane.STOP, Lane.COMMAND, Lane.STOP, Lane.OTHER):
+        rig.inbox.put(rig.seen.append, lane, lambda value: value, lane)
+    assert await rig.drained() == [Lane.STOP, Lane.STOP, Lane.COMMAND, Lane.COMMAND, Lane.OTHER, Lane.OTHER]
+
+
+async def test_a_flood_of_commands_costs_no_other_item() -> None:
+    rig = Rig()
+    rig.put("other")
+    for number in range(LANE + 3):
+        rig.put(number, first=True)
+    assert rig.metrics.total("bus_in_dropped") == 3
+    for _ in range(20):
+        await rig.drained()
+    assert rig.seen == [*range(3, LANE + 3), "other"]
+
+
 async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig()
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,12 +63,55 @@ def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
     return output
 
 
+class Lease:
+    """The lease of one robot by plain Zenoh and MessagePack, renewed on a thread until it is closed or has ended."""
+
+    def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
+        self._session = session
+        self._key = f"fleet/{robot}/@rpc/control/"
+        self.answer = self._ask(how, wishes)
+        assert self.answer["ok"], self.answer
+        self.token: bytes = self.answer["token"]
+        self._numbers = itertools.count(1)
+        self._closed = threading.Event()
+        threading.Thread(target=self._renew, daemon=True).start()
+
+    def _ask(self, name: str, fields: dict[str, Any]) -> dict[str, Any]:
+        """Ask one thing about the lease; an error text is no answer."""
+        for reply in self._session.get(self._key + name, payload=msgpack.packb(fields), timeout=3.0):
+            if reply.ok is not None:
+                answer: dict[str, Any] = msgpack.unpackb(reply.ok.payload.to_bytes())
+                return answer
+        return {"ok": False, "reason": f"no answer to {name}"}
+
+    def _renew(self) -> None:
+        with contextlib.suppress(zenoh.ZError):  # the session was closed
+            while not self._closed.wait(self.answer["expires_in_s"] / 3):
+                if not self._ask("renew", {"token": self.token})["ok"]:
+                    return
+
+    def attachment(self) -> bytes:
+        """What goes with the next command."""
+        packed: bytes = msgpack.packb({"token": self.token, "seq": next(self._numbers)})
+        return packed
+
+    def release(self) -> dict[str, Any]:
+        """Give the lease back."""
+        self.close()
+        return self._ask("release", {"token": self.token})
+
+    def close(self) -> None:
+        """Renew it no longer."""
+        self._closed.set()
+
+
 class Fleet:
-    """A Zenoh session of the test, and what it saw."""
+    """A Zenoh session of the test, what it saw, and the robots it holds."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self.seen: dict[str, list[dict[str, Any]]] = {}
+        self._leases: dict[str, Lease] = {}
         self._subscriber = session.declare_subscriber("fleet/**", self._take)
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -76,15 +121,42 @@ class Fleet:
     def last(self, path: str) -> dict[str, Any]:
         return (self.seen.get(f"fleet/{path}") or [{}])[-1]
 
-    def get(self, key: str, timeout_s: float = 3.0) -> list[Any]:
+    def get(self, key: str, timeout_s: float = 3.0, **fields: Any) -> list[Any]:
         """Plain get: the decoded replies, error texts as strings."""
+        payload = msgpack.packb(fields) if fields else None
         return [
             msgpack.unpackb(reply.ok.payload.to_bytes()) if reply.ok else reply.err.payload.to_string()
-            for reply in self.session.get(key, timeout=timeout_s)
+            for reply in self.session.get(key, payload=payload, timeout=timeout_s)
         ]
 
+    def hold(self, robot: str, who: str = "test", *, how: str = "acquire", **wishes: Any) -> Lease:
+        """Acquire a robot and keep its lease; from now on every command for it is the holder's."""
+        self.let_go(robot)
+        lease = self._leases[robot] = Lease(self.session, robot, how, {"who": who, **wishes})
+        return lease
+
+    def let_go(self, robot: str) -> None:
+        """Renew the lease no longer, and command without it."""
+        lease = self._leases.pop(robot, None)
+        if lease is not None:
+            lease.close()
+
     def put(self, path: str, **fields: Any) -> None:
-        self.session.put(f"fleet/{path}", msgpack.packb(fields), congestion_control=zenoh.CongestionControl.BLOCK)
+        self.put_payload(path, msgpack.packb(fields))
+
+    def put_payload(self, path: str, payload: bytes) -> None:
+        lease = self._leases.get(path.split("/")[0])
+        self.session.put(
+            f"fleet/{path}",
+            payload,
+            attachment=lease.attachment() if lease is not None else None,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+
+    def close(self) -> None:
+        """Renew nothing any more."""
+        for robot in tuple(self._leases):
+            self.let_go(robot)
 
     def tokens(self, key: str = "fleet/*/@alive/gateway") -> list[str]:
         return [str(reply.ok.key_expr) for reply in self.session.liveliness().get(key, timeout=2) if reply.ok]
@@ -101,6 +173,7 @@ class Bench:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._stack = stack
         self.fleet = Fleet(self._stack.enter_context(self.router()))
+        self._stack.callback(lambda: self.fleet.close())
 
     def router(self) -> zenoh.Session:
         config = zenoh.Config()

@@ -3,8 +3,9 @@
     python -m tests.e2e.judge                     # every version, with and without UDP, 2000 commands each
     python -m tests.e2e.judge --commands 300 --version 1.4 --udp
 
-A command that the robot's version or features exclude must be refused and never arrive. While a "1.4" robot sends
-its map, everything but a stop is refused; the judge waits for the end of it.
+A command that the robot's version or features exclude must be refused and never arrive. The judge holds the robot's
+lease, and acquires it anew after each stop. While a "1.4" robot sends its map, everything but a stop is refused; the
+judge waits for the end of it.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
         assert robot.stdout is not None
         bench.gateway("r1", int(robot.stdout.readline()))
         until(lambda: bench.fleet.state("r1") == "established", what="established")
+        bench.fleet.hold("r1", "judge")
         run = _Run(bench, Judgement(version, udp), random.Random(seed))
         began = time.monotonic()
         for number in range(commands):
@@ -164,9 +166,10 @@ class _Run:
         self._put("drive")
 
     def stop(self, number: int) -> None:
+        """Stop, as anybody may; whoever wants to go on acquires anew."""
         self._put("stop")
         time.sleep(PACE_S)
-        self._put("drive")
+        self._bench.fleet.hold("r1", "judge")
 
     def text(self, number: int) -> None:
         text = f"command {number}".encode()

@@ -48,6 +48,15 @@ def test_a_bad_file_ends_run_with_2_and_names_file_key_and_value(tmp_path: Path)
     assert "Traceback" not in ran.stderr
 
 
+def test_an_audit_log_that_cannot_be_written_ends_run_with_2_and_names_key_and_value(tmp_path: Path) -> None:
+    file = tmp_path / "r1.toml"
+    file.write_text(f'{TOML}[control]\naudit = "{file}/audit.jsonl"\n')
+    ran = zbridge("run", str(file))
+    assert ran.returncode == 2
+    assert f"control.audit = '{file}/audit.jsonl': " in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
 def test_the_module_of_a_protocol_runs_only_that_protocol(tmp_path: Path) -> None:
     file = tmp_path / "r1.toml"
     file.write_text('[robot]\nname = "r1"\n[device]\nprotocol = "nothing"\nconnect = ["tcp://x:1"]\n')
@@ -73,6 +82,19 @@ def test_ls_lists_the_robot_and_stop_confirms(bench: Bench) -> None:
     missing = zbridge("stop", "r2", *at)
     assert missing.returncode == 1
     assert "no gateway confirmed" in missing.stderr
+
+
+def test_a_stop_typed_by_anybody_takes_the_robot_from_its_driver(bench: Bench) -> None:
+    port = free_port()
+    bench.simulator(port)
+    bench.gateway("r1", port)
+    until(lambda: bench.fleet.state("r1") == "established")
+    bench.fleet.hold("r1", "driver")
+    bench.fleet.put("r1/@cmd/drive", forward=0.5)
+    assert zbridge("stop", "r1", "--connect", bench.endpoint).stdout == "r1: stopped\n"
+    bench.fleet.put("r1/@cmd/drive", forward=0.5)
+    refused = until(lambda: bench.fleet.last("r1/control")["refusals"], what="refusal")[0]
+    assert (refused["who"], refused["reason"]) == ("driver", "the lease has ended (stop)")
 
 
 def test_echo_prints_decoded_messages_with_the_last_states_first(bench: Bench) -> None:

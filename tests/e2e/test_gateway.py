@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
 import math
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -43,6 +46,7 @@ def test_a_robot_is_seen_driven_and_asked(bench: Bench) -> None:
     assert "joystick" in status["features"]
     assert fleet.tokens() == ["fleet/r1/@alive/gateway"]
     before = until(lambda: fleet.last("r1/pose"))
+    fleet.hold("r1")
     for _ in range(10):
         fleet.put("r1/@cmd/drive", forward=1.0)
         time.sleep(0.05)
@@ -110,6 +114,7 @@ def test_kill_9_removes_the_liveliness_token(bench: Bench, robot: ScriptedRobot)
 def test_sigterm_stops_the_robot_and_ends_within_two_seconds(bench: Bench, robot: ScriptedRobot) -> None:
     gateway = bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11), what="drive at the robot")
     began = time.monotonic()
@@ -125,23 +130,153 @@ def test_sigterm_stops_the_robot_and_ends_within_two_seconds(bench: Bench, robot
 def test_driver_killed_the_robot_stops_within_the_deadman(bench: Bench, robot: ScriptedRobot, repetition: int) -> None:
     bench.gateway("r1", robot.port, DEADMAN)
     until(lambda: established(bench))
-    driver = subprocess.Popen([sys.executable, "-c", DRIVER, bench.endpoint], stdout=subprocess.PIPE, text=True)
-    try:
-        until(lambda: len(robot.packets(11)) > 10, what="driving")
-    finally:
-        os.kill(driver.pid, signal.SIGKILL)
+    with driving(bench, robot) as driver:
+        driver.kill()
         killed = time.monotonic()
-        driver.communicate()
-    driving = robot.packets(11)[0][0]
-    stop_at, stop = until(lambda: stops_since(robot, driving), what="stop")[0]
+    moving = robot.packets(11)[0][0]
+    stop_at, stop = until(lambda: stops_since(robot, moving), what="stop")[0]
     assert stop == bytes.fromhex("02000000020d")
     # The last accepted command came before the kill, so this is the stricter bound seen from outside.
     assert stop_at - killed < 0.3 + 0.05
     until(lambda: time.monotonic() > stop_at + 1.3)
-    stops = [at for at, _ in stops_since(robot, driving)]
+    stops = [at for at, _ in stops_since(robot, moving)]
     assert 0.8 <= stops[-1] - stops[0] <= 1.1
     assert len(stops) >= 8
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
+
+
+@contextlib.contextmanager
+def driving(bench: Bench, robot: ScriptedRobot, *alive: str) -> Iterator[subprocess.Popen[str]]:
+    """A process that acquires the robot and drives it every 20 ms; ``alive``: its liveliness token."""
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, bench.endpoint, *alive], stdout=subprocess.PIPE, text=True)
+    try:
+        until(lambda: len(robot.packets(11)) > 10, what="driving")
+        yield driver
+    finally:
+        driver.kill()
+        driver.communicate()
+
+
+def refusals(bench: Bench) -> dict[str, Any]:
+    """What ``control`` shows as refused, by its reason."""
+    return {entry["reason"]: entry for entry in bench.fleet.last("r1/control").get("refusals", [])}
+
+
+def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman(
+    bench: Bench, robot: ScriptedRobot
+) -> None:
+    bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    with driving(bench, robot, "operator.1") as driver:
+        assert bench.fleet.last("r1/control")["holder"] == "driver"
+        killed = time.monotonic()
+        driver.kill()
+        moving = robot.packets(11)[0][0]
+        stop_at, _ = until(lambda: stops_since(robot, moving), what="stop")[0]
+    assert stop_at - killed < 0.5  # the deadman would take 2 s
+    until(lambda: bench.fleet.last("r1/control")["state"] == "stopped")
+    assert not [at for at, _ in robot.packets(11) if at > stop_at]
+
+
+def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(
+    bench: Bench, robot: ScriptedRobot
+) -> None:
+    bench.gateway("r1", robot.port, DEADMAN)
+    until(lambda: established(bench))
+    with driving(bench, robot, "operator.1") as driver:
+        os.kill(driver.pid, signal.SIGSTOP)
+        frozen = time.monotonic()
+        stop_at, _ = until(lambda: stops_since(robot, robot.packets(11)[0][0]), what="stop")[0]
+        assert stop_at - frozen < 0.3 + 0.05
+        os.kill(driver.pid, signal.SIGCONT)
+        until(lambda: refusals(bench).get("deadman: send a neutral drive first", {}).get("count", 0) > 10)
+    assert not [at for at, _ in robot.packets(11) if at > stop_at]
+
+
+def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhile(
+    bench: Bench, robot: ScriptedRobot
+) -> None:
+    gateway = bench.gateway("r1", robot.port, DEADMAN)
+    until(lambda: established(bench))
+    with driving(bench, robot):
+        os.kill(gateway.pid, signal.SIGSTOP)
+        time.sleep(1.0)
+        woken = time.monotonic()
+        os.kill(gateway.pid, signal.SIGCONT)
+        stop_at, _ = until(lambda: stops_since(robot, woken), what="stop")[0]
+        assert stop_at - woken < 0.2
+        until(lambda: refusals(bench).get("deadman: send a neutral drive first", {}).get("count", 0) > 10)
+    assert not [at for at, _ in robot.packets(11) if at > stop_at]
+
+
+def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_on_its_own(
+    bench: Bench, robot: ScriptedRobot
+) -> None:
+    bench.gateway("r1", robot.port, "[control]\nlease_s = 0.6\n")
+    until(lambda: established(bench))
+    bench.fleet.hold("r1")
+    time.sleep(1.2)  # the stop that greets the robot is repeated for a second
+    bench.fleet.put("r1/@cmd/mode", mode="autonomous")
+    sent_at, _ = until(lambda: robot.packets(10), what="autonomous mode")[0]
+    time.sleep(1.0)
+    assert stops_since(robot, sent_at) == []
+    assert bench.fleet.last("r1/control")["state"] == "held"
+    left = time.monotonic()
+    bench.fleet.let_go("r1")
+    stop_at, _ = until(lambda: stops_since(robot, sent_at), what="stop")[0]
+    assert stop_at - left < 0.6 + 0.1
+    until(lambda: bench.fleet.last("r1/control")["state"] == "stopped")
+
+
+def test_of_two_programs_the_holder_drives_until_the_other_takes_over(bench: Bench, robot: ScriptedRobot) -> None:
+    bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    fleet, other = bench.fleet, Fleet(bench.fleet.session)
+    fleet.hold("r1", "first")
+    assert [denied["holder"] for denied in fleet.get("fleet/r1/@rpc/control/acquire", who="second")] == ["first"]
+    other.put("r1/@cmd/drive", forward=0.5)
+    until(lambda: "no lease: acquire first" in refusals(bench), what="refusal")
+    assert not robot.packets(11)
+    fleet.put("r1/@cmd/drive", forward=0.5)
+    until(lambda: robot.packets(11), what="the first program's motion")
+    other.hold("r1", "second", how="takeover")
+    other.put("r1/@cmd/drive", turn=0.5)
+    until(lambda: robot.packets(12), what="the second program's motion")
+    fleet.put("r1/@cmd/drive", forward=0.5)
+    refused = until(lambda: refusals(bench).get("the lease has ended (taken over by second)"), what="refusal")
+    assert (refused["who"], refused["command"]) == ("first", "drive")
+    first, stop, second = robot.packets(11)[-1][0], robot.packets(13)[-1][0], robot.packets(12)[0][0]
+    assert first < stop < second
+    assert fleet.last("r1/control")["holder"] == "second"
+    other.close()
+
+
+def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_was_expected(
+    bench: Bench, robot: ScriptedRobot
+) -> None:
+    bench.gateway("r1", robot.port)
+    until(lambda: established(bench))
+    (text,) = bench.fleet.get("fleet/r1/@rpc/control/acquire", priority=1)
+    assert text.startswith("Acquire: ")
+    assert "who" in text
+
+
+def test_limits_and_the_audit_log_are_as_configured(bench: Bench, robot: ScriptedRobot) -> None:
+    file = bench.folder / "audit" / "r1.jsonl"
+    bench.gateway("r1", robot.port, f'[control]\nrate_hz = 5\nslew_per_s = 1.0\naudit = "{file}"\n')
+    until(lambda: established(bench))
+    lease = bench.fleet.hold("r1", "hq")
+    for _ in range(5):
+        bench.fleet.put("r1/@cmd/drive", forward=1.0)
+    refused = until(lambda: refusals(bench).get("more than 5 commands a second"), what="refusals")
+    assert refused["count"] == 3
+    speed = struct.unpack("<f", until(lambda: robot.packets(11))[0][1][-4:])[0]
+    assert speed == pytest.approx(0.25, abs=0.02)
+    assert lease.release()["ok"]
+    until(lambda: "released" in file.read_text(), what="the last line")
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [line["event"] for line in lines if line["event"] != "refused"] == ["acquired", "released"]
+    assert {line["who"] for line in lines} == {"hq"}
 
 
 def stops_since(robot: ScriptedRobot, since: float) -> list[tuple[float, bytes]]:
@@ -150,14 +285,20 @@ def stops_since(robot: ScriptedRobot, since: float) -> list[tuple[float, bytes]]
 
 
 DRIVER = """
-import sys, time, msgpack, zenoh
+import itertools, sys, time, msgpack, zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", '["%s"]' % sys.argv[1])
 with zenoh.open(config) as session:
+    request = {"who": "driver"}
+    if len(sys.argv) > 2:
+        alive = session.liveliness().declare_token("fleet/r1/@alive/" + sys.argv[2])
+        request["alive"] = sys.argv[2]
+    (reply,) = session.get("fleet/r1/@rpc/control/acquire", payload=msgpack.packb(request), timeout=3)
+    token = msgpack.unpackb(reply.ok.payload.to_bytes())["token"]
     drive = session.declare_publisher("fleet/r1/@cmd/drive")
-    while True:
-        drive.put(msgpack.packb({"forward": 0.5}))
+    for seq in itertools.count():
+        drive.put(msgpack.packb({"forward": 0.5}), attachment=msgpack.packb({"token": token, "seq": seq}))
         time.sleep(0.02)
 """
 
@@ -165,17 +306,23 @@ with zenoh.open(config) as session:
 def test_the_bus_lost_while_driving_stops_the_robot_at_once(bench: Bench, robot: ScriptedRobot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
     cut = time.monotonic()
     bench.fleet.session.close()
     stop_at, _ = until(lambda: stops_since(robot, robot.packets(11)[0][0]), what="stop")[0]
     assert stop_at - cut < 0.5  # far below the deadman of 2 s
+    bench.fleet = Fleet(bench.router())
+    until(lambda: established(bench), what="the gateway on the bus again")
+    assert bench.fleet.get("fleet/r1/control")[0]["state"] == "stopped"
+    bench.fleet.session.close()
 
 
 def test_one_packet_per_write_and_never_back_to_back(bench: Bench, robot: ScriptedRobot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1")
     for number in range(20):
         bench.fleet.put("r1/@cmd/text", text=f"number {number}")
         bench.fleet.put("r1/@cmd/drive", forward=number / 20, turn=0.01)
@@ -192,18 +339,17 @@ def test_one_packet_per_write_and_never_back_to_back(bench: Bench, robot: Script
 def test_refusals_show_on_control(bench: Bench, robot: ScriptedRobot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1", "hq")
     bench.fleet.put("r1/@cmd/drive", forward=7.0)
     bench.fleet.put("r1/@cmd/camera", on=True)
     bench.fleet.put("r1/@cmd/raw/tcpudp", id=70, body=b"x")
     bench.fleet.put("r1/@cmd/dance")
-    bench.fleet.session.put("fleet/r1/@cmd/drive", b"\xc1")
+    bench.fleet.put_payload("r1/@cmd/drive", b"\xc1")
 
-    def refusals() -> dict[str, Any] | None:
-        shown = bench.fleet.last("r1/control").get("refusals", [])
-        return {entry["reason"]: entry for entry in shown} if len(shown) == 5 else None
-
-    reasons = until(refusals, what="five refusals")
+    until(lambda: len(refusals(bench)) == 5, what="five refusals")
+    reasons = refusals(bench)
     assert {entry["command"] for entry in reasons.values()} == {"drive", "camera", "raw/tcpudp", "dance"}
+    assert {entry["who"] for entry in reasons.values()} == {"hq"}
     assert any("<= 1.0" in reason for reason in reasons)
     assert not robot.packets(11)
     assert not robot.packets(70)
@@ -263,6 +409,7 @@ def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies(bench: Ben
 def test_a_driver_that_goes_on_while_the_gateway_ends_moves_nothing(bench: Bench, robot: ScriptedRobot) -> None:
     gateway = bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
     gateway.send_signal(signal.SIGTERM)
@@ -280,6 +427,7 @@ def test_a_driver_that_goes_on_while_the_gateway_ends_moves_nothing(bench: Bench
 def test_a_robot_is_stopped_when_its_connection_returns(bench: Bench, robot: ScriptedRobot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
+    bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
     before = len(robot.reads)

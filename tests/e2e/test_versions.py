@@ -34,6 +34,7 @@ def test_a_robot_of_every_version_is_seen_and_driven(bench: Bench, version: str,
     assert status["version"] == version
     assert status["features"] == (["udp"] if udp else []) + FLAGS[version]
     before = until(lambda: fleet.last("r1/pose"))
+    fleet.hold("r1")
     for _ in range(10):
         fleet.put("r1/@cmd/drive", forward=1.0)
         time.sleep(0.05)
@@ -50,6 +51,7 @@ def test_a_1_4_robot_that_sends_its_map_is_stopped_and_busy(bench: Bench) -> Non
     until(lambda: fleet.state("r1") == "established")
     asking = threading.Thread(target=lambda: answers.extend(fleet.get("fleet/r1/@rpc/map", timeout_s=8.0)))
     answers: list[Any] = []
+    fleet.hold("r1")
     asking.start()
     until(lambda: fleet.last("r1/status")["reason"] == "busy: map")
     assert fleet.state("r1") == "established"
@@ -157,6 +159,7 @@ def test_a_robot_whose_datagrams_never_come_is_used_by_tcp(bench: Bench) -> None
         until(lambda: bench.fleet.state("r1") == "established", what="established by TCP")
         assert [data[5] for _, data in robot.reads][:2] == [3, 7]
         assert robot.reads[1][1] == bytes.fromhex("03000000020700")
+        bench.fleet.hold("r1")
         bench.fleet.put("r1/@cmd/drive", forward=0.5)
         until(lambda: robot.packets(11), what="drive by TCP")
         end(gateway)

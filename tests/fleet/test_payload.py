@@ -6,6 +6,7 @@ import struct
 from typing import Any
 
 import msgpack
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,11 +16,15 @@ from msgspec import UNSET
 from zbridge.errors import PayloadError
 from zbridge.fleet import messages
 from zbridge.fleet.messages import (
+    Acquire,
+    Authorization,
     Control,
     Device,
     Devices,
     Drive,
     FleetMessage,
+    Lease,
+    LeaseToken,
     LinkStatus,
     Map,
     Mode,
@@ -113,6 +118,15 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
     (
         SensorSetting(index=1, value=2.0, values=(1.0, 2.0)),
         {"enable": None, "index": 1, "value": 2.0, "values": [1.0, 2.0]},
+    ),
+    (
+        Acquire(who="hq 1", priority=3, lease_s=2.0, deadman_s=0.5, alive="operator.1"),
+        {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"},
+    ),
+    (LeaseToken(token=b"0123456789abcdef"), {"token": b"0123456789abcdef"}),
+    (
+        Lease(ok=True, token=b"0123456789abcdef", expires_in_s=3.0, holder="hq 1"),
+        {"ok": True, "token": b"0123456789abcdef", "expires_in_s": 3.0, "holder": "hq 1", "reason": None},
     ),
 ]
 
@@ -275,6 +289,35 @@ def test_missing_optional_fields_take_their_defaults() -> None:
     assert decode(Drive, msgpack.packb({"forward": 1})) == Drive(forward=1.0)
 
 
+def test_whoever_acquires_need_not_say_more_than_its_name() -> None:
+    assert decode(Acquire, msgpack.packb({"who": "hq"})) == Acquire("hq", 0, None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("message", "moving"),
+    [
+        (Drive(), False),
+        (Drive(light=True), False),
+        (Drive(forward=-0.0), False),
+        (Drive(forward=0.01), True),
+        (Drive(left=-0.01), True),
+        (Drive(turn=0.01), True),
+        (Motor(value=0.0), False),
+        (Motor(value=-0.1), True),
+    ],
+)
+def test_motion_is_told_from_neutral(message: Drive | Motor, moving: bool) -> None:
+    assert message.moving is moving
+
+
+def test_an_attachment_is_a_map_of_token_and_number() -> None:
+    packed = msgpack.packb({"token": b"0123456789abcdef", "seq": 7})
+    assert msgspec.msgpack.decode(packed, type=Authorization) == Authorization(b"0123456789abcdef", 7)
+    assert msgspec.msgpack.encode(Authorization(b"0123456789abcdef", 7)) == packed
+    with pytest.raises(msgspec.ValidationError, match="seq"):
+        msgspec.msgpack.decode(msgpack.packb({"token": b"", "seq": -1}), type=Authorization)
+
+
 def test_unknown_fields_are_ignored() -> None:
     assert decode(Switch, msgpack.packb({"on": True, "colour": "red"})) == Switch(on=True)
 
@@ -295,6 +338,13 @@ def test_unknown_fields_are_ignored() -> None:
         (Raw, {"id": "x"}, "id"),
         (Raw, {"id": 1, "body": [1]}, "body"),
         (Switch, {"on": True, "stamp_ns": "now"}, "stamp_ns"),
+        (Acquire, {}, "who"),
+        (Acquire, {"who": 1}, "who"),
+        (Acquire, {"who": "hq", "priority": 1.5}, "priority"),
+        (Acquire, {"who": "hq", "lease_s": "long"}, "lease_s"),
+        (Acquire, {"who": "hq", "alive": 7}, "alive"),
+        (LeaseToken, {}, "token"),
+        (LeaseToken, {"token": "text"}, "token"),
     ],
 )
 def test_a_wrong_field_is_a_payload_error_that_names_it(

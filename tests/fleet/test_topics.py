@@ -45,6 +45,10 @@ TABLE = [
     ("@cmd/raw/tcpudp", messages.Raw, Delivery.COMMAND),
     ("@rpc/map", messages.Query, Delivery.QUERY),
     ("@rpc/pose", messages.Query, Delivery.QUERY),
+    ("@rpc/control/acquire", messages.Acquire, Delivery.QUERY),
+    ("@rpc/control/takeover", messages.Acquire, Delivery.QUERY),
+    ("@rpc/control/renew", messages.LeaseToken, Delivery.QUERY),
+    ("@rpc/control/release", messages.LeaseToken, Delivery.QUERY),
 ]
 
 
@@ -55,7 +59,8 @@ def test_every_key_of_the_design_is_known(path: str, message: type[messages.Flee
 
 @pytest.mark.parametrize(
     "path",
-    ["", "/", "scans", "Scan", "scan/", "sensor", "sensor/", "sensor/a/b", "@cmd", "@cmd/", "@cmd/fly", "cmd/drive"],
+    ["", "/", "scans", "Scan", "scan/", "sensor", "sensor/", "sensor/a/b", "@cmd", "@cmd/", "@cmd/fly", "cmd/drive"]
+    + ["@rpc/control", "@rpc/control/", "@rpc/control/steal", "@rpc/acquire", "control/acquire"],
 )
 def test_other_paths_are_not(path: str) -> None:
     assert find(path) is None

@@ -104,7 +104,7 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
         entry = (key, handler)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))

@@ -100,7 +100,7 @@ class Lane(Enum):
 
 
 LaneOf = Callable[[bytes | None], Lane]
-"""Chooses a sample's lane by its attachment; called on the bus's own threads, so it must be quick and sure."""
+"""Chooses a lane by a sample's attachment or a question's payload; called on the bus's own threads: quick and sure."""
 
 
 class Bus(Protocol):
@@ -129,7 +129,7 @@ class Bus(Protocol):
     ) -> Handle:
         """Take samples by way of a lane; ``history`` asks for last values too."""
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
@@ -145,7 +145,7 @@ class Bus(Protocol):
         """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
 
     async def flush(self) -> None:
-        """Wait until what was given to be published is with the bus; raise BusError where that takes too long."""
+        """Wait until what may block, streams apart, is with the bus; raise BusError where that takes too long."""
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""

@@ -173,12 +173,13 @@ class ZenohBus:
             _Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
         )
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards."""
         inbox, writer = self._inbox, self._writer
 
         def store(query: zenoh.Query) -> None:
-            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), lane)
+            own = lane if isinstance(lane, Lane) else lane(query.payload.to_bytes() if query.payload else None)
+            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), own)
 
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
@@ -223,7 +224,7 @@ class ZenohBus:
         return self._keep(_Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
 
     async def flush(self) -> None:
-        """Wait until what was given to be published so far was handed to the bus."""
+        """Wait until what may block, streams apart, is with the bus; raise BusError where that takes too long."""
         loop = self._loop
         written: asyncio.Future[None] = loop.create_future()
 

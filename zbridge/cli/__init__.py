@@ -54,7 +54,10 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
         raise ConfigError(f"{file}: device.protocol = {plan.protocol.name!r}: expected {only!r}")
     gc.freeze()  # what start-up made stays, and need not be looked through again
     gateway = Gateway(plan)
-    run_loop(until_signal(gateway.run()))
+    try:
+        run_loop(until_signal(gateway.run()))
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
     if not gateway.left:  # a thread of the bus hangs, and would keep the process from ending
         logging.shutdown()
         os._exit(0)

@@ -163,8 +163,6 @@ class Authority:
             raise Refused("repeated or out of order")
         holder.seq = shown.seq
         holder.expires_at = now + holder.lease_s
-        if self._moving:
-            self._stop_at = now + holder.deadman_s
         return holder.who
 
     def require_motion(self) -> None:
@@ -240,6 +238,11 @@ class Authority:
         elif now >= self._stop_at:
             self.hold_back("deadman")
 
+    @property
+    def eventful(self) -> bool:
+        """Whether :meth:`events` has any."""
+        return bool(self._events)
+
     def events(self) -> list[Event]:
         """Give what happened since the last call, in order."""
         events, self._events = self._events, []
@@ -261,12 +264,12 @@ class Authority:
 
     def _grant(self, request: Acquire, what: What, now: float) -> Lease:
         try:
-            if not request.who:
-                raise Refused("who = '': expected a name that others are shown")
+            if not request.who or not request.who.isprintable():
+                raise Refused(f"who = {request.who[:_NAMED]!r}: expected a name that others are shown")
             lease_s = _wish("lease_s", request.lease_s, self.lease_s)
             deadman_s = _wish("deadman_s", request.deadman_s, self.deadman_s)
         except Refused as refusal:
-            self.refuse(what.value, str(refusal), request.who)
+            self.refuse("takeover" if what is What.TAKEN_OVER else "acquire", str(refusal), request.who)
             return self._denied(str(refusal), now)
         who = request.who[:_NAMED]
         if self._holder is not None:

@@ -5,14 +5,15 @@ delay. ``arrived - counter`` is a slowly bending line plus a delay that is never
 below the packets. Of each bucket of two seconds the lowest packet is kept, 32 buckets at most; the line is the
 edge over the middle of their lower convex hull, which is, of all lines below every packet, the highest at the
 middle of the window (as Moon, Skelly and Towsley estimate skew). A late packet lies above the hull and moves
-nothing, however late; a packet below the line lowers it at once.
+nothing, however late; a packet below the line lowers it at once. At both ends of the window buckets that hold late
+packets only are left out before the middle is sought.
 
 **The error** is the stamp less the instant at which the counter became ``device_ms``, less the least delay, which
 nobody can see. Where packets come every 2 s or more often, one at least of those of any 10 s is within ``E`` ms of
 the least delay (``E`` up to 40), and the drift is up to 400 ppm and changes by up to ``K`` ppm per second, it is,
 from 80 s after the beginning on, either way within
 
-    2 E + 1.5 K  milliseconds
+    2.5 E + 1.5 K  milliseconds
 
 ``E`` includes the resolution of the counter, 1 ms. Why: the line is not below the truth at the middle of the window,
 nor more than ``E`` above it near both ends, so at the end it is wrong by ``E`` times a ratio of lengths; a parabola
@@ -31,8 +32,10 @@ JUMP_S = 10.0
 """Seconds by which the delays of two packets in a row may differ; more is a jump of one of the clocks."""
 
 LATE_S = 1.0
-"""Seconds: where for ``jump_s`` every packet is later than this, not they are late but a clock has jumped.
-Also the most by which stamps are held back from going backwards."""
+"""Seconds: where for ``jump_s`` every packet is later than this, not they are late but a clock has jumped."""
+
+LATE_PACKETS = 8
+"""How many such packets it takes at least."""
 
 SILENCE_S = 300.0
 """Seconds of the counter after which a packet says nothing about the present."""
@@ -43,8 +46,8 @@ BUCKETS = 32
 MAX_DRIFT_PPM = 500.0
 """The drift that is believed: of the counter, and of a gateway whose clock is being slewed."""
 
-_DROP_NS = 100_000_000
-"""A packet so far below the line shows that the line was drawn through late packets, or the clock was put back."""
+_TRIM_NS = 150_000_000
+"""At either end of the window, buckets so far above the lowest tell nothing of the drift: all they hold is late."""
 
 _NS_PER_MS = 1_000_000
 _NS_PER_S = 1_000_000_000
@@ -61,8 +64,9 @@ class DeviceClock:
 
     ``wrap_ms``: the value at which the counter starts over, 2**32 for a u32; None for one that never does.
     ``jump_s``: a step of the counter against the gateway's clock, either way, that is no late packet but a restart
-    of the counter or a step of the clock, seconds. Steps between ``LATE_S`` and ``jump_s`` are noticed after
-    ``jump_s``, smaller ones forgotten after 64 s; steps of the gateway's clock backwards are followed at once.
+    of the counter or a step of the clock, seconds: it begins anew with the second packet after it. Of lesser steps,
+    one backwards of the gateway's clock is followed at once (under 0.15 s it leaves an error of up to 20 ms for 40 s);
+    one forward, or a restart, is noticed after ``jump_s`` if over ``LATE_S``, and else forgotten after 64 s.
     """
 
     def __init__(self, wrap_ms: int | None = None, jump_s: float = JUMP_S) -> None:
@@ -71,7 +75,7 @@ class DeviceClock:
         self.beginnings = 0
         """How often it began: with the first packet, and anew with every jump."""
         self._device_ms = self._now_ms = self._arrived_ns = self._stamp_ns = self._origin_ns = 0
-        self._late_since_ns: int | None = None
+        self._late_packets = self._late_since_ns = 0
         self._stray: tuple[int, int] | None = None
         self._drift_ppm = 0.0  # which is nanoseconds per millisecond
         self._height_ns = 0.0
@@ -91,9 +95,9 @@ class DeviceClock:
     def stamp_ns(self, device_ms: int, arrived_ns: int) -> int:
         """Tell when the counter was ``device_ms``, given that it arrived at ``arrived_ns``: Unix ns, not after that.
 
-        Of a counter that only grows the stamps never go back, but for a correction of over a second and a clock
-        put back; equal counters get equal stamps. Whatever fits nowhere is stamped with its arrival: a value that is no
-        counter, the first packets after a jump, a counter that has stood still for ``jump_s``.
+        While counter and arrivals do not go back, nor do the stamps; equal counters get equal stamps. Whatever fits
+        nowhere is stamped with its arrival: a value that is no counter, the first packets after a jump, a counter
+        that has stood still for ``jump_s``. No integers raise.
         """
         if device_ms < 0 or (self._wrap_ms is not None and device_ms >= self._wrap_ms):
             return arrived_ns
@@ -111,7 +115,8 @@ class DeviceClock:
             stamp_ns = self._line_ns(now_ms) if step_ms else self._stamp_ns
             return min(stamp_ns, self._stamp_ns, arrived_ns)
         self._learn(now_ms, offset_ns)
-        self._stamp_ns = min(self._forward_ns(self._line_ns(now_ms), step_ms), arrived_ns)
+        slow_ns = self._stamp_ns + step_ms * (_NS_PER_MS // 2)  # where a new line is lower, until it has caught up
+        self._stamp_ns = min(max(self._line_ns(now_ms), slow_ns), arrived_ns)
         self._device_ms, self._now_ms, self._arrived_ns = device_ms, now_ms, arrived_ns
         return self._stamp_ns
 
@@ -122,7 +127,7 @@ class DeviceClock:
         self._origin_ns = self._arrived_ns = self._stamp_ns = arrived_ns
         self._now_ms = 0
         self._height_ns = 0.0
-        self._late_since_ns = None
+        self._late_packets = 0
         self._stray = None
         self._points.clear()
         self._open_bucket(0, 0)
@@ -149,20 +154,16 @@ class DeviceClock:
     def _jumped(self, late_ns: float, arrived_ns: int) -> bool:
         """Tell whether all packets have been late for so long that a clock must have jumped."""
         if late_ns <= _LATE_NS:
-            self._late_since_ns = None
+            self._late_packets = 0
             return False
-        if self._late_since_ns is None:
+        if self._late_packets == 0:
             self._late_since_ns = arrived_ns
-        return arrived_ns - self._late_since_ns > self._jump_ns
+        self._late_packets += 1
+        return self._late_packets >= LATE_PACKETS and arrived_ns - self._late_since_ns > self._jump_ns
 
     def _line_ns(self, now_ms: int) -> int:
         """Tell the gateway's time when the counter was ``now_ms``, by the line."""
         return self._origin_ns + now_ms * _NS_PER_MS + int(self._height_ns + self._drift_ppm * now_ms)
-
-    def _forward_ns(self, line_ns: int, step_ms: int) -> int:
-        """Where the line fell, go on at half the pace until it has caught up; fall with it over a second."""
-        slow_ns = self._stamp_ns + step_ms * (_NS_PER_MS // 2)
-        return slow_ns if 0 < slow_ns - line_ns < _LATE_NS else line_ns
 
     def _learn(self, now_ms: int, offset_ns: int) -> None:
         """Enter a packet that is newer than all others into its bucket, and draw the line below it."""
@@ -170,10 +171,7 @@ class DeviceClock:
             self._close_bucket(now_ms)
             self._open_bucket(now_ms, offset_ns)
         low_ns = offset_ns - self._drift_ppm * now_ms
-        if low_ns < self._height_ns - _DROP_NS:
-            self._points.clear()
-            self._open_bucket(now_ms, offset_ns)
-        elif low_ns < self._lowest_ns:
+        if low_ns < self._lowest_ns:
             self._lowest, self._lowest_ns = (now_ms, offset_ns), low_ns
         if low_ns < self._height_ns:
             self._height_ns = low_ns
@@ -190,8 +188,8 @@ class DeviceClock:
         while len(points) > 1 and points[0][0] < now_ms - _SILENCE_MS:
             points.popleft()
         hull = _lower_hull(points)
-        drift_ppm = max(-MAX_DRIFT_PPM, min(_slope_at_middle(hull, self._drift_ppm), MAX_DRIFT_PPM))
-        self._drift_ppm = drift_ppm
+        slope_ppm = _slope_at_middle(_trim(hull, self._drift_ppm), self._drift_ppm)
+        self._drift_ppm = drift_ppm = max(-MAX_DRIFT_PPM, min(slope_ppm, MAX_DRIFT_PPM))
         self._height_ns = min(offset_ns - drift_ppm * ms for ms, offset_ns in hull)
 
 
@@ -206,6 +204,13 @@ def _lower_hull(points: Iterable[_Point]) -> list[_Point]:
             hull.pop()
         hull.append((x, y))
     return hull
+
+
+def _trim(hull: list[_Point], drift_ppm: float) -> list[_Point]:
+    """Cut off the ends of a hull that only late packets hold up."""
+    lows = [offset_ns - drift_ppm * ms for ms, offset_ns in hull]
+    limit = min(lows) + _TRIM_NS
+    return [point for point, low in zip(hull, lows, strict=True) if low <= limit]
 
 
 def _slope_at_middle(hull: list[_Point], guess_ppm: float) -> float:

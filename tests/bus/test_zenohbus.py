@@ -1,0 +1,116 @@
+"""The bus over Zenoh itself: sessions inside this process, on loopback, without waiting for any length of time."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+
+import pytest
+
+from zbridge.bus import BusSettings, Lane
+from zbridge.bus import zenohbus as module
+from zbridge.bus.zenohbus import ZenohBus, open_zenoh
+from zbridge.errors import BusError
+from zbridge.fleet import topics
+from zbridge.metrics import Metrics
+
+SOON_S = 5.0
+ALONE = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
+
+
+class Seen(list[object]):
+    """What a handler was told, and a way to wait for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._changed = asyncio.Event()
+
+    def take(self, *told: object) -> None:
+        self.append(told if len(told) > 1 else told[0])
+        self._changed.set()
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        async with asyncio.timeout(SOON_S):
+            while not condition():
+                self._changed.clear()
+                await self._changed.wait()
+
+
+@pytest.fixture
+async def bus() -> AsyncIterator[ZenohBus]:
+    opened = await open_zenoh(ALONE, Metrics())
+    yield opened
+    await opened.close()
+
+
+async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_those_that_go(bus: ZenohBus) -> None:
+    first = bus.announce("fleet/r1/@alive/first")
+    elsewhere = bus.announce("fleet/r2/@alive/elsewhere")
+    seen = Seen()
+    handle = bus.watch_alive("fleet/r1/@alive/*", seen.take)
+    await seen.until(lambda: len(seen) == 1)
+    second = bus.announce("fleet/r1/@alive/second")
+    await seen.until(lambda: len(seen) == 2)
+    elsewhere.close()
+    first.close()
+    await seen.until(lambda: len(seen) == 3)
+    assert seen == [
+        ("fleet/r1/@alive/first", True),
+        ("fleet/r1/@alive/second", True),
+        ("fleet/r1/@alive/first", False),
+    ]
+    handle.close()
+    handle.close()
+    again = Seen()
+    bus.watch_alive("fleet/r1/@alive/*", again.take)
+    second.close()
+    await again.until(lambda: ("fleet/r1/@alive/second", False) in again)
+    assert len(seen) == 3, "a closed watch is told nothing"
+
+
+async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -> None:
+    seen, asked, all_asked = Seen(), list[bytes | None](), threading.Event()
+
+    def lane(attachment: bytes | None) -> Lane:
+        asked.append(attachment)
+        if attachment == b"last":
+            all_asked.set()
+        return Lane.COMMAND if attachment == b"holder" else Lane.OTHER
+
+    bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload, sample.attachment), lane=lane)
+    drive = bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE)
+    sent = [(b"1", None), (b"2", b"other"), (b"3", b"holder"), (b"4", b"holder"), (b"5", b"last")]
+    for payload, attachment in sent:
+        drive.put(payload, attachment)
+    assert all_asked.wait(SOON_S)  # the event loop stands still meanwhile, so that everything waits for it
+    assert asked == [attachment for _, attachment in sent]
+    await seen.until(lambda: len(seen) == 5)
+    assert seen == [sent[2], sent[3], sent[0], sent[1], sent[4]]
+
+
+async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> None:
+    seen, go = Seen(), threading.Event()
+    bus.subscribe("fleet/r1/@cmd/mode", lambda sample: seen.take(sample.payload))
+    bus._writer.put(lambda: go.wait(SOON_S))  # as a full transmission queue holds it
+    bus.publisher("fleet/r1/@cmd/mode", topics.CMD_MODE).put(b"mode")
+    flushed = asyncio.ensure_future(bus.flush())
+    await asyncio.to_thread(lambda: None)
+    assert not flushed.done()
+    go.set()
+    async with asyncio.timeout(SOON_S):
+        await flushed
+    await seen.until(lambda: seen == [b"mode"])
+
+
+async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
+    bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    go = threading.Event()
+    bus._writer.put(lambda: go.wait(SOON_S))
+    with pytest.raises(BusError, match=r"the bus took nothing for 0\.01 s"):
+        await bus.flush()
+    go.set()
+    monkeypatch.undo()
+    await bus.flush()

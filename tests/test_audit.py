@@ -1,0 +1,414 @@
+"""The audit log: what a line says, what is counted instead of repeated, and what becomes of it on the disk."""
+
+import contextlib
+import json
+import os
+import stat
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zbridge.audit import KINDS, WAITING, Audit, AuditFile
+from zbridge.errors import ConfigError
+from zbridge.metrics import Metrics
+from zbridge.session.control import Event, What
+
+EPOCH_NS = 1_767_225_600_000_000_000
+"""The first second of 2026, UTC."""
+JOIN_S = 30.0
+"""Longest time a thread of a test may take; no test waits that long."""
+
+
+class Log:
+    """An audit log whose lines and whose clock are the test's."""
+
+    def __init__(self) -> None:
+        self.raw: list[str] = []
+        self.now_ns = EPOCH_NS
+        self.audit = Audit("r1", self.raw.append, lambda: self.now_ns)
+
+    def lines(self) -> list[dict[str, Any]]:
+        """Give what was written since the last call."""
+        taken, self.raw[:] = list(self.raw), []
+        return [json.loads(line) for line in taken]
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+def refused(who: str | None = "ann", command: str = "drive", reason: str = "offline") -> Event:
+    return Event(What.REFUSED, who, reason, command=command)
+
+
+# Lines
+
+WRITTEN = [
+    (
+        Event(What.ACQUIRED, "ann", priority=0),
+        {"event": "acquired", "who": "ann", "priority": 0},
+    ),
+    (
+        Event(What.TAKEN_OVER, "bob", priority=-3),
+        {"event": "taken over", "who": "bob", "priority": -3},
+    ),
+    (
+        Event(What.ENDED, "ann", "taken over by bob", stops=True),
+        {"event": "ended", "who": "ann", "reason": "taken over by bob", "stops": True},
+    ),
+    (
+        Event(What.RELEASED, "ann", "released"),
+        {"event": "released", "who": "ann", "reason": "released"},
+    ),
+    (
+        Event(What.STOPPED, "ann", "deadman", stops=True),
+        {"event": "stopped", "who": "ann", "reason": "deadman", "stops": True},
+    ),
+    (
+        Event(What.STOPPED, None, "stop", stops=True),
+        {"event": "stopped", "reason": "stop", "stops": True},
+    ),
+    (
+        refused(),
+        {"event": "refused", "who": "ann", "command": "drive", "reason": "offline"},
+    ),
+    (
+        refused(None),
+        {"event": "refused", "command": "drive", "reason": "offline"},
+    ),
+]
+
+
+@pytest.mark.parametrize(("event", "fields"), WRITTEN, ids=[str(event) for event, _ in WRITTEN])
+def test_every_event_is_a_line_that_says_what_is_known(log: Log, event: Event, fields: dict[str, Any]) -> None:
+    log.audit.write(event)
+    assert log.lines() == [{"time": "2026-01-01T00:00:00.000+00:00", "robot": "r1", **fields}]
+
+
+def test_the_time_is_utc_to_the_millisecond(log: Log) -> None:
+    log.now_ns = EPOCH_NS + 61_234_567_890
+    log.audit.write(Event(What.ACQUIRED, "ann"))
+    assert log.lines()[0]["time"] == "2026-01-01T00:01:01.234+00:00"
+
+
+@pytest.mark.parametrize("name", ["two\nlines", 'a "quoted" name', "\x00\x1b[2J", "Jürgen", "\u2028", "%s %d {}"])
+def test_whatever_a_name_is_it_stays_on_one_plain_line(log: Log, name: str) -> None:
+    log.audit.write(refused(name, name, name))
+    (raw,) = log.raw
+    assert raw.isascii()
+    assert raw.isprintable()
+    (line,) = log.lines()
+    assert (line["who"], line["command"], line["reason"]) == (name, name, name)
+
+
+def test_an_audit_log_prints_whose_it_is(log: Log) -> None:
+    assert repr(log.audit) == "<Audit r1>"
+
+
+# Repetitions
+
+
+def test_a_first_refusal_is_written_at_once_and_the_others_are_counted(log: Log) -> None:
+    log.audit.write(refused())
+    assert [line.get("count") for line in log.lines()] == [None]
+    for _ in range(1000):
+        log.audit.write(refused())
+    assert log.raw == []
+    log.now_ns += 1_000_000_000
+    log.audit.flush()
+    (line,) = log.lines()
+    assert line["count"] == 1000
+    assert (line["event"], line["who"], line["command"], line["reason"]) == ("refused", "ann", "drive", "offline")
+    assert line["time"] == "2026-01-01T00:00:01.000+00:00"
+
+
+def test_a_refusal_that_goes_on_is_a_line_and_then_one_a_second(log: Log) -> None:
+    for _ in range(5):
+        for _ in range(100):
+            log.audit.write(refused())
+        log.audit.flush()
+    counts = [line.get("count", 1) for line in log.lines()]
+    assert sum(counts) == 500
+    assert len(counts) == 1 + 5
+
+
+def test_a_refusal_that_did_not_repeat_itself_is_written_once(log: Log) -> None:
+    log.audit.write(refused())
+    log.audit.flush()
+    log.audit.flush()
+    assert len(log.lines()) == 1
+
+
+def test_one_repetition_is_a_line_like_the_first(log: Log) -> None:
+    log.audit.write(refused())
+    log.audit.write(refused())
+    log.audit.flush()
+    first, second = log.lines()
+    assert first == second
+    assert "count" not in first
+
+
+def test_nothing_is_written_when_nothing_happened(log: Log) -> None:
+    log.audit.flush()
+    assert log.raw == []
+
+
+def test_what_was_flushed_is_not_counted_again(log: Log) -> None:
+    for _ in range(3):
+        log.audit.write(refused())
+    log.audit.flush()
+    log.lines()
+    log.audit.flush()
+    assert log.lines() == []
+    log.audit.write(refused())
+    log.audit.flush()
+    assert [line.get("count", 1) for line in log.lines()] == [1]
+
+
+@pytest.mark.parametrize("other", [refused("bob"), refused(None), refused(command="raw"), refused(reason="busy")])
+def test_different_refusals_are_counted_apart(log: Log, other: Event) -> None:
+    for event in (refused(), other, refused(), other, other):
+        log.audit.write(event)
+    assert len(log.lines()) == 2
+    log.audit.flush()
+    assert [line.get("count", 1) for line in log.lines()] == [1, 2]
+
+
+@pytest.mark.parametrize("event", [event for event, _ in WRITTEN if event.who and event.what is not What.REFUSED])
+def test_what_happens_to_a_holder_is_written_every_time(log: Log, event: Event) -> None:
+    for _ in range(3):
+        log.audit.write(event)
+    assert [line["event"] for line in log.lines()] == [event.what.value] * 3
+    log.audit.flush()
+    assert log.lines() == []
+
+
+def test_stops_of_a_robot_that_nobody_holds_are_counted_too(log: Log) -> None:
+    for _ in range(5):
+        log.audit.write(Event(What.STOPPED, None, "stop", stops=True))
+    log.audit.flush()
+    assert [(line["event"], line["stops"], line.get("count")) for line in log.lines()] == [
+        ("stopped", True, None),
+        ("stopped", True, 4),
+    ]
+
+
+def test_a_flood_of_different_refusals_is_bounded_and_still_counted(log: Log) -> None:
+    for number in range(10 * KINDS):
+        log.audit.write(refused(reason=f"reason {number}"))
+    log.audit.flush()
+    lines = log.lines()
+    assert len(lines) <= KINDS + 2
+    assert sum(line.get("count", 1) for line in lines) == 10 * KINDS
+    assert lines[-1]["reason"] == "others"
+    assert lines[-1]["event"] == "refused"
+
+
+def test_a_flood_of_refusals_hides_no_stop(log: Log) -> None:
+    for number in range(KINDS + 1):
+        log.audit.write(refused(None, f"no such command {number}"))
+    log.lines()
+    log.audit.write(Event(What.STOPPED, None, "stop", stops=True))
+    log.audit.flush()
+    stops = [(line["reason"], line["stops"]) for line in log.lines() if line["event"] == "stopped"]
+    assert stops == [("stop", True)]
+
+
+events = st.builds(
+    Event,
+    st.sampled_from(What),
+    st.sampled_from(["ann", "bob"]),
+    st.sampled_from(["offline", "stop"]),
+    command=st.sampled_from([None, "drive", "raw"]),
+)
+
+
+@given(st.lists(events | st.none(), max_size=60))
+def test_nothing_is_lost_or_counted_twice(course: list[Event | None]) -> None:
+    log = Log()
+    for event in course:
+        if event is None:
+            log.audit.flush()
+        else:
+            log.audit.write(event)
+    log.audit.flush()
+    happened = Counter((event.what.value, event.who, event.command, event.reason) for event in course if event)
+    written: Counter[tuple[str, str, str | None, str]] = Counter()
+    for line in log.lines():
+        written[line["event"], line["who"], line.get("command"), line["reason"]] += line.get("count", 1)
+    assert written == happened
+
+
+# The file
+
+
+class Disk:
+    """A disk that stands still until the test reads: a pipe in the place of the file."""
+
+    def __init__(self, path: Path, metrics: Metrics) -> None:
+        os.mkfifo(path)
+        self._outlet = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        os.set_blocking(self._outlet, True)
+        self._data = b""
+        self.file = opened(path, metrics, file_bytes=0)
+
+    def stand_still(self) -> None:
+        """Let the writing thread begin a line that is too long for the pipe, and so take no other."""
+        self.file.write("x" * 2**20)
+        self._data += os.read(self._outlet, 1)
+
+    def read(self, lines: int) -> list[bytes]:
+        """Take what is written until there are that many lines."""
+        while self._data.count(b"\n") < lines:
+            chunk = os.read(self._outlet, 65536)
+            assert chunk, "the file was closed before all was written"
+            self._data += chunk
+        return self._data.splitlines()
+
+    def read_all(self) -> list[bytes]:
+        """Take what is written until the file is closed."""
+        while chunk := os.read(self._outlet, 65536):
+            self._data += chunk
+        return self._data.splitlines()
+
+    def close(self) -> None:
+        os.close(self._outlet)
+
+
+@pytest.fixture
+def metrics() -> Metrics:
+    return Metrics()
+
+
+@pytest.fixture
+def disk(tmp_path: Path, metrics: Metrics) -> Iterator[Disk]:
+    with contextlib.closing(Disk(tmp_path / "audit.jsonl", metrics)) as disk:
+        yield disk
+
+
+def opened(path: Path, metrics: Metrics | None = None, *, file_bytes: int = 1_000_000, files: int = 2) -> AuditFile:
+    return AuditFile(path, metrics or Metrics(), file_bytes=file_bytes, files=files)
+
+
+def fill(file: AuditFile) -> list[bytes]:
+    """Write as many lines as may wait."""
+    lines = [f"line {number}" for number in range(WAITING)]
+    for line in lines:
+        file.write(line)
+    return [line.encode() for line in lines]
+
+
+def test_closing_writes_what_waits(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    file = opened(path)
+    lines = [f'{{"line": {number}}}' for number in range(1000)]
+    for line in lines:
+        file.write(line)
+    file.close()
+    assert path.read_text().splitlines() == lines
+
+
+def test_lines_are_written_as_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    file = opened(path)
+    lines = ["100 % %s %(name)s", "{}", "Jürgen", ""]
+    for line in lines:
+        file.write(line)
+    file.close()
+    assert path.read_text(encoding="utf-8") == "".join(f"{line}\n" for line in lines)
+
+
+def test_a_file_that_is_there_is_continued(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    path.write_text("before\n")
+    file = opened(path)
+    file.write("after")
+    file.close()
+    assert path.read_text() == "before\nafter\n"
+
+
+def test_the_folder_is_made(tmp_path: Path) -> None:
+    path = tmp_path / "log" / "r1" / "audit.jsonl"
+    opened(path).close()
+    assert stat.S_ISREG(path.stat().st_mode)
+
+
+def test_files_are_rotated_and_the_oldest_are_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    file = opened(path, file_bytes=1000, files=2)
+    lines = [f"line {number:04}" for number in range(1000)]
+    for line in lines:
+        file.write(line)
+    file.close()
+    kept = [path.with_name("audit.jsonl.2"), path.with_name("audit.jsonl.1"), path]
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
+    assert all(0 < each.stat().st_size <= 1000 for each in kept)
+    written = "".join(each.read_text() for each in kept).splitlines()
+    assert written == lines[-len(written) :]
+    assert len(written) > 200
+
+
+def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written(disk: Disk, metrics: Metrics) -> None:
+    dropped = metrics.count("audit_dropped")
+    disk.stand_still()
+    lines = fill(disk.file)
+    assert dropped.value == 0
+    for _ in range(10):
+        disk.file.write("no room for this one")  # and it returns, although nobody reads
+    assert dropped.value == 10
+    assert disk.read(1 + WAITING)[1:] == lines
+    disk.file.write("and there is room again")
+    disk.file.close()
+    assert disk.read_all()[1:] == [*lines, b"and there is room again"]
+    assert dropped.value == 10
+
+
+def test_closing_writes_what_waits_although_the_queue_is_full(disk: Disk) -> None:
+    disk.stand_still()
+    lines = fill(disk.file)
+    failed: list[BaseException] = []
+
+    def close() -> None:
+        try:
+            disk.file.close()
+        except BaseException as error:
+            failed.append(error)
+
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    closing.join(0.05)  # it fails at once, or waits for the disk
+    if failed:
+        disk.read(1 + WAITING)
+        disk.file.close()
+    assert failed == []
+    assert disk.read_all()[1:] == lines
+    closing.join(JOIN_S)
+    assert failed == []
+
+
+def test_closing_twice_does_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    file = opened(path)
+    file.write("line")
+    file.close()
+    file.close()
+    assert path.read_text() == "line\n"
+
+
+@pytest.mark.parametrize("name", ["file/audit.jsonl", "folder", "file/deep/audit.jsonl"])
+def test_a_path_that_cannot_be_written_is_an_error_of_the_configuration(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / name
+    threads = threading.active_count()
+    with pytest.raises(ConfigError) as error:
+        opened(path)
+    assert str(error.value).startswith(f"control.audit = '{path}': ")
+    assert threading.active_count() == threads

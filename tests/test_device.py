@@ -21,7 +21,7 @@ from zbridge.bus import Handle, Lane, Question, Sample
 from zbridge.bus.fake import FakeBus, FakeQuestion
 from zbridge.bus.interface import LaneOf
 from zbridge.conversation import Conversation
-from zbridge.device import HEARTBEAT_S, Device
+from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
@@ -1460,6 +1460,16 @@ async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(name:
 
 
 @pytest.mark.parametrize(("mode", "stops"), [("autonomous", True), ("manual", False), ("none", False)])
+@jumping
+async def test_commands_are_served_in_the_midst_of_a_large_read() -> None:
+    async with established() as rig:
+        attended: list[int] = []
+        rig.bus.attend = lambda: attended.append(len(rig.values("pose")))  # type: ignore[method-assign]
+        rig.sends(POSITION * (3 * ATTEND_EVERY))
+        assert len(attended) == 3
+        assert len(rig.values("pose")) == 3 * ATTEND_EVERY
+
+
 @jumping
 async def test_a_release_stops_a_robot_only_while_it_may_move_by_itself(mode: str, stops: bool) -> None:
     async with established() as rig:

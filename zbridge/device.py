@@ -38,6 +38,8 @@ HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
 LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
+ATTEND_EVERY = 64
+"""Messages of a read between two looks at the commands that wait."""
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
@@ -195,7 +197,9 @@ class Device:
         encode, translators, waiting = payloads.encode, self._translators, self._questions.waiting
         streams: dict[str, list[bytes]] = {}
         flowing, states = True, 0
-        for message in messages:
+        for number, message in enumerate(messages, 1):
+            if not number % ATTEND_EVERY:
+                self._bus.attend()
             translate = translators.get(type(message)) or self._translator(type(message))
             try:
                 for topic, telemetry in translate(message, stamp_ns):

@@ -136,3 +136,14 @@ def test_an_item_for_a_loop_that_has_ended_is_no_error() -> None:
     rig = asyncio.run(make())
     rig.put(1)
     assert rig.seen == []
+
+
+async def test_attending_serves_stops_and_commands_at_once_and_nothing_else() -> None:
+    rig = Rig()
+    rig.put("other")
+    rig.put("command", first=True)
+    rig.inbox.put(rig.seen.append, "stop", lambda value: value, Lane.STOP)
+    rig.inbox.attend()
+    assert rig.seen == ["stop", "command"]
+    rig.inbox.attend()
+    assert await rig.drained() == ["stop", "command", "other"]

@@ -118,6 +118,9 @@ class FakeBus:
         kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
         return [reply for question in questions for reply in question.replies] + kept
 
+    def attend(self) -> None:
+        """Do nothing: handlers are called on the spot."""
+
     def announce(self, key: str) -> Handle:
         self._shared.tokens.append(key)
         self._shared.tell(key, True)

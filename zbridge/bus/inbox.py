@@ -28,6 +28,7 @@ class Inbox:
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
         self._lanes: dict[Lane, deque[tuple[Handler, Any, Read]]] = {lane: deque() for lane in Lane}
+        self._stops, self._commands = self._lanes[Lane.STOP], self._lanes[Lane.COMMAND]
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
 
@@ -44,17 +45,28 @@ class Inbox:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._drain)
 
+    def attend(self) -> None:
+        """Serve the stops and commands that wait, and nothing else."""
+        for _ in range(_DRAIN):
+            waiting = self._stops or self._commands
+            if not waiting:
+                return
+            self._serve(waiting)
+
+    def _serve(self, waiting: deque[tuple[Handler, Any, Read]]) -> None:
+        handler, raw, read = waiting.popleft()
+        try:
+            handler(read(raw))
+        except Exception:
+            log.exception("a handler failed")
+
     def _drain(self) -> None:
         self._awake = False
         for _ in range(_DRAIN):
             waiting = next((waiting for waiting in self._lanes.values() if waiting), None)
             if waiting is None:
                 return
-            handler, raw, read = waiting.popleft()
-            try:
-                handler(read(raw))
-            except Exception:
-                log.exception("a handler failed")
+            self._serve(waiting)
         if not self._awake:
             self._awake = True
             self._loop.call_soon(self._drain)

@@ -135,6 +135,9 @@ class Bus(Protocol):
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
 
+    def attend(self) -> None:
+        """Hand over the stops and the holder's commands that wait: to be called in the midst of long work."""
+
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
 

@@ -200,6 +200,10 @@ class ZenohBus:
         )
         return [_read_reply(reply) for reply in replies]
 
+    def attend(self) -> None:
+        """Hand over the stops and the holder's commands that wait: to be called in the midst of long work."""
+        self._inbox.attend()
+
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
         return self._keep(_Declared(self._session.liveliness().declare_token(key)))

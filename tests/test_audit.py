@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import select
 import stat
 import threading
 from collections import Counter
@@ -23,6 +24,8 @@ EPOCH_NS = 1_767_225_600_000_000_000
 """The first second of 2026, UTC."""
 JOIN_S = 30.0
 """Longest time a thread of a test may take; no test waits that long."""
+QUIET_S = 2.0
+"""How long nothing may come from a file that is open; no test waits that long either, unless it fails."""
 
 
 class Log:
@@ -146,6 +149,25 @@ def test_a_refusal_that_did_not_repeat_itself_is_written_once(log: Log) -> None:
     assert len(log.lines()) == 1
 
 
+def test_after_a_quiet_second_a_refusal_is_written_at_once_again(log: Log) -> None:
+    for _ in range(3):
+        log.audit.write(refused())
+    log.audit.flush()
+    log.audit.flush()
+    log.lines()
+    log.audit.write(refused())
+    assert len(log.lines()) == 1
+
+
+def test_refusals_of_long_ago_leave_room_for_others(log: Log) -> None:
+    for number in range(3 * KINDS):
+        for _ in range(2):
+            log.audit.write(refused(reason=f"reason {number}"))
+        log.audit.flush()
+        log.audit.flush()
+    assert len({line["reason"] for line in log.lines()}) == 3 * KINDS
+
+
 def test_one_repetition_is_a_line_like_the_first(log: Log) -> None:
     log.audit.write(refused())
     log.audit.write(refused())
@@ -224,7 +246,7 @@ def test_a_flood_of_refusals_hides_no_stop(log: Log) -> None:
 events = st.builds(
     Event,
     st.sampled_from(What),
-    st.sampled_from(["ann", "bob"]),
+    st.sampled_from(["ann", "bob", None]),
     st.sampled_from(["offline", "stop"]),
     command=st.sampled_from([None, "drive", "raw"]),
 )
@@ -240,9 +262,9 @@ def test_nothing_is_lost_or_counted_twice(course: list[Event | None]) -> None:
             log.audit.write(event)
     log.audit.flush()
     happened = Counter((event.what.value, event.who, event.command, event.reason) for event in course if event)
-    written: Counter[tuple[str, str, str | None, str]] = Counter()
+    written: Counter[tuple[str, str | None, str | None, str | None]] = Counter()
     for line in log.lines():
-        written[line["event"], line["who"], line.get("command"), line["reason"]] += line.get("count", 1)
+        written[line["event"], line.get("who"), line.get("command"), line["reason"]] += line.get("count", 1)
     assert written == happened
 
 
@@ -273,8 +295,8 @@ class Disk:
         return self._data.splitlines()
 
     def read_all(self) -> list[bytes]:
-        """Take what is written until the file is closed."""
-        while chunk := os.read(self._outlet, 65536):
+        """Take what is written until the file is closed, or, where it is never closed, until nothing more comes."""
+        while select.select([self._outlet], [], [], QUIET_S)[0] and (chunk := os.read(self._outlet, 65536)):
             self._data += chunk
         return self._data.splitlines()
 
@@ -373,6 +395,37 @@ def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written(disk:
 def test_closing_writes_what_waits_although_the_queue_is_full(disk: Disk) -> None:
     disk.stand_still()
     lines = fill(disk.file)
+    with closing(disk) as failed:
+        assert failed == []
+        assert disk.read_all()[1:] == lines
+    assert failed == []
+
+
+def test_what_is_given_up_at_the_end_is_counted(disk: Disk, metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("zbridge.audit.CLOSE_S", 0.001)
+    disk.stand_still()
+    lines = fill(disk.file)
+    with closing(disk) as failed:
+        written = disk.read_all()[1:]
+    assert failed == []
+    assert len(written) + metrics.count("audit_dropped").value >= len(lines)
+
+
+def test_a_disk_that_never_moves_again_does_not_keep_the_gateway_from_ending(
+    disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("zbridge.audit.CLOSE_S", 0.001)
+    disk.stand_still()
+    with closing(disk, within_s=2.0) as failed:
+        closed = not any(thread.name == "closing" for thread in threading.enumerate())
+        disk.read(1)
+    assert failed == []
+    assert closed, "close() waits for the disk without an end"
+
+
+@contextlib.contextmanager
+def closing(disk: Disk, within_s: float = 0.05) -> Iterator[list[BaseException]]:
+    """Close the file in a thread, and go on when that is done or waits for the disk; give the errors it had."""
     failed: list[BaseException] = []
 
     def close() -> None:
@@ -381,16 +434,11 @@ def test_closing_writes_what_waits_although_the_queue_is_full(disk: Disk) -> Non
         except BaseException as error:
             failed.append(error)
 
-    closing = threading.Thread(target=close, daemon=True)
-    closing.start()
-    closing.join(0.05)  # it fails at once, or waits for the disk
-    if failed:
-        disk.read(1 + WAITING)
-        disk.file.close()
-    assert failed == []
-    assert disk.read_all()[1:] == lines
-    closing.join(JOIN_S)
-    assert failed == []
+    thread = threading.Thread(target=close, name="closing", daemon=True)
+    thread.start()
+    thread.join(within_s)
+    yield failed
+    thread.join(JOIN_S)
 
 
 def test_closing_twice_does_no_harm(tmp_path: Path) -> None:

@@ -1459,7 +1459,6 @@ async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(name:
         assert rig.counted("stopped") == 1
 
 
-@pytest.mark.parametrize(("mode", "stops"), [("autonomous", True), ("manual", False), ("none", False)])
 @jumping
 async def test_commands_are_served_in_the_midst_of_a_large_read() -> None:
     async with established() as rig:
@@ -1470,6 +1469,7 @@ async def test_commands_are_served_in_the_midst_of_a_large_read() -> None:
         assert len(rig.values("pose")) == 3 * ATTEND_EVERY
 
 
+@pytest.mark.parametrize(("mode", "stops"), [("autonomous", True), ("manual", False), ("none", False)])
 @jumping
 async def test_a_release_stops_a_robot_only_while_it_may_move_by_itself(mode: str, stops: bool) -> None:
     async with established() as rig:

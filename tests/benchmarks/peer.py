@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-KEYS = {"pose": "fleet/bench/pose", "map": "fleet/bench/map"}
+KEYS = {"pose": "fleet/bench/pose", "map": "fleet/bench/map", "all": "fleet/bench/**"}
 ROBOT = "bench"
 PROBE_S = 0.005
 """Seconds between two probes, sent until the harness has seen one arrive."""

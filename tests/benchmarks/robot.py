@@ -26,7 +26,7 @@ def main() -> None:
     with link:
         link.settimeout(ACCEPT_S)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        _shake_hands(link)
+        shake_hands(link)
         if kind == "map":
             frame = wire.slam_map()
             drive(count, rate_hz, lambda _: link.sendall(frame), lambda: _flood(link, [frame] * count))
@@ -37,7 +37,8 @@ def main() -> None:
             pass
 
 
-def _shake_hands(link: socket.socket) -> None:
+def shake_hands(link: socket.socket) -> None:
+    """Send the settings and wait for the HQ's."""
     link.sendall(wire.server_settings())
     answer = b""
     while len(answer) < wire.HEADER.size or len(answer) < 4 + wire.HEADER.unpack_from(answer)[0]:

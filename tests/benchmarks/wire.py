@@ -61,9 +61,9 @@ def positions(first: int, last: int) -> bytes:
     return packets.tobytes()
 
 
-def slam_map() -> bytes:
-    """Write packet 53 with 40 000 cells."""
-    return _packet(_SERVER_ID, _MAP, struct.pack("<i", SIDE * SIDE) + _cells())
+def slam_map(side: int = SIDE) -> bytes:
+    """Write packet 53 with ``side * side`` cells, 40 000 of them by default."""
+    return _packet(_SERVER_ID, _MAP, struct.pack("<i", side * side) + _cells(side))
 
 
 def payload(kind: Kind, sequence: int, stamp_ns: int) -> bytes:
@@ -96,5 +96,5 @@ def _text(text: bytes) -> bytes:
     return struct.pack("<i", len(text)) + text
 
 
-def _cells() -> bytes:
-    return bytes(index % 3 for index in range(SIDE * SIDE))
+def _cells(side: int = SIDE) -> bytes:
+    return bytes(index % 3 for index in range(side * side))

@@ -326,6 +326,17 @@ def test_nobody_without_a_name_is_given_a_robot(state: str) -> None:
     assert (repr(authority), authority.moving, authority.deadline(), authority.token) == before
 
 
+@pytest.mark.parametrize("who", ["two\nlines", "\x1b[2J", "\x00", "\u2028", "\u202e", "a" * 100 + "\n"])
+def test_a_name_that_would_not_print_is_refused_and_told_without_printing_it(who: str) -> None:
+    authority = held()
+    lease = authority.takeover(Acquire(who=who, priority=9), NOW)
+    assert not lease.ok
+    assert lease.reason is not None
+    assert lease.reason.isprintable()
+    assert len(lease.reason) < 400
+    assert authority.report(NOW).holder == "ann"
+
+
 @pytest.mark.parametrize("ask", ["acquire", "takeover"])
 def test_a_refused_wish_is_shown_as_the_command_it_was(ask: str) -> None:
     authority = new()
@@ -389,6 +400,7 @@ MALFORMED = {
     "cut": attach(ANN, 9)[:-1],
     "more behind it": attach(ANN, 9) + b"\x00",
     "deeply nested": b"\x91" * 100_000 + b"\xc0",
+    "deeply nested aside": attach(ANN, 9).replace(b"\x82", b"\x83", 1) + b"\xa1x" + b"\x91" * 100_000 + b"\xc0",
 }
 
 
@@ -439,6 +451,13 @@ def test_a_command_renews_the_lease() -> None:
     authority.admit(attach(ANN, SEQ + 1), NOW + 1.0)
     assert authority.report(NOW + 1.0).expires_in_s == LEASE_S
     assert authority.deadline() == NOW + 1.0 + LEASE_S
+
+
+def test_a_command_that_was_only_admitted_does_not_feed_the_deadman() -> None:
+    authority = moving()
+    for step in range(1, 5):
+        authority.admit(attach(ANN, SEQ + step), NOW + 0.1 * step)
+    assert authority.deadline() == NOW + WAIT_S, "the robot may have refused it, and then moves on as before"
 
 
 def test_a_command_does_not_renew_a_lease_that_has_just_ended() -> None:

@@ -45,8 +45,6 @@ class Driver:
     deadman_s: float
     expires_at: float
     seq: int = -1
-    heard_at: float = 0.0
-    """When a command of its was last admitted, whatever became of it."""
     obeyed_at: float = 0.0
     """When a command of its was last carried out."""
 
@@ -257,7 +255,7 @@ class Driving(RuleBasedStateMachine):
         assert deadline is not None
         assert self.now < deadline <= driver.expires_at
         if self.robot.parts:
-            assert deadline <= driver.heard_at + driver.deadman_s
+            assert deadline <= driver.obeyed_at + driver.deadman_s
 
     @invariant()
     def there_is_one_holder_or_none(self) -> None:
@@ -349,7 +347,6 @@ class Driving(RuleBasedStateMachine):
         assert who == self.driver.who
         self.take_events()
         self.driver.seq = msgpack.unpackb(attachment)["seq"]
-        self.driver.heard_at = self.now
         self.driver.expires_at = self.now + self.driver.lease_s
         carry_out()
 

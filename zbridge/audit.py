@@ -7,20 +7,21 @@ from __future__ import annotations
 
 import json
 import logging
+import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
+from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from queue import Full, Queue
 from typing import Any
 
 from zbridge.errors import ConfigError
-from zbridge.metrics import Metrics
+from zbridge.metrics import Count, Metrics
 from zbridge.session.control import Event, What
 
 CLOSE_S = 1.0
-"""Longest time a full queue is given to empty at the end."""
+"""Longest time the disk is given at the end, twice."""
 WAITING = 4096
 """Lines that may wait for the disk; what is more is dropped and counted."""
 KINDS = 256
@@ -82,52 +83,63 @@ class AuditFile:
     """A file that lines are appended to, ``files`` of ``file_bytes`` at most besides the one in use."""
 
     def __init__(self, path: Path, metrics: Metrics, *, file_bytes: int, files: int) -> None:
+        self._dropped = metrics.count("audit_dropped")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = RotatingFileHandler(path, maxBytes=file_bytes, backupCount=files, encoding="utf-8")
+            self._file = _File(path, self._dropped, file_bytes=file_bytes, files=files)
         except OSError as error:
             raise ConfigError(f"control.audit = {str(path)!r}: {error.strerror or error}") from error
-        lines: Queue[Any] = Queue(WAITING)
-        self._inlet = _Inlet(lines, metrics)
-        self._listener: _Outlet | None = _Outlet(lines, self._file)
-        self._listener.start()
+        self._lines: Queue[logging.LogRecord | None] = Queue(WAITING)
+        self._writer = threading.Thread(target=self._work, name="zbridge-audit", daemon=True)
+        self._writer.start()
 
     def write(self, line: str) -> None:
         """Append a line, soon."""
-        self._inlet.handle(logging.makeLogRecord({"msg": line}))
-
-    def close(self) -> None:
-        """Write what waits, for a few seconds at most, and close the file; idempotent."""
-        listener, self._listener = self._listener, None
-        if listener is not None:
-            listener.stop()
-            self._file.close()
-
-
-class _Inlet(QueueHandler):
-    """Counts what finds no room, instead of printing it."""
-
-    def __init__(self, lines: Queue[Any], metrics: Metrics) -> None:
-        super().__init__(lines)
-        self._dropped = metrics.count("audit_dropped")
-
-    def enqueue(self, record: logging.LogRecord) -> None:
         try:
-            self.queue.put_nowait(record)
+            self._lines.put_nowait(logging.makeLogRecord({"msg": line}))
         except Full:
             self._dropped.value += 1
 
-
-class _Outlet(QueueListener):
-    """Ends when it has written what waits, also where the queue is full."""
-
-    def __init__(self, lines: Queue[Any], file: logging.Handler) -> None:
-        super().__init__(lines, file)
-        self._lines = lines
-
-    def enqueue_sentinel(self) -> None:
+    def close(self) -> None:
+        """Write what waits, for :data:`CLOSE_S` at most, and close the file; idempotent."""
+        if self._file.abandoned:
+            return
         try:
-            self._lines.put(None, timeout=CLOSE_S)  # None is the listener's own sign of the end
+            self._lines.put(None, timeout=CLOSE_S)
         except Full:
             self._lines.get_nowait()
+            self._dropped.value += 1
             self._lines.put_nowait(None)
+        self._writer.join(CLOSE_S)
+        if self._writer.is_alive():
+            self._dropped.value += self._lines.qsize() - 1
+        self._file.abandoned = True
+
+    def _work(self) -> None:
+        while (record := self._lines.get()) is not None:
+            self._file.emit(record)
+        self._file.finish()
+
+
+class _File(RotatingFileHandler):
+    """Counts what the disk does not take; abandoned, it keeps nobody waiting for a disk that stands still."""
+
+    def __init__(self, path: Path, dropped: Count, *, file_bytes: int, files: int) -> None:
+        super().__init__(path, maxBytes=file_bytes, backupCount=files, encoding="utf-8")
+        self.abandoned = False
+        self._dropped = dropped
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - the library's name
+        self._dropped.value += 1
+
+    def finish(self) -> None:
+        """Close the file, by the thread that writes it."""
+        super().close()
+
+    def flush(self) -> None:
+        if not self.abandoned:
+            super().flush()
+
+    def close(self) -> None:
+        if not self.abandoned:
+            super().close()

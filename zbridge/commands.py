@@ -13,7 +13,6 @@ from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.leases import Leases
 from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot
-from zbridge.session.motion import MotionLimits
 
 _OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
 """Commands that move a robot, or may: they need the lease."""
@@ -26,7 +25,6 @@ class Commands:
         self,
         robot: Robot,
         leases: Leases,
-        limits: MotionLimits,
         keys: KeySpace,
         metrics: Metrics,
         *,
@@ -37,7 +35,7 @@ class Commands:
         self._robot = robot
         self._leases = leases
         self._authority = leases.authority
-        self._limits = limits
+        self._limits = leases.limits
         self._keys = keys
         self._publish = publish
         self._pump = pump
@@ -98,8 +96,7 @@ class Commands:
             if on_its_own:
                 self._authority.require_motion()
             self._show(topic, self._robot.command(topic, command, now), who)
-            if on_its_own or isinstance(command, Mode):
-                self._authority.on_its_own = on_its_own
+            self._authority.on_its_own = self._authority.on_its_own or on_its_own
         self._pump()
 
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
@@ -112,12 +109,11 @@ class Commands:
         if command.moving:
             self._authority.require_motion()
         if isinstance(command, Drive):
-            if not self._authority.moving:
-                self._limits.stands()
             wished, command = command, self._limits.limit(command, now)
             self._slowed.value += command != wished
-            self._limits.sent(command, now)
         outcome = self._robot.command(topic, command, now)
+        if isinstance(command, Drive):
+            self._limits.sent(command, now)
         self._authority.applied(topic.path, now, moving=command.moving)
         if not command.moving:
             self._leases.stands(now)

@@ -79,17 +79,18 @@ class Device:
         self._greeted: Session[Any] | None = None
         self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
         self._leases = Leases(
-            robot, authority, keys, metrics, audit, publish=self._publish, pump=self._pump, clock=clock
-        )
-        self._commands = Commands(
             robot,
-            self._leases,
-            limits or MotionLimits(),
+            authority,
             keys,
             metrics,
+            audit,
+            limits or MotionLimits(),
             publish=self._publish,
             pump=self._pump,
             clock=clock,
+        )
+        self._commands = Commands(
+            robot, self._leases, keys, metrics, publish=self._publish, pump=self._pump, clock=clock
         )
         self._published = metrics.count("published")
         self._lost = metrics.count("commands_lost")

@@ -17,6 +17,7 @@ from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot
 from zbridge.session.control import Authority, What
+from zbridge.session.motion import MotionLimits
 from zbridge.session.session import State
 
 log = logging.getLogger("zbridge.control")
@@ -41,12 +42,14 @@ class Leases:
         keys: KeySpace,
         metrics: Metrics,
         audit: Audit,
+        limits: MotionLimits,
         *,
         publish: Callable[[Topic, FleetMessage], object],
         pump: Callable[[], None],
         clock: Callable[[], float],
     ) -> None:
         self.authority = authority
+        self.limits = limits
         self._robot = robot
         self._keys = keys
         self._metrics = metrics
@@ -122,6 +125,8 @@ class Leases:
                     self._refused.value += 1
                 else:
                     changed = True
+                    if event.what is not What.ACQUIRED:
+                        self.limits.stands()
                     self._metrics.count("control", what=event.what.value).value += 1
                     log.info("%s: %s", self._keys.robot, event)
                 if event.stops:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 Fraction = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 Floats = npt.NDArray[np.float32]
 Cells = npt.NDArray[np.uint8]
 
@@ -189,7 +190,7 @@ class Drive(FleetMessage, frozen=True):
 class Motor(FleetMessage, frozen=True):
     """One motor: rad/s, or metres for a linear motor."""
 
-    value: float
+    value: Finite
 
     @property
     def moving(self) -> bool:

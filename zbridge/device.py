@@ -130,6 +130,7 @@ class Device:
             self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.lane),
             self._bus.watch_connected(self._on_bus),
             *(self._bus.answer(self._keys.key(path), self._on_question) for path in _ASKED),
+            *(self._watch_listeners(topic) for topic in self._robot.on_demand),
         ]
         for endpoint in self._endpoints:
             for direction in ("in", "out"):
@@ -175,6 +176,8 @@ class Device:
             self._greeted = session
             with contextlib.suppress(Refused):  # whoever drove it before, it stands now
                 self._leases.stand_still()
+            for topic, message in self._robot.begun(self._clock_ns()):
+                self._publish(topic, message)
         elif busy != self._busy:
             self._leases.hold_back(self._busy or "no longer busy", stops=True)
 
@@ -247,6 +250,16 @@ class Device:
             endpoint.watch(direction, publisher.put if anybody else None)
 
         publisher = self._bus.frames(self._keys.key(f"@wire/{endpoint.name}/{direction}"), listened)
+
+    def _watch_listeners(self, topic: Topic) -> Handle:
+        """Tell the robot whether anybody listens to a topic."""
+
+        def changed(anybody: bool) -> None:
+            with contextlib.suppress(Refused):
+                self._robot.listened(topic, anybody)
+                self._pump()
+
+        return self._bus.watch_listeners(self._keys.key(topic.path), changed)
 
     def _publish_status(self) -> None:
         first = self._endpoints[0]

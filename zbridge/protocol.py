@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, Refused
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.link import Address
@@ -73,6 +73,19 @@ class Robot(ABC):
         """Ask the robot for what it publishes on ``topic``; raise Refused where it cannot be asked."""
 
     @property
+    def on_demand(self) -> tuple[Topic, ...]:
+        """What the robot publishes only while somebody listens; :meth:`listened` is told."""
+        return ()
+
+    def listened(self, topic: Topic, on: bool) -> None:
+        """Take note that the first listener of an on-demand topic came, or the last one went; raise Refused."""
+        raise Refused(f"{topic.path} needs no listener")
+
+    def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
+        """Begin with a connection that was just established; give what there is to show at once."""
+        return ()
+
+    @property
     def ready(self) -> bool:
         """Whether the robot takes commands now."""
         session = self.driving
@@ -106,7 +119,9 @@ class Protocol(msgspec.Struct, frozen=True):
     """``robot(options, links, metrics)``: the device side for a robot with so many links."""
     simulate: Callable[[Simulation], Coroutine[Any, Any, None]]
     """Be a robot of this protocol until cancelled."""
-    template: str
+    simulated: dict[str, Any] = {}
+    """The options that fit the simulated robot, where the default ones do not."""
+    template: str = ""
     """A commented configuration with the placeholder ``{name}``."""
 
 

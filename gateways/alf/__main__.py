@@ -1,4 +1,4 @@
-"""``python -m gateways.alf FILE``: run the gateway of one ALF vehicle."""
+"""``python -m gateways.alf FILE``: ``zbridge run`` for this protocol only."""
 
 from zbridge.cli import run_only
 

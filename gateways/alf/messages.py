@@ -34,6 +34,7 @@ from zbridge.wire.frames import FrameEnd
 POINTS = 769
 """Points of a measurement of the deployed scanner."""
 MOST_POINTS = 10_000
+_MOST_MEASURED = 1e9
 POINT_BYTES = 8
 
 
@@ -153,8 +154,9 @@ class DriveInfo(AlfMessage, frozen=True):
     temperature: F32
 
     def check(self) -> None:
-        if not math.isfinite(self.temperature):
-            raise ProtocolError(f"drive info with temperature {self.temperature}")
+        values = (self.longitudinal, self.lateral, self.vertical, self.gyro_x, self.gyro_y, self.gyro_z)
+        if not all(abs(value) <= _MOST_MEASURED for value in (*values, self.temperature)):
+            raise ProtocolError(f"drive info with {values} and temperature {self.temperature:g}")
 
 
 @message(255, "end", Sender.BOTH)
@@ -206,7 +208,8 @@ def read_text(frame: bytes, ids: frozenset[int]) -> AlfMessage:
     if number is None:
         raise ProtocolError(f"message without an id: {frame[:_FIELD_BYTES]!r}")
     spec = _known(number.group(), ids)
-    return spec.text.decode(frame[number.end() + 1 : -1])
+    end = number.end()
+    return spec.text.decode(frame[end + 1 if frame.startswith(b"|", end) else end : -1])
 
 
 def write_text(message: AlfMessage) -> bytes:

@@ -14,6 +14,7 @@ from gateways.alf.messages import (
     DriveCommand,
     End,
     Measurement,
+    ScannerInit,
     Sender,
     binary_frame_end,
     binary_size,
@@ -25,7 +26,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from zbridge.errors import ProtocolError
+from zbridge.errors import ProtocolError, Refused
 from zbridge.session.session import Limits, Role, Session, State
 
 REPEAT_S = 0.02
@@ -41,12 +42,16 @@ class AlfSession(Session[AlfMessage]):
     handled = frozenset({End})
     _SENT_BY_PEER: frozenset[int]
 
-    def __init__(self, dialect: Dialect, *, points: int = POINTS, gap_s: float = 0.0) -> None:
+    def __init__(
+        self, dialect: Dialect, *, points: int = POINTS, points_from_scanner: bool = False, gap_s: float = 0.0
+    ) -> None:
         self.dialect = dialect
         self.points = points
         self._ids = self._SENT_BY_PEER
+        self._broken = False
+        self._points_from_scanner = points_from_scanner
         if dialect is Dialect.TEXT:
-            limit = text_limit(max(points, POINTS))
+            limit = text_limit(MOST_POINTS if points_from_scanner else max(points, POINTS))
             self.frame_end = text_frame_end(limit)
             self._read, self._write = read_text, write_text
         else:
@@ -55,11 +60,22 @@ class AlfSession(Session[AlfMessage]):
             self._read, self._write = read_binary, write_binary
         super().__init__(Limits(frame_bytes=limit, handshake_s=HANDSHAKE_S, gap_s=gap_s))
 
+    def send(self, message: AlfMessage) -> None:
+        if self.over:
+            raise Refused("closing")
+        super().send(message)
+
     def encode(self, message: AlfMessage) -> bytes:
         return self._write(message)
 
     def decode(self, frame: bytes) -> AlfMessage:
+        if self.dialect is Dialect.TEXT:
+            broken, self._broken = self._broken, not frame.endswith(b";")
+            if broken:  # what comes before the next ';' belongs to what was too long
+                raise ProtocolError(f"{len(frame)} bytes more of a message without an end")
         message = self._read(frame, self._ids)
+        if isinstance(message, ScannerInit) and self._points_from_scanner:
+            self.points = points_of(message)
         if isinstance(message, Measurement) and len(message.points) != self.points:
             raise ProtocolError(f"measurement of {len(message.points)} points, expected {self.points}")
         return message
@@ -77,7 +93,7 @@ class AlfSession(Session[AlfMessage]):
         """Say END, once, and nothing after it."""
         if self.state is State.ESTABLISHED:
             self.outbox.clear(_DRIVE)
-            self.send(End())
+            super().send(End())
         super().close(reason, now)
 
 
@@ -88,9 +104,15 @@ class HqSession(AlfSession):
     _SENT_BY_PEER = sent_by(Sender.VEHICLE)
 
     def __init__(
-        self, dialect: Dialect, *, points: int = POINTS, gap_s: float = 0.0, drives: DriveCommand | None = None
+        self,
+        dialect: Dialect,
+        *,
+        points: int = POINTS,
+        points_from_scanner: bool = False,
+        gap_s: float = 0.0,
+        drives: DriveCommand | None = None,
     ) -> None:
-        super().__init__(dialect, points=points, gap_s=gap_s)
+        super().__init__(dialect, points=points, points_from_scanner=points_from_scanner, gap_s=gap_s)
         self._at_first = drives
 
     def opened(self, now: float) -> None:
@@ -100,6 +122,8 @@ class HqSession(AlfSession):
 
     def drive(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
         """Send a command at once, and again every 20 ms until the next one."""
+        if self.over:
+            raise Refused("closing")
         self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
@@ -108,3 +132,11 @@ class VehicleSession(AlfSession):
 
     role = Role.ROBOT
     _SENT_BY_PEER = sent_by(Sender.HQ)
+
+
+def points_of(scanner: ScannerInit) -> int:
+    """Reckon how many points a scanner's geometry gives; raise ProtocolError where that is absurd."""
+    points = (scanner.angle_max_deg - scanner.angle_min_deg) / scanner.angle_increment_deg + 1
+    if not 0.5 <= points <= MOST_POINTS:
+        raise ProtocolError(f"scanner init with {points:g} points, expected 1 to {MOST_POINTS}")
+    return round(points)

@@ -43,7 +43,7 @@ TEMPERATURE = 36.5
 _SCAN_EVERY, _INFO_EVERY = 5, 50
 _ANGLES = np.radians(SCANNER.angle_min_deg + SCANNER.angle_increment_deg * np.arange(POINTS))
 _FULL_LOCK_DEG = 90
-_MOST_SPEED = 100
+_MOST_SPEED, _MOST_TEXT_SPEED = 100, 255
 
 
 class Car:
@@ -71,7 +71,8 @@ class Car:
         """Obey a drive command."""
         straight = _FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
         right_deg = max(-_FULL_LOCK_DEG, min(_FULL_LOCK_DEG, command.steering - straight))
-        speed = min(_MOST_SPEED, command.speed) / _MOST_SPEED * SPEED_M_S
+        most = _MOST_SPEED if self._dialect is Dialect.BINARY else _MOST_TEXT_SPEED
+        speed = min(most, command.speed) / _MOST_SPEED * SPEED_M_S
         self._wanted_m_s = -speed if command.direction else speed
         self._wheels_rad = -right_deg / _FULL_LOCK_DEG * LOCK_RAD
         self.light = command.light

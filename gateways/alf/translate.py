@@ -23,7 +23,7 @@ from gateways.alf.messages import (
     Measurement,
     ScannerInit,
 )
-from gateways.alf.session import HqSession
+from gateways.alf.session import HqSession, points_of
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
@@ -38,6 +38,7 @@ FULL_LOCK_DEG = 90
 """The steering angle at ``turn`` = -1 or 1."""
 
 _M_PER_MM = 1e-3
+_MM_PER_M = 1000
 _FORWARD, _BACKWARD = 0, 1
 _COUNTER_ENDS = 2**32
 _UNITS = {
@@ -91,9 +92,12 @@ class AlfRobot(Robot):
         if link == 0:
             self._backward = False
             self._command = self._neutral()
-        points = self.options.points
         session = HqSession(
-            self._dialect, points=points, gap_s=self.options.gap_s, drives=self._command if link == 0 else None
+            self._dialect,
+            points=self.options.points,
+            points_from_scanner=self.options.points_from_scanner,
+            gap_s=self.options.gap_s,
+            drives=self._command if link == 0 else None,
         )
         self._sessions[link] = session
         return session
@@ -131,12 +135,8 @@ class AlfRobot(Robot):
             self._gaps.value += sequence - before - 1
 
     def _geometry(self, message: ScannerInit, stamp_ns: int) -> tuple[Telemetry, ...]:
+        points = points_of(message) if self.options.points_from_scanner else self.options.points
         self._scanner = message
-        points = self.options.points
-        if self.options.points_from_scanner:
-            points = points_of(message)
-            for session in filter(None, self._sessions):
-                session.points = points
         scanner = Scanner(
             math.radians(message.angle_min_deg),
             math.radians(message.angle_max_deg),
@@ -210,20 +210,12 @@ class AlfRobot(Robot):
 def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
     """Give the ranges in metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
     points = message.points
-    ranges: Floats = np.multiply(points, _M_PER_MM, dtype=np.float32, casting="unsafe")
+    ranges: Floats = np.divide(points, _MM_PER_M, dtype=np.float32, casting="unsafe")
     least = max(1, scanner.range_min_mm)
     ranges[(points < least) | (points > scanner.range_max_mm)] = np.nan
     ranges[: message.first_valid] = np.nan
     ranges[message.last_valid + 1 :] = np.nan
     return ranges
-
-
-def points_of(scanner: ScannerInit) -> int:
-    """Reckon how many points a scanner's geometry gives; raise ProtocolError where that is absurd."""
-    points = round((scanner.angle_max_deg - scanner.angle_min_deg) / scanner.angle_increment_deg) + 1
-    if not 1 <= points <= MOST_POINTS:
-        raise ProtocolError(f"scanner init with {points} points, expected 1 to {MOST_POINTS}")
-    return points
 
 
 _TELEMETRY: dict[type[AlfMessage], Callable[[AlfRobot, Any, int], tuple[Telemetry, ...]]] = {

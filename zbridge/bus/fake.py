@@ -151,6 +151,9 @@ class FakeBus:
             asyncio.get_running_loop().call_soon(listened, True)
         return publisher
 
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
+        return self.frames(key, handler)
+
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         self._connected.append(handler)
         handler(self.up)

@@ -153,6 +153,9 @@ class Bus(Protocol):
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
 
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
+        """Be told when the first listener of ``key`` comes and when the last one goes."""
+
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Be told when the first connection to the bus is made and when the last one is gone."""
 

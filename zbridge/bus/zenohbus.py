@@ -256,6 +256,10 @@ class ZenohBus:
         self._keep(_Declared(plain.declare_matching_listener(changed)))
         return self._keep(_PlainPublisher(key, plain, None))
 
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
+        """Be told when the first listener of ``key`` comes and when the last one goes."""
+        return self.frames(key, handler)
+
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Be told when the first connection to the bus is made and when the last one is gone."""
         loop, info = self._loop, self._session.info

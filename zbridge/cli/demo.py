@@ -130,7 +130,8 @@ def _free_port() -> int:
 @contextlib.asynccontextmanager
 async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str) -> AsyncIterator[None]:
     """Run a simulator and its gateway, each a process of its own."""
-    listen = find_protocol(protocol).links * ("--listen", "tcp://127.0.0.1:0")
+    found = find_protocol(protocol)
+    listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
         assert simulator.stdout is not None
         async with asyncio.timeout(START_S):
@@ -141,11 +142,20 @@ async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoi
         file = folder / f"{robot}.toml"
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
-            f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\n'
+            f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
             f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
         async with _process(log, "run", str(file)):
             yield
+
+
+def _inline(value: object) -> str:
+    """Write a value of a configuration: as JSON, but for tables."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(name)} = {_inline(item)}" for name, item in value.items()) + "}"
+    return json.dumps(value)
 
 
 @contextlib.asynccontextmanager

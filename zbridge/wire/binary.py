@@ -92,7 +92,7 @@ class BinaryCodec(Generic[M]):
                 break
             try:
                 parts.append(step.encode(value))
-            except (struct.error, OverflowError, UnicodeEncodeError, TypeError, AttributeError) as error:
+            except (struct.error, ArithmeticError, ValueError, TypeError, AttributeError) as error:
                 raise EncodeError(f"{self.message.__name__}.{step.name}: {error}") from error
         return b"".join(parts)
 
@@ -204,7 +204,11 @@ def _filling(wire: Filling, behind: int) -> tuple[Decode, Encode]:
             raise ValueError(f"{len(data) - position} bytes, expected {behind} and a multiple of {dtype.itemsize}")
         return np.frombuffer(data, dtype, count, position), position + count * dtype.itemsize
 
-    return decode, lambda value: np.ascontiguousarray(value, dtype).tobytes()
+    def encode(value: Any) -> bytes:
+        with np.errstate(invalid="raise"):
+            return np.ascontiguousarray(value, dtype).tobytes()
+
+    return decode, encode
 
 
 def _remainder(wire: Remainder) -> tuple[Decode, Encode]:

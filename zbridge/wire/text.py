@@ -24,6 +24,9 @@ Ints = npt.NDArray[np.int64]
 
 _NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
+_PLAIN = b"0123456789|"
+_UNCLIPPED = 2**63 - 2
+"""The largest number of a row that numpy has not made of a larger one."""
 _MOST = 2**31 - 1
 """The largest number of an array: what readers in the field can hold."""
 
@@ -57,7 +60,7 @@ class TextCodec(Generic[M]):
         """Write the fields of a message."""
         try:
             return b"|".join([field.write(getattr(message, field.name)) for field in self._fields])
-        except (ValueError, TypeError, OverflowError) as error:
+        except (ValueError, TypeError, ArithmeticError) as error:
             raise EncodeError(f"{self._name}: {error}") from error
 
     @property
@@ -82,7 +85,7 @@ class TextCodec(Generic[M]):
             raise ProtocolError(f"{self._name}.{self._fields[place].name}: a number over {_MOST}")
         values = [*numbers[:place].tolist(), array, *numbers[end:].tolist()]
         for field, value in zip(self._fields, values, strict=True):
-            if field.whole is not None and not field.whole.low <= value <= field.whole.high:
+            if field.whole is not None and not field.whole.low <= value <= min(field.whole.high, _UNCLIPPED):
                 raise ProtocolError(f"{self._name}.{field.name} = {value}: expected {field.whole}")
         return values
 
@@ -142,7 +145,7 @@ def _whole(kind: Whole) -> tuple[Callable[[bytes], int], Callable[[Any], bytes]]
 
 
 def _read_truth(number: bytes) -> bool:
-    return float(number) != 0
+    return _read_decimal(number) != 0
 
 
 def _read_decimal(number: bytes) -> float:
@@ -159,11 +162,17 @@ def _write_decimal(value: float) -> bytes:
 
 
 def _write_array(values: Any) -> bytes:
-    return b"|".join([b"%d" % value for value in np.asarray(values, np.int64).tolist()])
+    with np.errstate(invalid="raise"):
+        numbers = np.asarray(values, np.int64)
+    if numbers.size and numbers.max() > _MOST:
+        raise ValueError(f"a number over {_MOST}")
+    return b"|".join([b"%d" % value for value in numbers.tolist()])
 
 
 def _integers(body: bytes) -> Ints:
-    """Read a row of integers; where numpy stops before the end, the slow way, number by number."""
+    """Read a row of integers; where numpy would read otherwise than we do, the slow way, number by number."""
+    if body.translate(None, _PLAIN):
+        return _integers_one_by_one(body)
     try:
         numbers = np.fromstring(body, np.int64, sep="|")
     except (DeprecationWarning, ValueError):  # what numpy says of a row it cannot read to its end

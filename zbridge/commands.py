@@ -14,6 +14,7 @@ from zbridge.leases import Leases
 from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot
 
+_MOVING = (Drive, Motor)
 _OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
 """Commands that move a robot, or may: they need the lease."""
 
@@ -41,6 +42,7 @@ class Commands:
         self._pump = pump
         self._clock = clock
         self._closing: str | None = None
+        self._topics = {keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
         self._taken = metrics.count("commands")
         self._slowed = metrics.count("drives_slowed")
 
@@ -54,16 +56,15 @@ class Commands:
 
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it where everybody sees."""
-        path = self._keys.path(sample.key)
-        topic = topics.find(path)
+        topic = self._topics.get(sample.key) or topics.find(self._keys.path(sample.key))
         if topic is topics.CMD_STOP:  # has a lane of its own, and came by it
             return
         self._taken.value += 1
         try:
             self._carry_out(topic, sample)
         except (Refused, PayloadError, EncodeError) as error:
-            who = self._authority.owner(sample.attachment)
-            self._authority.refuse(path.removeprefix("@cmd/"), str(error), who)
+            command = self._keys.path(sample.key).removeprefix("@cmd/")
+            self._authority.refuse(command, str(error), self._authority.owner(sample.attachment))
         self._leases.settle()
 
     def require_ready(self) -> None:
@@ -88,15 +89,15 @@ class Commands:
             who = self._authority.admit(sample.attachment, now)
             self._leases.settle()
         command = payloads.decode(topic.message, sample.payload)
-        if isinstance(command, Drive | Motor):
+        if isinstance(command, _MOVING):
             self._move(topic, command, now, who)
-        else:
-            self.require_ready()
-            on_its_own = _moves_by_itself(command)
-            if on_its_own:
-                self._authority.require_motion()
-            self._show(topic, self._robot.command(topic, command, now), who)
-            self._authority.on_its_own = self._authority.on_its_own or on_its_own
+            return
+        self.require_ready()
+        on_its_own = _moves_by_itself(command)
+        if on_its_own:
+            self._authority.require_motion()
+        self._show(topic, self._robot.command(topic, command, now), who)
+        self._authority.on_its_own = self._authority.on_its_own or on_its_own
         self._pump()
 
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
@@ -110,8 +111,9 @@ class Commands:
             self._authority.require_motion()
         if isinstance(command, Drive):
             wished, command = command, self._limits.limit(command, now)
-            self._slowed.value += command != wished
+            self._slowed.value += command is not wished and command != wished
         outcome = self._robot.command(topic, command, now)
+        self._pump()  # the robot first, the accounts after it
         if isinstance(command, Drive):
             self._limits.sent(command, now)
         self._authority.applied(topic.path, now, moving=command.moving)

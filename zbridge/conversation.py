@@ -143,8 +143,8 @@ class Conversation:
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:
-            if deadline == self._timer_at:
-                return
+            if deadline is not None and self._timer_at is not None and self._timer_at <= deadline:
+                return  # it fires early, finds nothing due, and is set anew: cheaper than a new one for every frame
             self._timer.cancel()
             self._timer = None
         if deadline is not None:

@@ -118,6 +118,9 @@ class Leases:
 
     def settle(self) -> None:
         """Carry out what the authority decided, and be there when it is next due."""
+        if not self.authority.eventful:
+            self._watch_time()
+            return
         changed = False
         while events := self.authority.events():
             for event in events:

@@ -20,8 +20,6 @@ READ_BYTES = 64 * 1024
 """Most bytes taken from a socket before the loop serves others."""
 CONNECT_S = 5.0
 """Longest time a connection attempt may take."""
-_WRITE_BYTES = 16 * 1024
-"""Bytes the transport may hold back before a link is no longer writable."""
 
 
 class Address(msgspec.Struct, frozen=True):
@@ -162,7 +160,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # uvloop's is none by inheritance
-        self._transport.set_write_buffer_limits(high=_WRITE_BYTES)
+        self._transport.set_write_buffer_limits(high=0)  # so uvloop writes at once, not at the end of its round
         peer = transport.get_extra_info("peername")
         if peer is None:  # reset before we came to look; connection_lost follows
             self._transport.abort()

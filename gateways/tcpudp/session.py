@@ -120,6 +120,8 @@ class HqSession(_TcpUdpSession):
         self.settings: Settings | None = None
         self._udp = udp
         self._force = frozenset(force)
+        self._allowed: set[type[Packet]] = set()
+        """Classes of packets that this robot's settings were found to allow."""
         self._agreed = ""
         self._start = Probe(PROBE_S)
         self._probe = Probe(PROBE_S)
@@ -159,6 +161,8 @@ class HqSession(_TcpUdpSession):
 
     def may_send(self, message: Packet) -> None:
         """Raise Refused for a packet that this robot may not know: an unregistered id crashes it."""
+        if type(message) in self._allowed:
+            return
         packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
         if packet_id in self._force:
             return
@@ -174,6 +178,7 @@ class HqSession(_TcpUdpSession):
             raise Refused(f"{message.spec.name}: version {self._agreed} has no {names}")
         if not getattr(self.settings, feature.value):
             raise Refused(f"{message.spec.name}: the robot does not announce {feature.value}")
+        self._allowed.add(type(message))
 
     def encode(self, message: Packet) -> bytes:
         """Write a packet the robot can take whole; raise Refused for one it may not know."""

@@ -56,6 +56,7 @@ SCAN_POINTS = 360
 MAX_SIDE = 2048
 """Cells along a side of the largest map that is put together from parts."""
 _MOTION = "motion"
+_NOTHING = Outcome()
 _OCCUPIED = 2
 _RADIANS = math.pi / 180
 
@@ -177,7 +178,7 @@ class TcpUdpRobot(Robot):
         carry_out = _COMMANDS.get(topic.path)
         if carry_out is None:
             raise Refused("a TCP/UDP robot has no such command")
-        return carry_out(self, command, now) or Outcome()
+        return carry_out(self, command, now) or _NOTHING
 
     def stop(self, now: float, until: float) -> None:
         self._stand((ClientJoystickStop(),), now, period_s=STOP_REPEAT_S, until=until, urgent=True)
@@ -202,7 +203,7 @@ class TcpUdpRobot(Robot):
             packets = packets[1:] if rotates else packets[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
         self._stand(tuple(packets), now, period_s=REPEAT_S, until=math.inf, urgent=False)
-        return Outcome(left_out=left_out)
+        return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _mode(self, command: Mode, now: float) -> None:
         self._send(ClientControllMode({"none": 1, "manual": 2, "autonomous": 3}[command.mode]))

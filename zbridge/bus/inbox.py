@@ -27,8 +27,7 @@ class Inbox:
 
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
-        self._lanes: dict[Lane, deque[tuple[Handler, Any, Read]]] = {lane: deque() for lane in Lane}
-        self._stops, self._commands = self._lanes[Lane.STOP], self._lanes[Lane.COMMAND]
+        self._lanes: list[deque[tuple[Handler, Any, Read]]] = [deque() for _ in Lane]
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
 
@@ -47,8 +46,9 @@ class Inbox:
 
     def attend(self) -> None:
         """Serve the stops and commands that wait, and nothing else."""
+        stops, commands, _others = self._lanes
         for _ in range(_DRAIN):
-            waiting = self._stops or self._commands
+            waiting = stops or commands
             if not waiting:
                 return
             self._serve(waiting)
@@ -62,9 +62,10 @@ class Inbox:
 
     def _drain(self) -> None:
         self._awake = False
+        stops, commands, others = self._lanes
         for _ in range(_DRAIN):
-            waiting = next((waiting for waiting in self._lanes.values() if waiting), None)
-            if waiting is None:
+            waiting = stops or commands or others
+            if not waiting:
                 return
             self._serve(waiting)
         if not self._awake:

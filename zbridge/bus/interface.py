@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import Enum
+from enum import IntEnum
 from typing import Annotated, Literal, Protocol
 
 import msgspec
@@ -91,7 +91,7 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 """What was published together: for each key its payloads in order."""
 
 
-class Lane(Enum):
+class Lane(IntEnum):
     """What waits for the event loop, in the order it is served; each lane has its own bound."""
 
     STOP = 0

@@ -149,7 +149,9 @@ class Outbox:
 
     def _due_slot(self, now: float) -> str | None:
         """Pick a due slot; slots take turns with the queue."""
+        if not self._standing:
+            return None
         due = [slot for slot, standing in self._standing.items() if standing.due <= now]
         if not due or (self._queue and self._turn_of_queue and not self.held):
             return None
-        return min(due, key=lambda slot: self._standing[slot].due)
+        return due[0] if len(due) == 1 else min(due, key=lambda slot: self._standing[slot].due)

@@ -1,0 +1,64 @@
+"""The bytes of commands: drives on the bus, how they are authorised, and what a robot reads of them.
+
+Written by the design and the protocol page, without the gateway's own codec. Every drive has a running number,
+which travels as its speed: a multiple of 2**-20, exact in a float32.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import Any
+
+import msgpack
+
+from tests.benchmarks.peer import ROBOT
+from tests.benchmarks.wire import HEADER
+
+DRIVE = f"fleet/{ROBOT}/@cmd/drive"
+CONTROL = f"fleet/{ROBOT}/@rpc/control"
+ADVERSE = 2**19
+"""The numbers from here on are an adversary's: a robot that reads one was driven by somebody who may not."""
+_STEPS = 2**20
+_MOVE = 11
+_MOVE_BODY = struct.Struct("<fff")
+
+
+def drive(number: int) -> dict[str, float]:
+    """Give the fields of the drive with this number; 0 is neutral."""
+    return {"forward": number / _STEPS, "left": 0.0, "turn": 0.0}
+
+
+def number(payload: bytes) -> int:
+    """Read the number of a drive as the gateway reads it."""
+    forward: float = msgpack.unpackb(payload)["forward"]
+    return round(forward * _STEPS)
+
+
+def packed(fields: dict[str, Any]) -> bytes:
+    """Write a payload as the gateway reads it."""
+    payload: bytes = msgpack.packb(fields)
+    return payload
+
+
+def plain(fields: dict[str, Any]) -> bytes:
+    """Write a payload as the script reads it."""
+    return json.dumps(fields).encode()
+
+
+def attachment(token: bytes, seq: int) -> bytes:
+    """Authorise one command."""
+    return packed({"token": token, "seq": seq})
+
+
+def moves(reads: list[tuple[int, bytes]]) -> list[tuple[int, int]]:
+    """Find the packets 11 in what a robot read: the time of the read that completed each, and its number."""
+    found, rest = [], b""
+    for at_ns, data in reads:
+        rest += data
+        while len(rest) >= HEADER.size and len(rest) >= (end := 4 + HEADER.unpack_from(rest)[0]):
+            if rest[5] == _MOVE:
+                speed = _MOVE_BODY.unpack_from(rest, HEADER.size)[2]
+                found.append((at_ns, round(speed * _STEPS)))
+            rest = rest[end:]
+    return found

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from gateways.alf.messages import (
     MOST_POINTS,
@@ -39,6 +40,7 @@ FULL_LOCK_DEG = 90
 
 _M_PER_MM = 1e-3
 _MM_PER_M = 1000
+_MOST_TABLE_MM = 100_000
 _FORWARD, _BACKWARD = 0, 1
 _COUNTER_ENDS = 2**32
 _UNITS = {
@@ -47,6 +49,7 @@ _UNITS = {
 }
 """What one unit of acceleration (m/s2) and of gyro (rad/s) is where the options do not say."""
 
+Ints = npt.NDArray[np.int64]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
@@ -209,13 +212,26 @@ class AlfRobot(Robot):
 
 def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
     """Give the ranges in metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
-    points = message.points
-    ranges: Floats = np.divide(points, _MM_PER_M, dtype=np.float32, casting="unsafe")
-    least = max(1, scanner.range_min_mm)
-    ranges[(points < least) | (points > scanner.range_max_mm)] = np.nan
+    least, most = max(1, scanner.range_min_mm), max(0, scanner.range_max_mm)
+    if most <= _MOST_TABLE_MM:
+        ranges: Floats = _metres(least, most).take(message.points, mode="clip")
+    else:
+        ranges = _in_metres(message.points, least, most)
     ranges[: message.first_valid] = np.nan
     ranges[message.last_valid + 1 :] = np.nan
     return ranges
+
+
+@lru_cache(maxsize=8)
+def _metres(least: int, most: int) -> Floats:
+    """Tabulate the metres of every mm up to ``most``, and NaN behind it: half the time of comparing each point."""
+    return _in_metres(np.arange(most + 2), least, most)
+
+
+def _in_metres(points: Ints, least: int, most: int) -> Floats:
+    metres: Floats = np.divide(points, _MM_PER_M, dtype=np.float32, casting="unsafe")
+    metres[(points < least) | (points > most)] = np.nan
+    return metres
 
 
 _TELEMETRY: dict[type[AlfMessage], Callable[[AlfRobot, Any, int], tuple[Telemetry, ...]]] = {

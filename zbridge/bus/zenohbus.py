@@ -10,10 +10,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
 import re
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
+
+# One thread that receives instead of several that wake one another for each message; read when zenoh is imported.
+os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), acc: (handover: rx))")
 
 import zenoh
 import zenoh.ext

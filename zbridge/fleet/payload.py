@@ -30,6 +30,8 @@ def _array_bytes(value: Any) -> memoryview:
     """Give the bytes of an array: uint8 as it is, everything else as float32 little endian."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"{type(value).__name__} has no place in a payload")
+    if value.dtype == _F4 and value.ndim == 1 and value.flags.c_contiguous:
+        return value.data
     dtype = "|u1" if value.dtype == np.uint8 else "<f4"
     return np.ascontiguousarray(value, dtype).reshape(-1).view(np.uint8).data
 
@@ -70,6 +72,7 @@ def unpack(payload: bytes) -> dict[str, Any]:
     return values
 
 
+_F4 = np.dtype("<f4")
 _EMPTY = b"\x80"
 
 

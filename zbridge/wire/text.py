@@ -24,7 +24,7 @@ Ints = npt.NDArray[np.int64]
 
 _NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
-_PLAIN = b"0123456789|"
+_DIGITS = b"0123456789"
 _UNCLIPPED = 2**63 - 2
 """The largest number of a row that numpy has not made of a larger one."""
 _MOST = 2**31 - 1
@@ -171,13 +171,14 @@ def _write_array(values: Any) -> bytes:
 
 def _integers(body: bytes) -> Ints:
     """Read a row of integers; where numpy would read otherwise than we do, the slow way, number by number."""
-    if body.translate(None, _PLAIN):
+    bars = body.translate(None, _DIGITS)
+    if bars != b"|" * len(bars):
         return _integers_one_by_one(body)
     try:
         numbers = np.fromstring(body, np.int64, sep="|")
     except (DeprecationWarning, ValueError):  # what numpy says of a row it cannot read to its end
         return _integers_one_by_one(body)
-    return numbers if len(numbers) == body.count(b"|") + 1 else _integers_one_by_one(body)
+    return numbers if len(numbers) == len(bars) + 1 else _integers_one_by_one(body)
 
 
 def _integers_one_by_one(body: bytes) -> Ints:

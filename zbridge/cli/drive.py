@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import os
 import sys
 import termios
@@ -32,13 +33,13 @@ class Session:
         self._keyboard = Keyboard(speed)
         self._who = who
         self._takeover = takeover
-        self._keys: asyncio.Queue[str] = asyncio.Queue(_READ_BYTES)
+        self._keys: asyncio.Queue[tuple[str, float]] = asyncio.Queue(_READ_BYTES)
         self._loop = asyncio.get_running_loop()
         self._line = ""
 
     async def run(self) -> None:
         """Drive until ``x``; a lost lease is taken again with Enter."""
-        print(_HELP)  # noqa: T201
+        print(_HELP, f"waiting for the gateway of {self._robot.name}", sep="\n")  # noqa: T201
         with _raw_keys(self._loop, self._take):
             while True:
                 try:
@@ -54,13 +55,13 @@ class Session:
         """Send what the keys say until ``x``."""
         while True:
             while not self._keys.empty():
-                key = self._keys.get_nowait()
+                key, at = self._keys.get_nowait()
                 if key == "x":
                     return
                 if key == " ":
                     await self._stop()
                 else:
-                    self._keyboard.press(key, self._loop.time())
+                    self._keyboard.press(key, at)
             command = self._keyboard.drive(self._loop.time())
             try:
                 await drive(command.forward, command.left, command.turn)
@@ -73,7 +74,7 @@ class Session:
 
     async def _again(self) -> bool:
         while True:
-            match await self._keys.get():
+            match (await self._keys.get())[0]:
                 case "\r" | "\n":
                     return True
                 case "x":
@@ -89,9 +90,9 @@ class Session:
             self._say(str(error))
 
     def _take(self, text: str) -> None:
-        for key in split_keys(text):
+        for key, _ in itertools.groupby(split_keys(text)):  # what came at once was not held: it waited somewhere
             with contextlib.suppress(asyncio.QueueFull):
-                self._keys.put_nowait(key)
+                self._keys.put_nowait((key, self._loop.time()))
 
     def _show(self, command: Drive) -> None:
         line = (
@@ -104,7 +105,9 @@ class Session:
             sys.stdout.flush()
 
     def _say(self, text: str) -> None:
-        self._line = ""
+        if text == self._line:
+            return
+        self._line = text
         sys.stdout.write(f"\r\x1b[K{text}\n")
         sys.stdout.flush()
 
@@ -136,4 +139,5 @@ def _raw_keys(loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> I
         yield
     finally:
         loop.remove_reader(descriptor)
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)

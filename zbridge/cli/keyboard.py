@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import msgspec
 
 from zbridge.fleet.messages import Drive
@@ -22,17 +24,14 @@ DRIVES = {
     "e": Drive(left=-1.0),
 }
 ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
-_ESCAPE = "\x1b"
+_KEYS = re.compile("\x1b\\[[0-?]*[ -/]*[@-~]|\x1bO.|\x1b[^\x1b]?|.", re.DOTALL)
+"""One key: a whole escape sequence, so that its letters are not taken for keys, or one character."""
 
 
 def split_keys(text: str) -> list[str]:
     """Cut what a terminal sent into keys; the arrows, three characters each, become their letters."""
-    keys = []
-    while text:
-        length = 3 if text[:3] in ARROWS else 1
-        keys.append(ARROWS.get(text[:length], text[:length]))
-        text = text[length:]
-    return [key for key in keys if key != _ESCAPE]
+    keys = [ARROWS.get(key, key) for key in _KEYS.findall(text)]
+    return [key for key in keys if not key.startswith("\x1b")]
 
 
 class Keyboard:

@@ -37,7 +37,7 @@ def bus_settings(endpoints: Sequence[str] = (), tls: Tls | None = None) -> BusSe
 
 @contextlib.asynccontextmanager
 async def connect(
-    endpoints: Sequence[str] = (),
+    endpoints: Sequence[str] | str = (),
     *,
     realm: str = "fleet",
     tls: Tls | None = None,
@@ -49,6 +49,8 @@ async def connect(
     settings: all there is to set, instead of ``endpoints`` and ``tls``.
     Raises BusError where no given endpoint can be reached.
     """
+    if isinstance(endpoints, str):
+        endpoints = (endpoints,)
     bus = await open_bus(settings or bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
     try:
         yield Fleet(bus, realm)

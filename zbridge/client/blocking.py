@@ -11,6 +11,7 @@ with zbridge.blocking.connect(endpoints=["tcp/127.0.0.1:7447"]) as fleet:
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import threading
 from collections.abc import Coroutine, Iterable, Iterator, Sequence
@@ -52,21 +53,35 @@ class _Loop:
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine there and wait for it; interrupted, it is cancelled."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        try:
+            future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        except RuntimeError:
+            work.close()
+            raise BusError("this client was closed") from None
         try:
             return future.result()
+        except concurrent.futures.CancelledError:
+            raise BusError("this client was closed") from None
         except BaseException:
             future.cancel()
             raise
 
+    async def _cancel_all(self) -> None:
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._loop.shutdown_asyncgens()
+
     def close(self) -> None:
+        asyncio.run_coroutine_threadsafe(self._cancel_all(), self._loop).result()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
 
 @contextlib.contextmanager
-def connect(endpoints: Sequence[str] = (), *, realm: str = "fleet", tls: Tls | None = None) -> Iterator[Fleet]:
+def connect(endpoints: Sequence[str] | str = (), *, realm: str = "fleet", tls: Tls | None = None) -> Iterator[Fleet]:
     """Be on the bus while the context lasts; see :func:`zbridge.client.connect`."""
     joining = zbridge.client.connect(endpoints, realm=realm, tls=tls)
     with contextlib.closing(_Loop()) as loop, _entered(loop, joining) as fleet:
@@ -106,6 +121,16 @@ class Feed(Generic[T]):
     def __repr__(self) -> str:
         return repr(self._feed)
 
+    @property
+    def lost(self) -> int:
+        """Messages that made room because a program was slower than the robot."""
+        return self._feed.lost
+
+    @property
+    def malformed(self) -> int:
+        """Payloads that were not what their key promises, and were left out."""
+        return self._feed.malformed
+
     def __iter__(self) -> Iterator[T]:
         messages: Any = self._feed.__aiter__()
 
@@ -113,11 +138,8 @@ class Feed(Generic[T]):
             message: T = await anext(messages)
             return message
 
-        try:
-            while True:
-                yield self._loop.run(following())
-        finally:
-            self._loop.run(messages.aclose())
+        while True:  # dropped, the asynchronous generator is closed by its own loop: this one must not wait for it
+            yield self._loop.run(following())
 
 
 class StateFeed(Feed[F]):

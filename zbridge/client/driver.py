@@ -27,6 +27,7 @@ from zbridge.fleet.messages import (
     Raw,
 )
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.session.control import LEASE_ENDED
 
 RETRY_S = 0.1
 """Seconds between two questions to a gateway that does not answer."""
@@ -114,7 +115,11 @@ class Driver:
 
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
         async with self._lock:
-            self._raise_news()
+            if self.loss is not None:
+                raise LeaseLost(*self.loss.args)  # a new one each time: the traceback of a raised exception grows
+            refusal, self._refusal = self._refusal, None
+            if refusal is not None and getattr(message, "moving", True):
+                raise refusal
             self._seq += 1
             attachment = _encode(Authorization(self._token, self._seq))
             publisher = self._publishers.get(topic.path)
@@ -123,13 +128,8 @@ class Driver:
             publisher.put(payloads.encode(message), attachment)
             if topic is not topics.CMD_DRIVE:  # goes by way of a thread: the next command must not overtake it
                 await self._bus.flush()
-
-    def _raise_news(self) -> None:
-        if self.loss is not None:
-            raise self.loss
-        refusal, self._refusal = self._refusal, None
-        if refusal is not None:
-            raise refusal
+            if refusal is not None:  # a neutral is sent whatever there is to tell
+                raise refusal
 
     # Keeping the lease
 
@@ -165,13 +165,17 @@ class Driver:
 
     def _new_refusals(self, control: Control) -> list[str]:
         """List what was refused to us since we last looked."""
-        news = []
+        news, seen = [], {}
         for refusal in control.refusals:
             key = (refusal.command, refusal.reason)
             if refusal.who == self.who and refusal.command.startswith(_MOVING):
-                if refusal.count > self._seen.get(key, 0):
-                    news.append(f"{refusal.command}: {refusal.reason}")
-                self._seen[key] = refusal.count
+                if refusal.count != self._seen.get(key, 0):
+                    if refusal.reason.startswith(LEASE_ENDED):  # of a lease before this one, or this one's end: ask
+                        self._doubted.set()
+                    else:
+                        news.append(f"{refusal.command}: {refusal.reason}")
+                seen[key] = refusal.count
+        self._seen = seen
         return news
 
     def remember(self, control: Control | None) -> None:
@@ -189,7 +193,7 @@ class Driver:
 
     async def _ask(self, topic: Topic, timeout_s: float) -> Lease | None:
         payload = payloads.encode(LeaseToken(self._token))
-        with contextlib.suppress(BusError):
+        with contextlib.suppress(BusError, PayloadError):
             for answer in await self._bus.ask(self._keys.key(topic.path), payload, timeout_s=timeout_s):
                 if answer.error is None:
                     return payloads.decode(Lease, answer.payload)
@@ -206,7 +210,8 @@ async def acquire(bus: Bus, keys: KeySpace, request: Acquire, *, takeover: bool,
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
     why = "no gateway answered"
-    while (left_s := deadline - loop.time()) > 0:
+    while True:
+        left_s = max(RETRY_S, deadline - loop.time())
         for answer in await bus.ask(key, payloads.encode(request), timeout_s=min(ASK_S, left_s)):
             if answer.error is not None:
                 why = f"the gateway says {answer.error!r}"
@@ -218,6 +223,8 @@ async def acquire(bus: Bus, keys: KeySpace, request: Acquire, *, takeover: bool,
                 raise Refused(f"{keys.robot}: {lease.reason}")
             expires = f", {lease.expires_in_s:.1f} s left" if lease.expires_in_s is not None else ""
             raise Held(f"{keys.robot} is {lease.reason}{expires}", lease.holder)
+        if loop.time() >= deadline:
+            break
         await asyncio.sleep(min(RETRY_S, max(0.0, deadline - loop.time())))
     raise BusError(f"{keys.robot}: {why} within {wait_s:g} s")
 

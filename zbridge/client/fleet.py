@@ -32,13 +32,14 @@ from zbridge.fleet.messages import (
     Switch,
     Text,
 )
-from zbridge.fleet.topics import KeySpace, Topic, split_key, unescape
+from zbridge.fleet.topics import KeySpace, Topic, is_name, split_key, unescape
 
 CONFIRM_S = 2.0
 """Seconds within which a stop must be confirmed."""
 ANSWER_S = 5.0
 """Longest time a robot is given to answer a question."""
 _STOP_EVERY_S = 0.05
+_ASK_S = 0.3
 
 
 class Fleet:
@@ -52,7 +53,9 @@ class Fleet:
         return f"<Fleet {self.realm}>"
 
     def __getitem__(self, name: str) -> Robot:
-        """Give the robot of this name, on the bus or not."""
+        """Give the robot of this name, on the bus or not; raise ValueError for what cannot be a name."""
+        if not is_name(name):
+            raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
         return Robot(self._bus, KeySpace(self.realm, name))
 
     async def robots(self) -> dict[str, Status | None]:
@@ -71,7 +74,7 @@ class Fleet:
         if names is None:
             tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
             names = {split[1] for key in tokens if (split := split_key(key))}
-        names = sorted(names)
+        names = [names] if isinstance(names, str) else sorted(names)
         return dict(zip(names, await asyncio.gather(*map(self._stop_one, names)), strict=True))
 
     async def _stop_one(self, name: str) -> Refused | BusError | None:
@@ -176,12 +179,19 @@ class Robot:
 
         Raises BusError where none does within 2 s, Refused where the robot cannot be stopped or reached.
         """
-        refused = _stops_refused(await self.control.last())
+        await self._put(topics.CMD_STOP, Stop())  # before anything that may take time
+        try:
+            refused = _stops_refused(await self.control.last(_ASK_S))
+        except (BusError, PayloadError):
+            refused = 0
         control = await self._stop_until_shown()
         if _stops_refused(control) > refused:
             reason = next(refusal.reason for refusal in control.refusals if refusal.command == "stop")
             raise Refused(f"{self.name}: cannot be stopped: {reason}")
-        status = await self.status.last()
+        try:
+            status = await self.status.last()
+        except PayloadError as error:
+            raise Refused(f"{self.name}: stop taken, but the robot's status cannot be read: {error}") from error
         if status is not None and status.state != "established":
             why = status.reason or "no reason known"
             raise Refused(f"{self.name}: stop taken, but the robot is {status.state}: {why}")

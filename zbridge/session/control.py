@@ -18,6 +18,8 @@ import msgspec
 from zbridge.errors import Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
 
+LEASE_ENDED = "the lease has ended"
+"""How every refusal of an ended lease's token begins."""
 REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
 TOKEN_BYTES = 16
@@ -289,7 +291,7 @@ class Authority:
     def _why_not(self, token: bytes) -> str:
         ended = self._ended.get(token)
         if ended is not None:
-            return f"the lease has ended ({ended[1]})"
+            return f"{LEASE_ENDED} ({ended[1]})"
         return f"held by {self._holder.described}" if self._holder else "no lease: acquire first"
 
     def _lose(self, reason: str) -> None:

@@ -1,0 +1,177 @@
+"""The client over a fake bus. The robot's side is the gateway's own lease and commands; only the robot is played."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+
+from zbridge.audit import Audit
+from zbridge.bus import Sample
+from zbridge.bus.fake import FakeBus
+from zbridge.commands import Commands
+from zbridge.errors import Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Acquire, Authorization, Control, FleetMessage, Status
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.leases import Leases
+from zbridge.metrics import Metrics
+from zbridge.protocol import Outcome, Robot
+from zbridge.session.control import Authority
+from zbridge.session.motion import MotionLimits
+from zbridge.session.session import State
+
+LEASE_S, DEADMAN_S = 3.0, 2.0
+
+
+class Machine(Robot):
+    """A robot that takes every command and keeps it; ``refusal`` and ``unstoppable`` say why not, ``left_out`` what."""
+
+    link_names = ("robot",)
+
+    def __init__(self) -> None:
+        self.commands: list[tuple[str, FleetMessage]] = []
+        self.stops = 0
+        self.refusal: str | None = None
+        self.unstoppable: str | None = None
+        self.left_out: str | None = None
+
+    def session(self, link: int, peer: str) -> Any:
+        raise NotImplementedError
+
+    @property
+    def driving(self) -> Any:
+        return SimpleNamespace(over=False, busy=None, state=State.ESTABLISHED)
+
+    def translator(self, kind: type) -> Any:
+        raise NotImplementedError
+
+    def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
+        if self.refusal is not None:
+            raise Refused(self.refusal)
+        self.commands.append((topic.path.removeprefix("@cmd/"), command))
+        return Outcome(left_out=self.left_out)
+
+    def stop(self, now: float, until: float) -> None:
+        if self.unstoppable is not None:
+            raise Refused(self.unstoppable)
+        self.stops += 1
+
+    def ask(self, topic: Topic) -> None:
+        raise NotImplementedError
+
+
+class Gateway:
+    """The gateway of one robot: lease, commands, stop, ``control`` and ``status``; quiet until :meth:`serve`."""
+
+    def __init__(self, bus: FakeBus, name: str = "r1", *, lease_s: float = LEASE_S) -> None:
+        self.name = name
+        self.keys = KeySpace("fleet", name)
+        self.machine = Machine()
+        self.attachments: list[Authorization] = []
+        """What came with the commands that need the lease, in order."""
+        self.asked: list[tuple[float, str]] = []
+        """When which question about the lease came."""
+        self._bus = bus.join(f"gateway of {name}")
+        self._loop = asyncio.get_running_loop()
+        metrics = Metrics()
+        tokens = (bytes([number]) * 16 for number in itertools.count(1))
+        self.authority = Authority(lease_s, DEADMAN_S, lambda: next(tokens))
+        self.leases = Leases(
+            self.machine,
+            self.authority,
+            self.keys,
+            metrics,
+            Audit(name, lambda line: None),
+            MotionLimits(),
+            publish=self.publish,
+            pump=lambda: None,
+            clock=self._loop.time,
+        )
+        self.commands = Commands(
+            self.machine,
+            self.leases,
+            self.keys,
+            metrics,
+            publish=self.publish,
+            pump=lambda: None,
+            clock=self._loop.time,
+        )
+
+    def serve(self) -> None:
+        """Come to the bus."""
+        self._bus.announce(self.keys.alive("gateway"))
+        self.publish(topics.STATUS, Status(state="established"))
+        self.leases.report()
+        for topic in (topics.RPC_ACQUIRE, topics.RPC_TAKEOVER, topics.RPC_RENEW, topics.RPC_RELEASE):
+            self._bus.answer(self.keys.key(topic.path), self._note)
+        self.leases.serve(self._bus)
+        self._bus.subscribe(self.keys.key(topics.CMD_STOP.path), self.commands.take_stop)
+        self._bus.subscribe(self.keys.key("@cmd/**"), self._take)
+
+    async def vanish(self) -> None:
+        """Be gone, without a word."""
+        self.leases.close()
+        await self._bus.close()
+
+    def publish(self, topic: Topic, message: FleetMessage) -> None:
+        self.put(topic, payloads.encode(message))
+
+    def put(self, topic: Topic, payload: bytes) -> None:
+        """Publish this payload, whatever it is; a state keeps its last value for as long as the gateway is there."""
+        self._bus.publisher(self.keys.key(topic.path), topic).put(payload)
+
+    def give(self, who: str, *, takeover: bool = False, **wishes: Any) -> bytes:
+        """Give another program the lease; give its token."""
+        decide = self.authority.takeover if takeover else self.authority.acquire
+        lease = decide(Acquire(who=who, **wishes), self._loop.time())
+        self.leases.settle()
+        assert lease.token is not None, lease.reason
+        return lease.token
+
+    def refuse(self, command: str, reason: str, who: str | None) -> None:
+        """Show a refusal on ``control``."""
+        self.authority.refuse(command, reason, who)
+        self.leases.settle()
+
+    @property
+    def control(self) -> Control:
+        return self.authority.report(self._loop.time())
+
+    @property
+    def driven(self) -> list[FleetMessage]:
+        """The drive commands that were carried out."""
+        return [command for name, command in self.machine.commands if name == "drive"]
+
+    def questions(self, topic: Topic) -> list[float]:
+        """When this was asked."""
+        return [at for at, path in self.asked if path == topic.path]
+
+    def _note(self, question: Any) -> None:
+        self.asked.append((self._loop.time(), self.keys.path(question.key)))
+
+    def _take(self, sample: Sample) -> None:
+        if sample.attachment is not None:
+            self.attachments.append(msgspec.msgpack.decode(sample.attachment, type=Authorization))
+        self.commands.take(sample)
+
+
+async def settle() -> None:
+    """Let what is ready run, without time passing."""
+    for _ in range(10):
+        await asyncio.sleep(0)
+
+
+def subscriptions(bus: FakeBus, key: str) -> int:
+    """Count the subscriptions of this very key."""
+    return sum(key_expr == key for key_expr, _ in bus._shared.subscribers)
+
+
+def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
+    """List the liveliness tokens of programs that drive."""
+    prefix = f"fleet/{name}/@alive/"
+    return [token.removeprefix(prefix) for token in bus._shared.tokens if token.startswith(prefix + "operator.")]

@@ -1,0 +1,807 @@
+"""The lease as a program holds it: got, kept, numbered, lost and given back, against a gateway's own authority."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import getpass
+import math
+import socket
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+
+from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
+from tests.clock import jumping
+from zbridge.bus import Answer, Publisher, Sample
+from zbridge.bus.fake import FakeBus
+from zbridge.client import Driver, Fleet, Robot
+from zbridge.client.driver import RETRY_S, default_who
+from zbridge.errors import BusError, Held, LeaseLost, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Authorization, Control, Drive, Mode, Motor, Raw
+from zbridge.fleet.topics import Congestion, Topic
+
+ME = "ann@here"
+REFUSED = "no legs"
+SEEN_S = 0.06
+"""Within this a refusal shows on ``control``."""
+
+Command = Callable[[Driver], Any]
+COMMANDS: dict[str, Command] = {
+    "drive": lambda drive: drive(forward=0.5),
+    "neutral": lambda drive: drive(),
+    "during": lambda drive: drive.during(1.0, forward=0.5),
+    "motor": lambda drive: drive.motor("arm", 1.0),
+    "mode": lambda drive: drive.mode("manual"),
+    "raw": lambda drive: drive.raw("tcpudp", 7, b"abc"),
+}
+every_command = pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+
+
+class World:
+    """One robot with its gateway, and two programs."""
+
+    def __init__(self, bus: FakeBus | None = None, *, served: bool = True, lease_s: float = LEASE_S) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.bus = bus or FakeBus()
+        self.gateway = Gateway(self.bus, lease_s=lease_s)
+        self.mine = self.bus.join("mine") if bus is None else bus
+        self.robot: Robot = Fleet(self.mine)["r1"]
+        self.others: Robot = Fleet(self.bus.join("others"))["r1"]
+        if served:
+            self.gateway.serve()
+
+    @property
+    def machine(self) -> Any:
+        return self.gateway.machine
+
+    async def refused(self, drive: Driver) -> None:
+        """Have the robot refuse one command of this driver, and everybody see it."""
+        self.machine.refusal = REFUSED
+        await drive(forward=0.5)
+        self.machine.refusal = None
+        await asyncio.sleep(SEEN_S)
+
+
+@contextlib.asynccontextmanager
+async def driving(**wishes: Any) -> AsyncIterator[tuple[World, Driver]]:
+    """Hold the lease of a robot."""
+    world = World()
+    async with world.robot.control(ME, **wishes) as drive:
+        yield world, drive
+
+
+# Getting the lease
+
+
+@jumping
+async def test_the_lease_is_held_while_the_context_lasts() -> None:
+    world = World()
+    assert world.gateway.control.state == "free"
+    async with world.robot.control(ME, priority=3) as drive:
+        shown = world.gateway.control
+        assert (shown.state, shown.holder, shown.priority) == ("held", ME, 3)
+        assert (drive.who, drive.robot, drive.loss) == (ME, "r1", None)
+        assert not drive.lost.is_set()
+        assert repr(drive) == "<Driver of r1 holding>"
+    assert world.gateway.control.state == "free"
+    assert repr(drive) == "<Driver of r1 lost>"
+
+
+@jumping
+async def test_who_is_user_at_host_unless_said_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(getpass, "getuser", lambda: "ann")
+    monkeypatch.setattr(socket, "gethostname", lambda: "here")
+    world = World()
+    async with world.robot.control() as drive:
+        assert drive.who == "ann@here"
+        assert world.gateway.control.holder == "ann@here"
+
+
+@pytest.mark.parametrize("error", [KeyError("uid not found"), OSError("no username")])
+def test_a_user_without_a_name_has_one_nevertheless(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nobody() -> str:
+        raise error
+
+    monkeypatch.setattr(getpass, "getuser", nobody)
+    assert default_who() == f"somebody@{socket.gethostname()}"
+
+
+@jumping
+async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
+    world = World()
+    async with world.robot.control(ME):
+        assert tokens(world.bus) == ["operator.mine"]
+        world.mine._shared.tell("fleet/r1/@alive/operator.mine", False)
+        assert world.gateway.control.state == "stopped", "the lease names the token"
+    assert tokens(world.bus) == []
+
+
+@jumping
+async def test_the_token_is_there_before_the_lease_is_asked_for() -> None:
+    world = World(served=False)
+    there: list[list[str]] = []
+    world.bus.answer("fleet/r1/@rpc/control/acquire", lambda question: there.append(tokens(world.bus)))
+    world.gateway.serve()
+    async with world.robot.control(ME):
+        assert there == [["operator.mine"]]
+
+
+@jumping
+async def test_a_gateway_that_comes_later_is_waited_for() -> None:
+    world = World(served=False)
+    world.loop.call_later(4.0, world.gateway.serve)
+    asked_at = world.loop.time()
+    async with world.robot.control(ME):
+        assert 4.0 <= world.loop.time() - asked_at <= 4.0 + 2 * RETRY_S
+        assert world.gateway.control.holder == ME
+
+
+@pytest.mark.parametrize(("wishes", "wait_s"), [({}, 5.0), ({"wait_s": 1.5}, 1.5)])
+@jumping
+async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[str, float], wait_s: float) -> None:
+    world = World(served=False)
+    asked_at = world.loop.time()
+    with pytest.raises(BusError, match=rf"^r1: no gateway answered within {wait_s:g} s$"):
+        await world.robot.control(ME, **wishes).__aenter__()  # type: ignore[arg-type]
+    assert world.loop.time() - asked_at == pytest.approx(wait_s, abs=2 * RETRY_S)
+    assert tokens(world.bus) == []
+    assert subscriptions(world.bus, "fleet/r1/control") == 0
+
+
+@jumping
+async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told() -> None:
+    world = World()
+    world.gateway.leases.refuse_all("gateway stopped")
+    with pytest.raises(BusError, match="r1: the gateway says 'gateway stopped' within 5 s"):
+        await world.robot.control(ME).__aenter__()
+    world.loop.call_later(1.0, setattr, world.gateway.leases, "_closing", None)
+    async with world.robot.control(ME):
+        assert world.gateway.control.holder == ME
+
+
+@jumping
+async def test_held_names_the_holder_at_once() -> None:
+    async with driving(priority=2) as (world, drive):
+        asked_at = world.loop.time()
+        with pytest.raises(Held, match=r"^r1 is held by ann@here \(priority 2\), [23]\.\d s left$") as held:
+            await world.others.control("bob@there", priority=2).__aenter__()
+        assert held.value.holder == ME
+        assert world.loop.time() == asked_at
+        assert tokens(world.bus) == ["operator.mine"]
+        await drive(forward=0.5)
+        assert drive.loss is None
+
+
+@jumping
+async def test_the_lease_is_free_for_the_next_one() -> None:
+    world = World()
+    async with world.robot.control(ME):
+        pass
+    async with world.others.control("bob@there") as drive:
+        await drive(forward=0.5)
+        assert world.gateway.control.holder == "bob@there"
+        assert world.gateway.driven == [Drive(forward=0.5)]
+
+
+@pytest.mark.parametrize(
+    ("wishes", "reason"),
+    [
+        ({"lease_s": 0.001}, r"^r1: lease_s = 0\.001: expected at least 0\.01$"),
+        ({"deadman_s": -1.0}, r"^r1: deadman_s = -1: expected at least 0\.01$"),
+        ({"deadman_s": math.nan}, r"^r1: deadman_s = nan: expected at least 0\.01$"),
+    ],
+)
+@jumping
+async def test_a_bad_wish_is_refused_at_once_with_the_reason(wishes: dict[str, Any], reason: str) -> None:
+    world = World()
+    asked_at = world.loop.time()
+    with pytest.raises(Refused, match=reason) as refused:
+        await world.robot.control(ME, **wishes).__aenter__()
+    assert not isinstance(refused.value, Held)
+    assert world.loop.time() == asked_at
+    assert tokens(world.bus) == []
+
+
+@jumping
+async def test_wishes_reach_the_authority() -> None:
+    async with driving(lease_s=1.0, deadman_s=0.3) as (world, drive):
+        assert world.gateway.control.expires_in_s == pytest.approx(1.0)
+        await drive(forward=0.5)
+        driven_at = world.loop.time()
+        await asyncio.sleep(0.29)
+        assert world.machine.stops == 0
+        await asyncio.sleep(0.02)
+        assert world.machine.stops == 1, f"the deadman, {world.loop.time() - driven_at:g} s"
+        assert drive.loss is None
+
+
+@jumping
+async def test_motion_lasts_half_a_second_by_default() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        await asyncio.sleep(0.49)
+        assert world.machine.stops == 0
+        await asyncio.sleep(0.02)
+        assert world.machine.stops == 1
+
+
+@jumping
+async def test_a_cancelled_wait_for_the_lease_leaves_nothing_behind() -> None:
+    world = World(served=False)
+    waiting = asyncio.create_task(world.robot.control(ME).__aenter__())
+    await asyncio.sleep(1.0)
+    assert tokens(world.bus) == ["operator.mine"]
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert tokens(world.bus) == []
+    assert subscriptions(world.bus, "fleet/r1/control") == 0
+
+
+# Commands
+
+
+@jumping
+async def test_commands_reach_the_robot_with_the_token_and_rising_numbers() -> None:
+    async with driving() as (world, drive):
+        token = world.gateway.authority.token
+        await drive(forward=0.5, left=-0.25, turn=1.0)
+        await drive(turn=-1.0, light=True)
+        await drive.mode("autonomous")
+        await drive.motor("left arm", 1.5)
+        await drive.raw("tcpudp", 7, b"abc")
+        await drive()
+        assert world.machine.commands == [
+            ("drive", Drive(forward=0.5, left=-0.25, turn=1.0)),
+            ("drive", Drive(turn=-1.0, light=True)),
+            ("mode", Mode("autonomous")),
+            ("motor/left%20arm", Motor(1.5)),
+            ("raw/tcpudp", Raw(id=7, body=b"abc")),
+            ("drive", Drive()),
+        ]
+        assert {shown.token for shown in world.gateway.attachments} == {token}
+        numbers = [shown.seq for shown in world.gateway.attachments]
+        assert numbers == sorted(set(numbers))
+        assert len(numbers) == 6
+
+
+@pytest.mark.parametrize("name", ["forward", "left", "turn"])
+@pytest.mark.parametrize("value", [1.001, -1.001, math.inf, -math.inf, math.nan])
+@jumping
+async def test_what_is_no_fraction_of_full_scale_is_a_value_error_and_is_not_sent(name: str, value: float) -> None:
+    async with driving() as (world, drive):
+        for work in (drive(**{name: value}), drive.during(1.0, **{name: value})):
+            with pytest.raises(ValueError, match=rf"^{name} = {value!r}: expected -1 to 1$"):
+                await work
+        assert world.machine.commands == []
+        assert drive.loss is None
+
+
+@jumping
+async def test_full_scale_is_allowed() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=1.0, left=-1.0, turn=1)
+        assert world.gateway.driven == [Drive(forward=1.0, left=-1.0, turn=1.0)]
+
+
+@jumping
+async def test_an_unknown_mode_is_a_value_error_and_is_not_sent() -> None:
+    async with driving() as (world, drive):
+        with pytest.raises(ValueError, match=r"^mode = 'fast': expected 'none', 'manual' or 'autonomous'$"):
+            await drive.mode("fast")
+        assert world.machine.commands == []
+
+
+@jumping
+async def test_during_repeats_for_its_time_and_then_stands() -> None:
+    async with driving(deadman_s=0.2) as (world, drive):
+        began = world.loop.time()
+        await drive.during(2.0, forward=0.5, left=0.25, turn=-0.5)
+        assert world.loop.time() - began == pytest.approx(2.0, abs=0.001)
+        *moved, last = world.gateway.driven
+        assert last == Drive()
+        assert set(moved) == {Drive(forward=0.5, left=0.25, turn=-0.5)}
+        assert 38 <= len(moved) <= 42
+        assert world.machine.stops == 0, "commanded anew before the deadman"
+
+
+@jumping
+async def test_during_no_time_only_stands() -> None:
+    async with driving() as (world, drive):
+        await drive.during(0.0, forward=0.5)
+        assert world.gateway.driven == [Drive()]
+
+
+@jumping
+async def test_during_ends_where_the_lease_is_lost() -> None:
+    async with driving() as (world, drive):
+        world.loop.call_later(1.0, world.gateway.give, "bob@there")
+        world.loop.call_later(1.0, lambda: world.gateway.leases.stop("stop"))
+        began = world.loop.time()
+        with pytest.raises(LeaseLost):
+            await drive.during(10.0, forward=0.5)
+        assert world.loop.time() - began < 1.2
+        assert world.machine.stops == 1
+
+
+class SlowBus(FakeBus):
+    """Hands over like Zenoh's: what may be dropped goes at once, what may not goes by way of a queue."""
+
+    def __init__(self, zid: str, shared: Any) -> None:
+        super().__init__(zid, shared)
+        self.queue: deque[Callable[[], object]] = deque()
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        publisher = super().publisher(key, topic)
+        return _Queued(publisher, self.queue) if topic.qos.congestion is Congestion.BLOCK else publisher
+
+    async def flush(self) -> None:
+        await asyncio.sleep(0.01)
+        while self.queue:
+            self.queue.popleft()()
+
+
+class _Queued:
+    def __init__(self, publisher: Publisher, queue: deque[Callable[[], object]]) -> None:
+        self.key = publisher.key
+        self.close = publisher.close
+        self._publisher = publisher
+        self._queue = queue
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        self._queue.append(lambda: self._publisher.put(payload, attachment))
+        return True
+
+
+@jumping
+async def test_no_command_overtakes_another_however_they_are_given() -> None:
+    world = World(FakeBus())
+    robot = Fleet(SlowBus("slow", world.bus._shared))["r1"]
+    async with robot.control(ME) as drive:
+        await drive.mode("manual")
+        await drive(forward=0.5)
+        await asyncio.gather(
+            drive.motor("arm", 1.0),
+            drive(forward=0.25),
+            drive.raw("tcpudp", 7),
+            drive.mode("none"),
+            drive(),
+        )
+        assert [name for name, _ in world.machine.commands] == [
+            "mode",
+            "drive",
+            "motor/arm",
+            "drive",
+            "raw/tcpudp",
+            "mode",
+            "drive",
+        ]
+        assert world.gateway.control.refusals == ()
+
+
+@jumping
+async def test_commands_of_a_new_lease_are_taken_although_they_count_anew() -> None:
+    world = World()
+    for _ in range(2):
+        async with world.robot.control(ME) as drive:
+            await drive(forward=0.5)
+            await drive()
+    assert len(world.gateway.driven) == 4
+    assert world.gateway.control.refusals == ()
+
+
+# Keeping the lease
+
+
+@jumping
+async def test_an_idle_program_keeps_its_lease() -> None:
+    async with driving() as (world, drive):
+        least_s = math.inf
+        for _ in range(600):
+            await asyncio.sleep(0.1)
+            left_s = world.gateway.control.expires_in_s
+            assert left_s is not None, "the lease has ended"
+            least_s = min(least_s, left_s)
+        assert least_s >= LEASE_S / 2, "renewed with time to spare for a lost answer"
+        assert drive.loss is None
+        assert 50 <= len(world.gateway.questions(topics.RPC_RENEW)) <= 70
+
+
+@jumping
+async def test_a_short_lease_is_renewed_more_often() -> None:
+    async with driving(lease_s=0.3) as (world, drive):
+        await asyncio.sleep(10.0)
+        assert drive.loss is None
+        assert world.gateway.control.state == "held"
+
+
+@jumping
+async def test_one_answer_that_does_not_come_costs_nothing() -> None:
+    async with driving() as (world, drive):
+        world.gateway.leases.refuse_all("not now")
+        await asyncio.sleep(LEASE_S / 2)
+        assert world.gateway.questions(topics.RPC_RENEW)
+        world.gateway.leases._closing = None
+        await asyncio.sleep(2 * LEASE_S)
+        assert drive.loss is None
+        assert world.gateway.control.state == "held"
+
+
+# Losing the lease
+
+
+async def lost(world: World, drive: Driver, within_s: float) -> str:
+    """Wait for the event, and give what every command says from then on."""
+    began = world.loop.time()
+    await asyncio.wait_for(drive.lost.wait(), within_s)
+    assert world.loop.time() - began <= within_s
+    assert drive.loss is not None
+    before = len(world.machine.commands)
+    for command in COMMANDS.values():
+        with pytest.raises(LeaseLost) as raised:
+            await command(drive)
+        assert str(raised.value) == str(drive.loss)
+    assert len(world.machine.commands) == before
+    assert repr(drive) == "<Driver of r1 lost>"
+    return str(drive.loss)
+
+
+@jumping
+async def test_a_stop_ends_the_lease_and_the_program_hears_of_it() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        await world.others.stop()
+        assert await lost(world, drive, 0.1) == "r1: the lease has ended (stop)"
+
+
+@jumping
+async def test_a_takeover_names_the_new_holder() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        async with world.others.control("bob@there", takeover=True) as bobs:
+            said = await lost(world, drive, 0.1)
+            assert said == "r1: the lease has ended (taken over by bob@there); held by bob@there"
+            await bobs(forward=0.25)
+            assert world.gateway.driven[-1] == Drive(forward=0.25)
+            assert world.machine.stops == 1
+
+
+@jumping
+async def test_a_higher_priority_is_given_the_robot_and_named() -> None:
+    async with driving(priority=1) as (world, drive), world.others.control("bob@there", priority=2):
+        assert "held by bob@there" in await lost(world, drive, 0.1)
+
+
+@jumping
+async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_within_the_lease() -> None:
+    async with driving() as (world, drive), world.others.control(ME, takeover=True) as other:
+        assert "taken over by ann@here" in await lost(world, drive, LEASE_S)
+        assert other.loss is None
+
+
+@jumping
+async def test_a_lease_that_ran_out_is_noticed() -> None:
+    async with driving() as (world, drive):
+        world.gateway.authority.expire(world.loop.time() + 10 * LEASE_S)
+        world.gateway.leases.settle()
+        assert await lost(world, drive, 0.1) == "r1: the lease has ended (lease expired)"
+
+
+@jumping
+async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_out() -> None:
+    async with driving() as (world, drive):
+        await asyncio.sleep(10.0)
+        renewed_at = world.gateway.questions(topics.RPC_RENEW)[-1]
+        await world.gateway.vanish()
+        await asyncio.wait_for(drive.lost.wait(), 2 * LEASE_S)
+        assert LEASE_S <= world.loop.time() - renewed_at <= LEASE_S * 5 / 3
+        assert str(drive.loss) == "r1: the gateway does not answer"
+        with pytest.raises(LeaseLost, match="does not answer"):
+            await drive(forward=0.5)
+
+
+@jumping
+async def test_a_gateway_that_starts_anew_knows_nothing_of_the_lease() -> None:
+    async with driving() as (world, drive):
+        await world.gateway.vanish()
+        again = Gateway(world.bus)
+        again.serve()
+        await asyncio.wait_for(drive.lost.wait(), LEASE_S)
+        assert "no lease: acquire first" in str(drive.loss)
+        assert again.driven == []
+
+
+@jumping
+async def test_what_others_do_to_control_is_no_loss() -> None:
+    async with driving() as (world, drive):
+        world.gateway.put(topics.CONTROL, b"\xc1")
+        world.gateway.publish(topics.CONTROL, Control(state="stopped"))
+        world.gateway.publish(topics.CONTROL, Control(state="held", holder="bob@there"))
+        await asyncio.sleep(0.1)
+        assert drive.loss is None, "the gateway was asked, and it knows better"
+        assert 1 <= len(world.gateway.questions(topics.RPC_RENEW)) <= 3
+        await drive(forward=0.5)
+        assert len(world.gateway.driven) == 1
+
+
+@jumping
+async def test_after_a_loss_nothing_is_asked_or_declared_any_more() -> None:
+    async with driving() as (world, drive):
+        await world.others.stop()
+        await asyncio.wait_for(drive.lost.wait(), 0.1)
+        asked = len(world.gateway.asked)
+        await asyncio.sleep(3 * LEASE_S)
+    assert len(world.gateway.asked) == asked, "neither renewed nor released"
+    assert tokens(world.bus) == []
+    assert subscriptions(world.bus, "fleet/r1/control") == 0
+
+
+@jumping
+async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
+    """It never waits for anything but its own commands."""
+    async with driving() as (world, drive):
+        world.loop.call_later(0.0, lambda: world.gateway.leases.stop("stop"))
+        sent = 0
+        with contextlib.suppress(LeaseLost):
+            while sent < 100:
+                await drive(forward=0.5)
+                sent += 1
+        assert sent < 10
+
+
+# Refusals
+
+
+@every_command
+@jumping
+async def test_a_refusal_is_raised_by_the_next_command(command: Command) -> None:
+    async with driving() as (world, drive):
+        await world.refused(drive)
+        with pytest.raises(Refused, match=f"^r1: drive: {REFUSED}$") as raised:
+            await command(drive)
+        assert not isinstance(raised.value, LeaseLost)
+        assert drive.loss is None
+
+
+@jumping
+async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> None:
+    async with driving() as (world, drive):
+        for _ in range(3):
+            await world.refused(drive)
+            with pytest.raises(Refused, match=REFUSED):
+                await drive()
+            await asyncio.sleep(1.0)
+            world.gateway.leases.beat()
+            await drive()
+            await drive()
+
+
+@pytest.mark.parametrize(
+    ("command", "work"),
+    [
+        ("mode", lambda drive: drive.mode("manual")),
+        ("motor/arm", lambda drive: drive.motor("arm", 1.0)),
+        ("raw/tcpudp", lambda drive: drive.raw("tcpudp", 7)),
+    ],
+)
+@jumping
+async def test_the_refusal_says_which_command_it_was(command: str, work: Command) -> None:
+    async with driving() as (world, drive):
+        world.machine.refusal = REFUSED
+        await work(drive)
+        await asyncio.sleep(SEEN_S)
+        with pytest.raises(Refused, match=f"^r1: {command}: {REFUSED}$"):
+            await drive()
+
+
+@jumping
+async def test_what_the_robot_left_out_of_a_command_is_raised_too() -> None:
+    async with driving() as (world, drive):
+        world.machine.left_out = "light: this robot has none"
+        await drive(forward=0.5, light=True)
+        await asyncio.sleep(SEEN_S)
+        assert world.gateway.driven == [Drive(forward=0.5, light=True)]
+        with pytest.raises(Refused, match=r"^r1: drive: light: this robot has none$"):
+            await drive()
+
+
+@pytest.mark.parametrize(
+    ("command", "who"),
+    [("drive", "bob@there"), ("drive", None), ("acquire", ME), ("stop", ME), ("light", None), ("camera", ME)],
+)
+@jumping
+async def test_what_was_not_our_command_is_not_our_refusal(command: str, who: str | None) -> None:
+    async with driving() as (world, drive):
+        world.gateway.refuse(command, REFUSED, who)
+        await asyncio.sleep(SEEN_S)
+        assert world.gateway.control.refusals
+        await drive(forward=0.5)
+        assert len(world.gateway.driven) == 1
+
+
+@jumping
+async def test_refusals_of_before_the_lease_are_not_raised() -> None:
+    world = World()
+    world.gateway.refuse("drive", REFUSED, ME)
+    world.gateway.refuse("drive", REFUSED, ME)
+    await asyncio.sleep(SEEN_S)
+    async with world.robot.control(ME) as drive:
+        world.gateway.leases.beat()
+        await asyncio.sleep(SEEN_S)
+        await drive(forward=0.5)
+        await world.refused(drive)
+        with pytest.raises(Refused, match=REFUSED):
+            await drive()
+
+
+@jumping
+async def test_during_ends_with_the_refusal_of_its_commands() -> None:
+    async with driving() as (world, drive):
+        world.machine.refusal = REFUSED
+        began = world.loop.time()
+        with pytest.raises(Refused, match=REFUSED):
+            await drive.during(10.0, forward=0.5)
+        assert world.loop.time() - began < 0.2
+
+
+@jumping
+async def test_motion_after_the_deadman_is_refused_and_neutral_makes_it_possible() -> None:
+    async with driving(deadman_s=0.2) as (world, drive):
+        await drive(forward=0.5)
+        await asyncio.sleep(1.0)
+        assert world.machine.stops == 1
+        await drive(forward=0.5)
+        await asyncio.sleep(SEEN_S)
+        with pytest.raises(Refused, match="r1: drive: deadman: send a neutral drive first"):
+            await drive(forward=0.5)
+        await drive()
+        await drive(forward=0.25)
+        assert world.gateway.driven == [Drive(forward=0.5), Drive(), Drive(forward=0.25)]
+
+
+# Giving the lease back
+
+
+class Wrong(Exception):
+    """What a program may raise."""
+
+
+@pytest.mark.parametrize("error", [Wrong, KeyboardInterrupt, SystemExit, asyncio.CancelledError])
+@jumping
+async def test_the_lease_is_given_back_when_the_program_raises(error: type[BaseException]) -> None:
+    world = World()
+
+    async def program() -> None:
+        async with world.robot.control(ME) as drive:
+            await drive(forward=0.5)
+            raise error
+
+    with pytest.raises(error):
+        await program()
+    assert world.gateway.control.state == "free"
+    assert len(world.gateway.questions(topics.RPC_RELEASE)) == 1
+    assert world.machine.stops == 1, "it moved"
+    assert tokens(world.bus) == []
+    assert subscriptions(world.bus, "fleet/r1/control") == 0
+
+
+@jumping
+async def test_a_robot_that_stands_is_given_back_without_a_stop() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        await drive()
+    assert world.gateway.control.state == "free"
+    assert world.machine.stops == 0
+
+
+@jumping
+async def test_a_cancelled_program_gives_the_lease_back() -> None:
+    world = World()
+
+    async def program() -> None:
+        async with world.robot.control(ME) as drive:
+            await drive.during(100.0, forward=0.5)
+
+    task = asyncio.create_task(program())
+    await asyncio.sleep(1.0)
+    assert world.gateway.control.holder == ME
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    await settle()
+    assert world.gateway.control.state == "free"
+    assert world.machine.stops == 1
+    assert tokens(world.bus) == []
+
+
+@jumping
+async def test_nothing_runs_on_when_the_lease_was_given_back() -> None:
+    world = World()
+    before = asyncio.all_tasks()
+    async with world.robot.control(ME):
+        await settle()
+    await settle()
+    assert asyncio.all_tasks() == before
+    assert world.gateway.questions(topics.RPC_RENEW) == []
+
+
+class SlowToAsk(FakeBus):
+    """Takes its time with every question, and counts the publishers that are open."""
+
+    publishers = 0
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        await asyncio.sleep(0.1)
+        return await super().ask(key_expr, payload, timeout_s=timeout_s)
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        publisher = super().publisher(key, topic)
+        self.publishers += 1
+        publisher.close = self._closed  # type: ignore[method-assign]
+        return publisher
+
+    def _closed(self) -> None:
+        self.publishers -= 1
+
+
+@jumping
+async def test_a_program_cancelled_while_it_gives_the_lease_back_has_given_it_back() -> None:
+    world = World()
+    bus = SlowToAsk("slow", world.bus._shared)
+
+    async def program() -> None:
+        async with Fleet(bus)["r1"].control(ME) as drive:
+            await drive(forward=0.5)
+
+    task = asyncio.create_task(program())
+    await asyncio.sleep(0.25)
+    assert world.gateway.driven == [Drive(forward=0.5)]
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    await asyncio.sleep(0.2)
+    assert len(world.gateway.questions(topics.RPC_RELEASE)) == 1
+
+
+@jumping
+async def test_what_was_declared_for_commands_is_taken_back() -> None:
+    world = World()
+    bus = SlowToAsk("slow", world.bus._shared)
+    async with Fleet(bus)["r1"].control(ME) as drive:
+        for command in COMMANDS.values():
+            await command(drive)
+        assert bus.publishers == 4, "one for each key"
+    assert bus.publishers == 0
+
+
+@every_command
+@jumping
+async def test_a_driver_is_of_no_use_after_its_context(command: Command) -> None:
+    async with driving() as (world, drive):
+        pass
+    with pytest.raises(LeaseLost, match=r"^r1: released$"):
+        await command(drive)
+    assert world.machine.commands == []
+
+
+@jumping
+async def test_a_gateway_that_is_gone_is_not_waited_for_in_vain() -> None:
+    async with driving() as (world, _):
+        await world.gateway.vanish()
+        left_at = world.loop.time()
+    assert world.loop.time() - left_at <= 1.5
+
+
+@jumping
+async def test_the_attachment_is_a_map_of_token_and_seq() -> None:
+    async with driving() as (world, drive):
+        taken: list[Sample] = []
+        world.bus.subscribe("fleet/r1/@cmd/drive", taken.append)
+        await drive(forward=0.5)
+        assert world.gateway.attachments == [Authorization(world.gateway.authority.token or b"", 1)]
+        assert taken[0].attachment is not None
+        assert taken[0].attachment[0] == 0x82

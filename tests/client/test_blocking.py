@@ -23,6 +23,7 @@ from zbridge.bus import BusSettings
 from zbridge.bus.fake import FakeBus
 from zbridge.client import blocking
 from zbridge.client.driver import Driver
+from zbridge.client.feed import WAITING
 from zbridge.errors import BusError, Held, LeaseLost, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -192,6 +193,14 @@ def test_clients_can_follow_each_other_and_live_beside_each_other(
     assert [world.closed for world, _ in opened] == [True] * 3
 
 
+def test_a_client_that_was_closed_says_so(opened: list[tuple[World, BusSettings]]) -> None:
+    with zbridge.blocking.connect() as fleet:
+        robot = fleet["r1"]
+    with pytest.raises(BusError, match=r"^this client was closed$"):
+        robot.ask_pose()
+    gc.collect()  # a coroutine that was never awaited would be an error
+
+
 # Looking
 
 
@@ -229,6 +238,18 @@ def test_what_comes_between_two_steps_waits(fleet: blocking.Fleet, world: World)
     assert [next(poses).x, next(poses).x] == [5.0, 6.0]
     poses.close()  # type: ignore[attr-defined]
     assert world.listeners == 0
+
+
+def test_a_feed_counts_what_was_lost_and_malformed(fleet: blocking.Fleet, world: World) -> None:
+    feed = fleet["r1"].pose
+    assert (feed.lost, feed.malformed) == (0, 0)
+    poses = iter(feed)
+    world.soon(topics.POSE, POSE)
+    next(poses)
+    world.on_bus(lambda: world.gateway.put(topics.POSE, b"\xc1"))
+    world.publish(*map(float, range(WAITING)))
+    assert next(poses).x == 0.0
+    assert (feed.lost, feed.malformed) == (1, 0), "the malformed one was the oldest"
 
 
 def test_states_give_their_last_value_first_and_arrays_are_numpys(fleet: blocking.Fleet, world: World) -> None:
@@ -457,6 +478,46 @@ def test_an_iterator_that_is_dropped_ends_its_subscription(fleet: blocking.Fleet
     del poses
     gc.collect()
     until(lambda: world.listeners == 0, "the subscription ends")
+
+
+def test_an_iterator_may_outlive_its_client(opened: list[tuple[World, BusSettings]]) -> None:
+    with zbridge.blocking.connect() as fleet:
+        poses = iter(fleet["r1"].pose)
+        opened[-1][0].soon(topics.POSE, POSE)
+        assert next(poses) == POSE
+    del poses
+    gc.collect()
+
+
+def test_an_iterator_collected_on_the_clients_thread_does_not_hang_it(fleet: blocking.Fleet, world: World) -> None:
+    poses = iter(fleet["r1"].pose)
+    world.soon(topics.POSE, POSE)
+    next(poses)
+    cycle: list[Any] = [poses]
+    cycle.append(cycle)
+    del poses, cycle
+    world.on_bus(gc.collect)
+    until(lambda: world.listeners == 0, "the subscription ends")
+
+
+def test_a_thread_that_iterates_ends_with_the_client(opened: list[tuple[World, BusSettings]]) -> None:
+    ended: list[str] = []
+
+    def look() -> None:
+        try:
+            for _ in robot.pose:
+                pass
+        except BusError as error:
+            ended.append(str(error))
+
+    looking = threading.Thread(target=look, daemon=True)
+    with zbridge.blocking.connect() as fleet:
+        robot = fleet["r1"]
+        looking.start()
+        until(lambda: opened[-1][0].listeners == 1, "the other thread looks")
+    looking.join(SOON_S)
+    assert not looking.is_alive()
+    assert ended == ["this client was closed"]
 
 
 PAIRS: list[tuple[type, type]] = [

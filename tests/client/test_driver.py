@@ -7,6 +7,7 @@ import contextlib
 import getpass
 import math
 import socket
+import traceback
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -15,7 +16,7 @@ import pytest
 
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
-from zbridge.bus import Answer, Publisher, Sample
+from zbridge.bus import Answer, Handle, Publisher, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import RETRY_S, default_who
@@ -64,6 +65,13 @@ class World:
         await drive(forward=0.5)
         self.machine.refusal = None
         await asyncio.sleep(SEEN_S)
+
+    def garble(self, topic: Topic) -> Handle:
+        """Have somebody answer a question with nonsense, before the gateway does."""
+        nonsense = self.bus.answer(f"fleet/r1/{topic.path}", lambda question: question.answer(b"\xc1"))
+        queryables = self.bus._shared.queryables
+        queryables.insert(0, queryables.pop())
+        return nonsense
 
 
 @contextlib.asynccontextmanager
@@ -161,6 +169,14 @@ async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told
     world.loop.call_later(1.0, setattr, world.gateway.leases, "_closing", None)
     async with world.robot.control(ME):
         assert world.gateway.control.holder == ME
+
+
+@jumping
+async def test_a_program_that_does_not_wait_asks_once() -> None:
+    world = World()
+    async with world.robot.control(ME, wait_s=0.0):
+        assert world.gateway.control.holder == ME
+    assert len(world.gateway.questions(topics.RPC_ACQUIRE)) == 1
 
 
 @jumping
@@ -431,6 +447,18 @@ async def test_one_answer_that_does_not_come_costs_nothing() -> None:
         assert world.gateway.control.state == "held"
 
 
+@jumping
+async def test_a_malformed_answer_does_not_end_the_renewals() -> None:
+    async with driving() as (world, drive):
+        nonsense = world.garble(topics.RPC_RENEW)
+        await asyncio.sleep(LEASE_S / 2)
+        assert world.gateway.questions(topics.RPC_RENEW)
+        nonsense.close()
+        await asyncio.sleep(3 * LEASE_S)
+        assert drive.loss is None
+        assert world.gateway.control.state == "held"
+
+
 # Losing the lease
 
 
@@ -481,6 +509,23 @@ async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_within_the_le
     async with driving() as (world, drive), world.others.control(ME, takeover=True) as other:
         assert "taken over by ann@here" in await lost(world, drive, LEASE_S)
         assert other.loss is None
+
+
+@jumping
+async def test_a_takeover_by_a_program_of_the_same_name_is_a_loss_and_no_refusal() -> None:
+    async with driving() as (world, drive), world.others.control(ME, takeover=True):
+        with pytest.raises(LeaseLost):
+            await drive.during(1.0, forward=0.5)
+
+
+@jumping
+async def test_the_refusals_of_a_program_of_the_same_name_that_lost_its_lease_are_not_raised() -> None:
+    async with driving() as (world, first), world.others.control(ME, takeover=True) as second:
+        with contextlib.suppress(Refused):
+            await first(forward=0.5)
+        await asyncio.sleep(SEEN_S)
+        await second(forward=0.25)
+        assert world.gateway.driven == [Drive(forward=0.25)]
 
 
 @jumping
@@ -553,6 +598,18 @@ async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
         assert sent < 10
 
 
+@jumping
+async def test_the_traceback_of_a_loss_does_not_grow_with_every_command() -> None:
+    async with driving() as (world, drive):
+        await world.others.stop()
+        await drive.lost.wait()
+        for _ in range(100):
+            with pytest.raises(LeaseLost):
+                await drive()
+        assert drive.loss is not None
+        assert len(traceback.extract_tb(drive.loss.__traceback__)) < 10
+
+
 # Refusals
 
 
@@ -580,6 +637,35 @@ async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> Non
             await drive()
 
 
+@jumping
+async def test_a_refusal_that_others_pushed_out_of_sight_is_raised_when_it_happens_again() -> None:
+    async with driving() as (world, drive):
+        for _ in range(3):
+            await world.refused(drive)
+            with pytest.raises(Refused, match=REFUSED):
+                await drive()
+        for number in range(20):
+            world.gateway.refuse("drive", f"reason {number}", "bob@there")
+        await asyncio.sleep(0.1)
+        assert ME not in {refusal.who for refusal in world.gateway.control.refusals}
+        await world.refused(drive)
+        with pytest.raises(Refused, match=REFUSED):
+            await drive()
+
+
+@jumping
+async def test_a_neutral_is_sent_although_a_refusal_is_raised() -> None:
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        world.machine.refusal = REFUSED
+        await drive.motor("arm", 1.0)
+        world.machine.refusal = None
+        await asyncio.sleep(SEEN_S)
+        with pytest.raises(Refused, match=f"^r1: motor/arm: {REFUSED}$"):
+            await drive()
+        assert world.gateway.driven == [Drive(forward=0.5), Drive()]
+
+
 @pytest.mark.parametrize(
     ("command", "work"),
     [
@@ -605,6 +691,16 @@ async def test_what_the_robot_left_out_of_a_command_is_raised_too() -> None:
         await drive(forward=0.5, light=True)
         await asyncio.sleep(SEEN_S)
         assert world.gateway.driven == [Drive(forward=0.5, light=True)]
+        with pytest.raises(Refused, match=r"^r1: drive: light: this robot has none$"):
+            await drive()
+
+
+@jumping
+async def test_a_light_left_out_of_a_neutral_is_raised() -> None:
+    async with driving() as (world, drive):
+        world.machine.left_out = "light: this robot has none"
+        await drive(light=True)
+        await asyncio.sleep(SEEN_S)
         with pytest.raises(Refused, match=r"^r1: drive: light: this robot has none$"):
             await drive()
 
@@ -696,6 +792,13 @@ async def test_a_robot_that_stands_is_given_back_without_a_stop() -> None:
         await drive()
     assert world.gateway.control.state == "free"
     assert world.machine.stops == 0
+
+
+@jumping
+async def test_a_malformed_answer_to_the_release_is_no_error_of_the_program() -> None:
+    async with driving() as (world, _):
+        world.garble(topics.RPC_RELEASE)
+    assert world.gateway.control.state == "free"
 
 
 @jumping

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -11,11 +12,11 @@ import pytest
 
 from tests.client import Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
-from zbridge.bus import Question, Sample
+from zbridge.bus import Answer, Question, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.fleet import CONFIRM_S
-from zbridge.errors import BusError, Held, Refused
+from zbridge.errors import BusError, Held, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -289,6 +290,34 @@ async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so() -> None
     assert len(world.taken("@cmd/stop")) >= 2
 
 
+@pytest.mark.parametrize("topic", [topics.CONTROL, topics.STATUS], ids=["control", "status"])
+@jumping
+async def test_a_stop_is_sent_although_a_state_cannot_be_read(topic: Topic) -> None:
+    world = World("r1")
+    world.gateway.put(topic, b"\xc1")
+    with contextlib.suppress(Refused, PayloadError):
+        await world.robot.stop()
+    assert world.gateway.machine.stops >= 1
+
+
+class SlowToAsk(FakeBus):
+    """Gives every question all the time it may take."""
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        await asyncio.sleep(timeout_s)
+        return await super().ask(key_expr, payload, timeout_s=timeout_s)
+
+
+@jumping
+async def test_a_stop_is_sent_before_anything_is_asked() -> None:
+    world = World("r1")
+    stopping = asyncio.create_task(Fleet(SlowToAsk("slow", world.bus._shared))["r1"].stop())
+    await asyncio.sleep(0.05)
+    assert world.gateway.machine.stops >= 1
+    assert not stopping.done()
+    await stopping
+
+
 @jumping
 async def test_all_robots_are_stopped_at_once_and_each_has_its_outcome() -> None:
     world = World("r1", "r2", "r3")
@@ -309,12 +338,30 @@ async def test_all_robots_are_stopped_at_once_and_each_has_its_outcome() -> None
 
 
 @jumping
+async def test_one_robots_unreadable_status_leaves_every_robot_its_stop_and_outcome() -> None:
+    world = World("r1", "r2")
+    world.gateway.put(topics.STATUS, b"\xc1")
+    outcomes = await world.fleet.stop()
+    assert list(outcomes) == ["r1", "r2"]
+    assert isinstance(outcomes["r1"], Refused)
+    assert outcomes["r2"] is None
+    assert all(gateway.machine.stops > 0 for gateway in world.gateways.values())
+
+
+@jumping
 async def test_only_the_named_robots_are_stopped() -> None:
     world = World("r1", "r2", "r3")
     outcomes = await world.fleet.stop(name for name in ("r3", "r1", "r3"))
     assert set(outcomes) == {"r1", "r3"}
     assert not any(outcomes.values())
     assert [gateway.machine.stops > 0 for gateway in world.gateways.values()] == [True, False, True]
+
+
+@jumping
+async def test_a_single_name_is_one_robot_to_stop() -> None:
+    world = World("r1", "r2")
+    assert await world.fleet.stop("r1") == {"r1": None}
+    assert world.gateways["r2"].machine.stops == 0
 
 
 @jumping

@@ -24,8 +24,11 @@ DRIVES = {
     "e": Drive(left=-1.0),
 }
 ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
-_KEYS = re.compile("\x1b\\[[0-?]*[ -/]*[@-~]|\x1bO.|\x1b[^\x1b]?|.", re.DOTALL)
-"""One key: a whole escape sequence, so that its letters are not taken for keys, or one character."""
+_KEYS = re.compile(r"\x1b\[[0-?]*[!-/]*[@-~]|\x1bO[A-Za-z]|\x1b[^\x1b \[]?|.", re.DOTALL)
+"""One key: a whole escape sequence, so that its letters are not taken for keys, or a character.
+
+A space is never part of a sequence: it stops the robot, whatever came before it.
+"""
 
 
 def split_keys(text: str) -> list[str]:

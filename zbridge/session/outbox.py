@@ -49,7 +49,7 @@ class Outbox:
         self.gap_s = gap_s
         self._limit = limit
         self._queue: deque[bytes] = deque()
-        self._urgent: deque[bytes] = deque(maxlen=limit)
+        self._urgent: deque[bytes] = deque(maxlen=max(limit, 256))
         self._standing: dict[str, _Standing] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False

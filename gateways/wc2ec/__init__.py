@@ -1,0 +1,96 @@
+"""WC2EC: Webots robots, by the controller program of the simulation, in the field's dialect or the document's.
+
+``messages`` declares the messages of both dialects, ``devices`` the table of what a robot has, ``session`` holds the
+conversation in both roles, ``translate`` turns readings into fleet messages and commands into motor values,
+``simulator`` is a robot to play with, ``strict`` one that is as fragile as the deployed ones and shares no code with
+the others.
+"""
+
+from __future__ import annotations
+
+from gateways.wc2ec.messages import Dialect
+from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
+from zbridge.config import COMMON_TEMPLATE
+from zbridge.errors import ConfigError
+from zbridge.link import Address
+from zbridge.protocol import Protocol, Simulation
+
+TEMPLATE = (
+    """\
+# A gateway for one Webots robot. Start it with: zbridge run FILE
+
+[robot]
+name = "{name}"                         # its keys begin with fleet/{name}/
+realm = "fleet"
+
+[device]
+protocol = "wc2ec"
+connect = ["tcp://127.0.0.1:27015"]     # the Webots controller: one port per robot
+
+[device.options]
+dialect = "deployed"                    # what programs in the field speak; "draft": the document's, without names
+motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors; they move with the Webots version
+# motors = { rotational = ["wheel1"], linear = [] }  # names that are motors, whatever their type byte
+# bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the deployed application's
+# bounds = { front = [-1.0, 5000.0] }   # others for some sensors
+# tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
+# bearings_deg = { front = 0.0, left = 90.0 }  # where distance sensors look, counter-clockwise: they make a scan
+# scan_range_m = [0.0, 10.0]
+# devices = [{ name = "light0", number = 0 }]  # draft only: the devices there are, kind = "light" by default
+# pinned = ["light0"]                   # draft only: sensors that measure though nobody listens
+# values = 3                            # draft only: configuration values of a sensor
+
+# [device.options.differential]         # how a drive moves it; or factors = { motor = { forward = 10.0, turn = -3.0 } }
+# left = ["left wheel"]
+# right = ["right wheel"]
+# wheel_radius_m = 0.05
+# track_m = 0.3
+# speed_full_m_s = 0.5                  # over ground at a drive of 1
+# turn_full_rad_s = 1.0
+
+"""
+    + COMMON_TEMPLATE
+)
+SIMULATED = {
+    "bounds_default": [0.0, 1000.0],
+    "differential": {"left": ["left wheel"], "right": ["right wheel"], "wheel_radius_m": 0.05, "track_m": 0.3},
+    "tables": {f"ds{number}": [[0.0, 0.0], [1000.0, 1.0]] for number in range(8)},
+    "bearings_deg": {f"ds{number}": 45.0 * number for number in range(8)},
+    "scan_range_m": [0.02, 1.0],
+}
+
+
+async def _simulate(simulation: Simulation) -> None:
+    if simulation.version is not None or simulation.udp:
+        raise ConfigError("a Webots robot has no versions and no datagrams")
+    if len(simulation.addresses) > 1:
+        raise ConfigError("a Webots robot has one link")
+    try:
+        dialect = Dialect(simulation.dialect or "deployed")
+    except ValueError:
+        names = ", ".join(dialect.value for dialect in Dialect)
+        raise ConfigError(f"dialect {simulation.dialect!r}: expected one of {names}") from None
+    (address,) = simulation.addresses
+    if simulation.strict:
+        from gateways.wc2ec.strict import simulate_strict
+
+        def ready(port: int) -> None:
+            simulation.ready((Address(address.host, port),))
+
+        await simulate_strict(address.host, address.port, dialect=dialect.value, seed=simulation.seed, ready=ready)
+    else:
+        from gateways.wc2ec.simulator import simulate
+
+        await simulate(simulation)
+
+
+PROTOCOL = Protocol(
+    name=NAME,
+    summary="WC2EC: Webots robots, by their controller program",
+    options=Options,
+    links=1,
+    robot=Wc2EcRobot,
+    simulate=_simulate,
+    simulated=SIMULATED,
+    template=TEMPLATE,
+)

@@ -1,0 +1,174 @@
+"""The messages of WC2EC, each declared once for the dialects that have it, and how they are framed.
+
+Source: "Dialect `draft`" and "Dialect `deployed`" of the protocol page. Every message begins with a byte of command,
+one of sensor type and one of sensor number; the command tells how the rest is read. Sans-IO.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+from typing import Annotated, ClassVar, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from zbridge.errors import ProtocolError
+from zbridge.wire import F64, U8, BinaryCodec, Message
+from zbridge.wire.fields import CountedBytes, Filling
+from zbridge.wire.frames import FrameEnd
+
+FROM_CONTROLLER = range(128)
+"""Commands of the Webots controller; the others are the external controller's."""
+HEADER_BYTES = 3
+MAX_FRAME = 4096
+_QUOTED = 16
+
+
+class Dialect(Enum):
+    """The document's first draft, or what programs in the field speak."""
+
+    DRAFT = "draft"
+    DEPLOYED = "deployed"
+
+
+class Sender(Enum):
+    """Who sends a message: the Webots controller or the external one."""
+
+    WC = "Webots controller"
+    EC = "external controller"
+
+
+class Wc2EcMessage(Message, frozen=True):
+    """A message of this protocol: what follows its command."""
+
+    kind: U8
+    number: U8
+
+    commands: ClassVar[dict[Dialect, int]]
+
+
+W = TypeVar("W", bound=Wc2EcMessage)
+Name = Annotated[bytes, CountedBytes("B")]
+F64Fill = Annotated[npt.NDArray[np.float64], Filling("<f8")]
+
+
+class Spec(msgspec.Struct, frozen=True, eq=False):
+    """A row of a dialect's table."""
+
+    command: int
+    name: str
+    message: type[Wc2EcMessage]
+    codec: BinaryCodec[Wc2EcMessage]
+
+    @property
+    def sender(self) -> Sender:
+        """Who sends it: the halves of the range say so."""
+        return Sender.WC if self.command in FROM_CONTROLLER else Sender.EC
+
+
+MESSAGES: dict[Dialect, dict[int, Spec]] = {dialect: {} for dialect in Dialect}
+"""The tables, by command."""
+
+
+def message(name: str, **commands: int) -> Callable[[type[W]], type[W]]:
+    """Enter a declaration into the tables of its dialects: ``draft`` and ``deployed`` give its command there."""
+
+    def enter(declared: type[W]) -> type[W]:
+        declared.commands = {Dialect(dialect): command for dialect, command in commands.items()}
+        for dialect, command in declared.commands.items():
+            MESSAGES[dialect][command] = Spec(command, name, declared, BinaryCodec(declared))
+        return declared
+
+    return enter
+
+
+@message("registerSensor", deployed=0)
+class RegisterSensor(Wc2EcMessage, frozen=True):
+    """The robot has this device, under this name; motors are registered too."""
+
+    name: Name
+
+
+@message("sensorData", draft=0, deployed=1)
+class SensorData(Wc2EcMessage, frozen=True):
+    """A sensor's newest value."""
+
+    value: F64
+
+
+@message("error", deployed=127)
+class Error(Wc2EcMessage, frozen=True):
+    """Documented later, sent by nobody."""
+
+
+@message("enableSensor", draft=128)
+class EnableSensor(Wc2EcMessage, frozen=True):
+    """Let a sensor measure."""
+
+
+@message("disableSensor", draft=129)
+class DisableSensor(Wc2EcMessage, frozen=True):
+    """Let a sensor rest."""
+
+
+@message("changeSensor", draft=130)
+class ChangeSensor(Wc2EcMessage, frozen=True):
+    """Change one configuration value of a sensor."""
+
+    index: U8
+    value: F64
+
+
+@message("setSensor", draft=131)
+class SetSensor(Wc2EcMessage, frozen=True, eq=False):
+    """Set all configuration values of a sensor; how many it has is a setting."""
+
+    values: F64Fill
+
+
+@message("setValue", deployed=130)
+class SetValue(Wc2EcMessage, frozen=True):
+    """Set a motor: rad/s of a rotational one, position in metres of a linear one."""
+
+    value: F64
+
+
+def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
+    """Make the framing of what one side sends. values: configuration values of a sensor.
+
+    A command that the side cannot send breaks the stream: nothing tells how long it is.
+    """
+    specs = {command: spec for command, spec in MESSAGES[dialect].items() if spec.sender is sender}
+    sizes = {command: 1 + spec.codec.fixed_size for command, spec in specs.items()}
+    registration = RegisterSensor.commands.get(dialect) if sender is Sender.WC else None
+    if (setting := SetSensor.commands.get(dialect)) in sizes:
+        sizes[setting] += 8 * values
+
+    def end(data: bytes, start: int) -> int:
+        command = data[start]
+        size = sizes.get(command)
+        if size is None:
+            half = (
+                "" if (command in FROM_CONTROLLER) is (sender is Sender.WC) else ", which is of the other side's half"
+            )
+            quoted = data[start : start + _QUOTED].hex(" ")
+            raise ProtocolError(f"command {command}{half}, expected one of {sorted(sizes)}: {quoted}")
+        if command != registration:
+            return start + size
+        counted = start + size + 1
+        return counted if len(data) < counted else counted + data[counted - 1]
+
+    return end
+
+
+def read(frame: bytes, dialect: Dialect) -> Wc2EcMessage:
+    """Read one message; its framing has checked the command."""
+    return MESSAGES[dialect][frame[0]].codec.decode(frame, 1)
+
+
+def write(message: Wc2EcMessage, dialect: Dialect) -> bytes:
+    """Write one message; raise EncodeError where a value has no form in it."""
+    command = message.commands[dialect]
+    return bytes((command,)) + MESSAGES[dialect][command].codec.encode(message)

@@ -1,0 +1,97 @@
+"""Sessions of WC2EC in both roles and both dialects. Sans-IO.
+
+Source: "Roles" and the dialects of the protocol page. The Webots controller of the field registers its devices first:
+that is the handshake. The draft has none.
+"""
+
+from __future__ import annotations
+
+import math
+
+from gateways.wc2ec.messages import (
+    MAX_FRAME,
+    Dialect,
+    RegisterSensor,
+    Sender,
+    SensorData,
+    Wc2EcMessage,
+    frame_end,
+    read,
+    write,
+)
+from zbridge.errors import EncodeError
+from zbridge.session.session import Limits, Role, Session, State
+
+HANDSHAKE_S = 5.0
+SETTLE_S = 0.1
+"""Seconds without another registration, or data, after which all devices are taken to be registered."""
+
+
+class Wc2EcSession(Session[Wc2EcMessage]):
+    """What both roles share. values: configuration values of a sensor, which framing has to know."""
+
+    _PEER: Sender
+
+    def __init__(self, dialect: Dialect, *, values: int = 0) -> None:
+        self.dialect = dialect
+        self.frame_end = frame_end(dialect, self._PEER, values=values)
+        super().__init__(Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S))
+
+    def encode(self, message: Wc2EcMessage) -> bytes:
+        if self.dialect not in message.commands:
+            raise EncodeError(f"{type(message).__name__} has no place in dialect {self.dialect.value}")
+        return write(message, self.dialect)
+
+    def decode(self, frame: bytes) -> Wc2EcMessage:
+        return read(frame, self.dialect)
+
+    def accept(self, message: Wc2EcMessage, now: float) -> bool:
+        return True
+
+
+class ExternalSession(Wc2EcSession):
+    """We play the external controller towards a Webots controller."""
+
+    role = Role.HQ
+    _PEER = Sender.WC
+
+    def __init__(self, dialect: Dialect) -> None:
+        super().__init__(dialect)
+        self._settled_at = math.inf
+
+    def opened(self, now: float) -> None:
+        if self.dialect is Dialect.DRAFT:
+            self.establish("", ())
+
+    def overdue(self) -> str:
+        return f"connected, but no device was registered within {self.limits.handshake_s:g} s"
+
+    def accept(self, message: Wc2EcMessage, now: float) -> bool:
+        if self.state is State.HANDSHAKING:
+            if isinstance(message, RegisterSensor):
+                self._limit_at = math.inf
+                self._settled_at = now + SETTLE_S
+            elif isinstance(message, SensorData):
+                self._settle()
+        return True
+
+    def timers(self) -> float:
+        return self._settled_at
+
+    def on_timer(self, now: float) -> None:
+        self._settle()
+
+    def _settle(self) -> None:
+        self._settled_at = math.inf
+        if self.state is State.HANDSHAKING:
+            self.establish("", ())
+
+
+class ControllerSession(Wc2EcSession):
+    """We play the Webots controller towards an external one."""
+
+    role = Role.ROBOT
+    _PEER = Sender.EC
+
+    def opened(self, now: float) -> None:
+        self.establish("", ())

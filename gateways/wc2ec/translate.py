@@ -1,0 +1,398 @@
+"""Between WC2EC messages and fleet messages, both ways, and one Webots robot as a robot. Sans-IO.
+
+Source: the dialects and "The gateway as external controller" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from gateways.wc2ec.devices import (
+    LIGHT,
+    LINEAR,
+    ROTATIONAL,
+    Device,
+    Table,
+    kind_of,
+    registered,
+    sensor_topic,
+    unnamed,
+)
+from gateways.wc2ec.messages import (
+    ChangeSensor,
+    Dialect,
+    DisableSensor,
+    EnableSensor,
+    Error,
+    RegisterSensor,
+    SensorData,
+    SetSensor,
+    SetValue,
+    Wc2EcMessage,
+)
+from gateways.wc2ec.session import ExternalSession
+from zbridge.errors import ConfigError, ProtocolError, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Text
+from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
+from zbridge.protocol import Outcome, Robot, Telemetry, Translate
+
+NAME = "wc2ec"
+STOP_REPEAT_S = 0.1
+
+Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
+Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
+Bearing = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+
+
+class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A device of the draft, which has no names."""
+
+    name: str
+    number: Byte
+    kind: str = LIGHT
+
+
+class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Two sides of wheels. speed_full, turn_full: m/s and rad/s of a drive of 1."""
+
+    left: tuple[str, ...]
+    right: tuple[str, ...]
+    wheel_radius_m: Positive
+    track_m: Positive
+    speed_full_m_s: Positive = 0.5
+    turn_full_rad_s: Positive = 1.0
+
+
+class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """rad/s of one motor for a drive of 1."""
+
+    forward: Number = 0.0
+    left: Number = 0.0
+    turn: Number = 0.0
+
+
+class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Type bytes that are motors."""
+
+    rotational: tuple[Byte, ...] = (53,)
+    linear: tuple[Byte, ...] = (46,)
+
+
+class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Names that are motors whatever their type byte."""
+
+    rotational: tuple[str, ...] = ()
+    linear: tuple[str, ...] = ()
+
+
+class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    dialect: Literal["deployed", "draft"] = "deployed"
+    devices: tuple[DeviceOption, ...] = ()
+    motor_types: MotorTypes = MotorTypes()
+    motors: MotorNames = MotorNames()
+    differential: Differential | None = None
+    factors: dict[str, Factors] = {}
+    bounds: dict[str, tuple[Number, Number]] = {}
+    bounds_default: tuple[Number, Number] | None = None
+    tables: dict[str, tuple[tuple[Number, Number], ...]] = {}
+    bearings_deg: dict[str, Bearing] = {}
+    scan_range_m: tuple[Number, Positive] = (0.0, 10.0)
+    pinned: tuple[str, ...] = ()
+    values: Annotated[int, msgspec.Meta(ge=0, le=255)] = 3
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot go together."""
+        if (self.dialect == "draft") is not bool(self.devices):
+            raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
+        for field in ("number", "name"):
+            if len({getattr(device, field) for device in self.devices}) < len(self.devices):
+                raise ConfigError(f"devices: a {field} twice")
+        unknown = sorted(set(self.pinned) - {device.name for device in self.devices})
+        if unknown:
+            raise ConfigError(f"pinned: {unknown[0]!r} is none of the devices")
+        ranges = {"bounds_default": self.bounds_default, "scan_range_m": self.scan_range_m}
+        ranges |= {f"bounds.{name}": bounds for name, bounds in self.bounds.items()}
+        for name, pair in ranges.items():
+            if pair is not None and pair[0] > pair[1]:
+                raise ConfigError(f"{name} = {list(pair)}: expected the lower one first")
+        if self.differential is not None and set(self.differential.left) & set(self.differential.right):
+            raise ConfigError("differential: a motor on both sides")
+        if self.differential is not None and self.factors:
+            raise ConfigError("factors: either differential or factors")
+        for name, table in self.tables.items():
+            if len(table) < 2 or any(low[0] >= high[0] for low, high in pairwise(table)):
+                raise ConfigError(f"tables.{name}: expected at least two pairs with rising first values")
+
+
+class Wc2EcRobot(Robot):
+    """One Webots robot, seen from its external controller."""
+
+    link_names = ("robot",)
+
+    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+        metrics = metrics or Metrics()
+        self.options = options
+        self.dialect = options.dialect  # type: ignore[misc]
+        self._dialect = Dialect(options.dialect)
+        self._session: ExternalSession | None = None
+        self._table = Table()
+        self._listened: set[str] = set(options.pinned)
+        self._ring = Ring(options) if options.bearings_deg else None
+        self._faults = metrics.count("sensor_faults")
+        self._unregistered = metrics.count("sensor_unregistered")
+        self._motor_types = {ROTATIONAL: options.motor_types.rotational, LINEAR: options.motor_types.linear}
+        self._motor_names = {ROTATIONAL: options.motors.rotational, LINEAR: options.motors.linear}
+
+    @property
+    def driving(self) -> ExternalSession | None:
+        return self._session
+
+    @property
+    def on_demand(self) -> tuple[Topic, ...]:
+        """The draft's sensors measure while somebody listens."""
+        if self._dialect is Dialect.DEPLOYED:
+            return ()
+        return tuple(topics.SENSOR(device.name) for device in self.options.devices)
+
+    def session(self, link: int, peer: str) -> ExternalSession:
+        self._session = ExternalSession(self._dialect)
+        self._table = Table()
+        self._ring = Ring(self.options) if self.options.bearings_deg else None
+        for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
+            self._table.add(Device(option.name, option.name, option.number, 0, option.kind))
+        return self._session
+
+    def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
+        if self._dialect is Dialect.DRAFT:
+            session = self._connected()
+            devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
+            frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
+            if frames:
+                session.outbox.stand("enable", frames, -math.inf)
+            return ((topics.DEVICES, self._table.message(stamp_ns)),)
+        return ()
+
+    def listened(self, topic: Topic, on: bool) -> None:
+        device = next((d for d in self.options.devices if topics.SENSOR(d.name).path == topic.path), None)
+        if device is None or device.name in self.options.pinned:
+            return
+        if on:
+            self._listened.add(device.name)
+        else:
+            self._listened.discard(device.name)
+        if self.ready:
+            self._send((EnableSensor if on else DisableSensor)(0, device.number))
+
+    # Messages to telemetry
+
+    def translator(self, kind: type) -> Translate:
+        return partial(_TELEMETRY[kind], self)
+
+    def _registration(self, message: RegisterSensor, stamp_ns: int) -> tuple[Telemetry, ...]:
+        kind = kind_of(message.kind, self._motor_types)
+        device = registered(message.name, message.number, message.kind, kind)
+        for motor, names in self._motor_names.items():
+            if device.name in names:
+                device = msgspec.structs.replace(device, kind=motor)
+        entered = self._table.add(device)
+        if entered is None:
+            raise ProtocolError(f"device {message.number} registered again, as {device.shown!r}")
+        shown: list[Telemetry] = [(topics.DEVICES, self._table.message(stamp_ns))]
+        if entered.name != device.name:
+            text = f"{self._table.collisions[-1]}: the second is shown as {entered.shown!r}"
+            shown.append((topics.TEXT, Text(text, stamp_ns=stamp_ns)))
+        return tuple(shown)
+
+    def _reading(self, message: SensorData, stamp_ns: int) -> tuple[Telemetry, ...]:
+        device = self._table.numbered(message.number)
+        if device is None:
+            self._unregistered.value += 1
+            kind = LIGHT if self._dialect is Dialect.DRAFT else kind_of(message.kind, self._motor_types)
+            device = unnamed(message.number, message.kind, kind)
+        options, name = self.options, device.name
+        value = message.value
+        low, high = options.bounds.get(name) or options.bounds_default or (-math.inf, math.inf)
+        fault = not low <= value <= high or math.isinf(value)
+        self._faults.value += fault
+        table = options.tables.get(name)
+        if table is not None and not fault:
+            values, meanings = zip(*table, strict=True)
+            value = float(np.interp(value, values, meanings))
+        reading = Reading(value, device.kind, device.number, fault, stamp_ns=stamp_ns)
+        if self._ring is None:
+            return ((sensor_topic(device), reading),)
+        scan = self._ring.take(name, math.nan if fault else value, stamp_ns)
+        return ((sensor_topic(device), reading), *(((topics.SCAN, scan),) if scan is not None else ()))
+
+    def _error(self, message: Error, stamp_ns: int) -> tuple[Telemetry, ...]:
+        return ((topics.TEXT, Text(f"error of device {message.number}", stamp_ns=stamp_ns)),)
+
+    # Commands to messages
+
+    def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
+        chunk = topic.path.rpartition("/")[2]
+        if isinstance(command, Drive):
+            return self._drive(command, now)
+        if isinstance(command, Motor):
+            self._motor(topics.unescape(chunk), command.value, now)
+        elif isinstance(command, SensorSetting):
+            self._configure(topics.unescape(chunk), command)
+        else:
+            raise Refused("a Webots robot has no such command")
+        return Outcome()
+
+    def stop(self, now: float, until: float) -> None:
+        """Let every rotational motor stand; linear ones hold their position by themselves."""
+        if self._dialect is Dialect.DEPLOYED:
+            for device in self._table.motors(ROTATIONAL):
+                self._stand(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+
+    def ask(self, topic: Topic) -> None:
+        raise Refused(f"a Webots robot cannot be asked for its {topic.path}")
+
+    def _drive(self, command: Drive, now: float) -> Outcome:
+        velocities = self._velocities(command)
+        missing = sorted(set(velocities) - {device.name for device in self._table.motors(ROTATIONAL)})
+        if missing:
+            raise Refused(f"no rotational motor is registered as {', '.join(missing)}")
+        for name, velocity in velocities.items():
+            device = self._table.named(name)
+            assert device is not None
+            self._stand(device, velocity, now)
+        left_out = [name for name in ("left",) if command.left and self.options.differential is not None]
+        left_out += ["light"] if command.light is not None else []
+        return Outcome(left_out=f"{' and '.join(left_out)}: this robot has none" if left_out else None)
+
+    def _velocities(self, command: Drive) -> dict[str, float]:
+        """Give the velocity of every driven motor, rad/s."""
+        wheels = self.options.differential
+        if wheels is not None:
+            if command.left and not (command.forward or command.turn):
+                raise Refused("left: a robot with two sides of wheels does not move sideways")
+            along = command.forward * wheels.speed_full_m_s
+            across = command.turn * wheels.turn_full_rad_s * wheels.track_m / 2
+            left, right = (along - across) / wheels.wheel_radius_m, (along + across) / wheels.wheel_radius_m
+            return {**dict.fromkeys(wheels.left, left), **dict.fromkeys(wheels.right, right)}
+        if not self.options.factors:
+            raise Refused("no kinematics in the configuration (differential or factors)")
+        return {
+            name: command.forward * factor.forward + command.left * factor.left + command.turn * factor.turn
+            for name, factor in self.options.factors.items()
+        }
+
+    def _stand(
+        self,
+        device: Device,
+        value: float,
+        now: float,
+        *,
+        period_s: float = math.inf,
+        until: float = math.inf,
+        urgent: bool = False,
+    ) -> None:
+        """Let a value stand for a motor: the newest wins, whoever gave it."""
+        if self._dialect is not Dialect.DEPLOYED:
+            raise Refused("the draft dialect has no motors")
+        if not math.isfinite(value):
+            raise Refused(f"{device.shown}: {value} is no value of a motor")
+        session = self._connected()
+        frame = session.encode(SetValue(device.type, device.number, value))
+        slot = f"motor {device.number}"
+        session.outbox.stand(slot, (frame,), now, period_s=period_s, until=until, urgent=urgent)
+
+    def _motor(self, name: str, value: float, now: float) -> None:
+        device = self._table.named(name)
+        if device is None or not device.motor:
+            raise Refused(f"no motor is registered as {name!r}")
+        self._stand(device, value, now)
+
+    def _configure(self, name: str, setting: SensorSetting) -> None:
+        device = self._table.named(name)
+        if device is None:
+            raise Refused(f"no sensor is named {name!r}")
+        if self._dialect is not Dialect.DRAFT:
+            raise Refused("only the draft dialect has settings of sensors")
+        header = device.type, device.number
+        messages: list[Wc2EcMessage] = []
+        if setting.enable is not None:
+            messages.append((EnableSensor if setting.enable else DisableSensor)(*header))
+        if (setting.index is None) is not (setting.value is None):
+            raise Refused("index and value: one without the other")
+        if setting.index is not None and setting.value is not None:
+            if not 0 <= setting.index < self.options.values:
+                raise Refused(f"index {setting.index}: expected 0 to {self.options.values - 1}")
+            messages.append(ChangeSensor(*header, setting.index, setting.value))
+        if setting.values is not None:
+            if len(setting.values) != self.options.values:
+                raise Refused(f"{len(setting.values)} values: expected {self.options.values}")
+            messages.append(SetSensor(*header, np.array(setting.values)))
+        if not messages:
+            raise Refused("a setting without any field")
+        if not all(map(math.isfinite, (setting.value or 0.0, *(setting.values or ())))):
+            raise Refused("a value that is no number")
+        for message in messages:
+            self._send(message)
+
+    def _send(self, message: Wc2EcMessage) -> None:
+        self._connected().send(message)
+
+    def _connected(self) -> ExternalSession:
+        if self._session is None:
+            raise Refused("offline")
+        return self._session
+
+
+class Ring:
+    """Distance sensors with bearings, as one scan: a point a degree where they are not evenly spread."""
+
+    def __init__(self, options: Options) -> None:
+        self._range = options.scan_range_m
+        bearings = sorted(options.bearings_deg.values())
+        steps = {round(high - low, 6) for low, high in pairwise(bearings)}
+        self._first_deg = bearings[0]
+        self._step_deg = steps.pop() if len(steps) == 1 and min(steps) > 0 else 1.0
+        count = round((bearings[-1] - bearings[0]) / self._step_deg) + 1
+        self._ranges = np.full(count, np.nan, np.float32)
+        self._places = {
+            name: round((bearing - self._first_deg) / self._step_deg) for name, bearing in options.bearings_deg.items()
+        }
+        self._fresh: set[str] = set()
+
+    def take(self, name: str, value_m: float, stamp_ns: int) -> Scan | None:
+        """Take one reading; give the scan when every sensor has a new one."""
+        place = self._places.get(name)
+        if place is None:
+            return None
+        low, high = self._range
+        self._ranges[place] = value_m if low <= value_m <= high else np.nan
+        self._fresh.add(name)
+        if len(self._fresh) < len(self._places):
+            return None
+        self._fresh.clear()
+        return Scan(
+            math.radians(self._first_deg),
+            math.radians(self._step_deg),
+            low,
+            high,
+            self._ranges.copy(),
+            stamp_ns=stamp_ns,
+        )
+
+
+_TELEMETRY: dict[type[Wc2EcMessage], Callable[[Wc2EcRobot, Any, int], tuple[Telemetry, ...]]] = {
+    RegisterSensor: Wc2EcRobot._registration,
+    SensorData: Wc2EcRobot._reading,
+    Error: Wc2EcRobot._error,
+}

@@ -1,0 +1,144 @@
+"""The recorded session of the field through the sessions of both roles, each segment at its time, and on to the fleet.
+
+The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
+from gateways.wc2ec.session import ControllerSession, ExternalSession
+from gateways.wc2ec.translate import Options, Wc2EcRobot
+from tests.captures import payloads, stream
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading
+from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
+from zbridge.session.session import State
+
+NAME, PORT = "wc2ec-deployed.hex", 27515
+BEGAN_NS = 1_700_000_000_000_000_000
+REGISTRATIONS = [
+    RegisterSensor(53, 0, b"wheel1"),
+    RegisterSensor(53, 1, b"wheel2"),
+    RegisterSensor(53, 2, b"wheel3"),
+    RegisterSensor(53, 3, b"wheel4"),
+    RegisterSensor(46, 4, b"slider_curb_lf"),
+    RegisterSensor(46, 5, b"slider_curb_lf2"),
+    RegisterSensor(37, 6, b"dist_c"),
+    RegisterSensor(37, 7, b"dist_ir_c"),
+    RegisterSensor(37, 8, b"inf_left"),
+    RegisterSensor(37, 9, b"inf_cent"),
+    RegisterSensor(37, 10, b"inf_right"),
+    RegisterSensor(37, 11, b"curb_lf"),
+]
+VALUES = {6: 1000.0, 7: 750.5, 8: 123.456, 9: 0.0, 10: -1.0, 11: 0.001}
+ROUND = [SensorData(37, number, value) for number, value in VALUES.items()]
+ROUNDS = 20
+READINGS = ROUND * ROUNDS + [SensorData(37, 6, 1000.0)]
+
+
+def delivered(session: ExternalSession, data: bytes) -> list[Wc2EcMessage]:
+    session.open(0.0)
+    messages = session.receive(data, 0.0)
+    assert session.traffic.malformed == 0
+    return messages
+
+
+def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
+    """What the fleet is told of everything the controller sent, each segment at its recorded time."""
+    session = robot.session(0, "tcp://robot.test:1")
+    session.open(0.0)
+    telemetry: list[tuple[Topic, FleetMessage]] = []
+    for record in payloads(NAME, source=PORT):
+        for message in session.receive(record.payload, record.seconds):
+            telemetry += robot.telemetry(message, BEGAN_NS + round(record.seconds * 1e9))
+    assert (session.state, session.traffic.malformed) == (State.ESTABLISHED, 0)
+    return telemetry
+
+
+def test_the_recorded_session_gives_the_registrations_and_the_readings() -> None:
+    messages = delivered(ExternalSession(Dialect.DEPLOYED), stream(NAME, source=PORT))
+    assert messages[:12] == REGISTRATIONS
+    assert messages[12:] == READINGS
+    assert len(messages) == 133
+
+
+def test_what_is_read_as_external_controller_is_written_as_controller_to_the_same_bytes() -> None:
+    recorded = stream(NAME, source=PORT)
+    writer, written = ControllerSession(Dialect.DEPLOYED), b""
+    writer.open(0.0)
+    for message in delivered(ExternalSession(Dialect.DEPLOYED), recorded):
+        writer.send(message)
+        written += writer.outgoing(0.0) or b""
+    assert written == recorded
+
+
+def test_the_messages_written_by_hand_are_the_recorded_bytes() -> None:
+    writer, written = ControllerSession(Dialect.DEPLOYED), b""
+    writer.open(0.0)
+    for message in [*REGISTRATIONS, *READINGS]:
+        writer.send(message)
+        written += writer.outgoing(0.0) or b""
+    assert written == stream(NAME, source=PORT)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 11, 100])
+def test_however_the_recording_is_cut_it_is_the_same(size: int) -> None:
+    recorded, session = stream(NAME, source=PORT), ExternalSession(Dialect.DEPLOYED)
+    session.open(0.0)
+    messages: list[Wc2EcMessage] = []
+    for start in range(0, len(recorded), size):
+        messages += session.receive(recorded[start : start + size], 0.0)
+    assert messages == [*REGISTRATIONS, *READINGS]
+
+
+def test_the_recorded_controller_is_established_with_its_first_data() -> None:
+    session = ExternalSession(Dialect.DEPLOYED)
+    session.open(0.0)
+    for record in payloads(NAME, source=PORT):
+        assert (session.state is State.ESTABLISHED) == (record.seconds > 0.0220 or session.traffic.frames_in > 12)
+        session.receive(record.payload, record.seconds)
+        if record.seconds <= 0.0018:
+            assert session.state is State.HANDSHAKING
+
+
+def test_the_recorded_external_controller_sent_nothing() -> None:
+    assert stream(NAME, destination=PORT) == b""
+
+
+def test_the_recorded_devices_are_the_device_table() -> None:
+    tables = [message for topic, message in told(Wc2EcRobot(Options())) if topic is topics.DEVICES]
+    assert isinstance(tables[-1], Devices)
+    assert tables[-1].devices == (
+        Device("wheel1", 0, "rotational"),
+        Device("wheel2", 1, "rotational"),
+        Device("wheel3", 2, "rotational"),
+        Device("wheel4", 3, "rotational"),
+        Device("slider_curb_lf", 4, "linear"),
+        Device("slider_curb_lf2", 5, "linear"),
+        Device("dist_c", 6, "distance"),
+        Device("dist_ir_c", 7, "distance"),
+        Device("inf_left", 8, "distance"),
+        Device("inf_cent", 9, "distance"),
+        Device("inf_right", 10, "distance"),
+        Device("curb_lf", 11, "distance"),
+    )
+    assert tables[-1].stamp_ns == BEGAN_NS + 1_800_000
+
+
+def test_the_recorded_readings_are_on_the_keys_of_their_names() -> None:
+    metrics = Metrics()
+    robot = Wc2EcRobot(Options(bounds_default=(0.0, 1000.0)), 1, metrics)
+    readings = [(topic.path, message) for topic, message in told(robot) if isinstance(message, Reading)]
+    names = ("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf")
+    assert [path for path, _ in readings] == [f"sensor/{name}" for name in names] * ROUNDS + ["sensor/dist_c"]
+    assert [reading.value for _, reading in readings] == [*VALUES.values()] * ROUNDS + [1000.0]
+    assert [reading.device for _, reading in readings] == [*VALUES] * ROUNDS + [6]
+    assert {reading.kind for _, reading in readings} == {"distance"}
+    assert {path for path, reading in readings if reading.fault} == {"sensor/inf_right"}, "-1 is outside 0..1000"
+    assert metrics.total("sensor_faults") == ROUNDS
+    assert metrics.total("sensor_unregistered") == 0
+    assert readings[0][1].stamp_ns == BEGAN_NS + 22_000_000
+    assert readings[-1][1].stamp_ns == BEGAN_NS + 425_900_000

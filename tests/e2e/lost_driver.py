@@ -193,7 +193,7 @@ def part(name: str, *arguments: object) -> list[str]:
 
 
 class Watch:
-    """A process on each processor that sleeps and wakes: when it wakes late, that processor was late with everything."""
+    """A process on each processor that sleeps and wakes: late, that processor was late with everything."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self._late: list[list[tuple[float, float]]] = []

@@ -156,7 +156,8 @@ class Device:
         self._publish_status()
         self._leases.close()
         with contextlib.suppress(BusError, TimeoutError):
-            await asyncio.wait_for(self._bus.flush(), FLUSH_S)
+            async with asyncio.timeout(FLUSH_S):
+                await self._bus.flush()
         for handle in (*declared, *self._publishers.values()):
             handle.close()
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import Bench, end, free_port, start, until
+from zbridge.protocol import protocol_names
 
 ROOT = Path(__file__).parents[2]
 TOML = '[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://x:1"]\n'
@@ -119,7 +120,8 @@ def test_the_demo_shows_data_and_ends_by_itself() -> None:
     shown = zbridge("demo", "--seconds", "4")
     assert shown.returncode == 0, shown.stdout + shown.stderr
     assert "established" in shown.stdout
-    assert "tcpudp1" in shown.stdout
+    for robot in ("alf1", "tcpudp1", "wc2ec1"):
+        assert robot in shown.stdout
 
 
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:
@@ -127,7 +129,7 @@ def test_the_demo_interrupted_leaves_no_process_behind() -> None:
     assert demo.stdout is not None
     until(lambda: "router at" in (demo.stdout.readline() if demo.stdout else ""))
     children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-    assert len(children) == 2
+    assert len(children) == 2 * len(protocol_names())
     end(demo, signal.SIGINT)
     assert demo.returncode == 0
     for child in children:

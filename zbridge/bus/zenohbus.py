@@ -245,7 +245,8 @@ class ZenohBus:
 
         self._writer.put(ring)
         try:
-            await asyncio.wait_for(written, FLUSH_S)
+            async with asyncio.timeout(FLUSH_S):
+                await written
         except TimeoutError:
             raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
 
@@ -325,7 +326,8 @@ class ZenohBus:
         except zenoh.ZError as error:
             raise BusError(_ORIGIN.sub("", str(error))) from error
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(done, timeout_s + 0.5)
+            async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may swallow a cancellation
+                await done
         return list(replies)
 
 

@@ -39,7 +39,8 @@ FIGURE_S = 2.0
 """Seconds the robots go straight on, then turn, then go straight on."""
 PRIORITY = -1
 """Less than everybody's, so that whoever asks for a robot is given it."""
-_RATES = ("pose", "map", "text")
+_RATES = ("pose", "scan", "map", "sensor")
+_NO_DATA = (topics.STATUS.path, topics.CONTROL.path)
 
 
 class Row(msgspec.Struct):
@@ -48,6 +49,7 @@ class Row(msgspec.Struct):
     status: Status | None = None
     control: Control | None = None
     pose: Pose | None = None
+    heard: bool = False
     counts: Counter[str] = msgspec.field(default_factory=Counter)
 
 
@@ -63,7 +65,8 @@ class Watch:
         row = self.rows.get(split[1]) if split else None
         if split is None or row is None:
             return
-        row.counts[split[2]] += 1
+        row.counts[split[2].partition("/")[0]] += 1
+        row.heard = row.heard or split[2] not in _NO_DATA
         with contextlib.suppress(PayloadError):
             if split[2] == topics.STATUS.path:
                 row.status = payloads.decode(Status, sample.payload)
@@ -98,12 +101,18 @@ async def run_demo(seconds: float) -> None:
         log = stack.enter_context((folder / "log").open("w+b"))
         bus, endpoint = await _router()
         stack.push_async_callback(bus.close)
-        for robot, protocol in robots.items():
+        gateways = [
             await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint))
-        bus.subscribe(f"{REALM}/*/*", watch.take)
+            for robot, protocol in robots.items()
+        ]
+        for key_expr in ("*", "sensor/*"):
+            bus.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --connect {endpoint}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
-        silent = [robot for robot, row in watch.rows.items() if row.pose is None]
+        for gateway in gateways:  # all at once: each takes its time to leave its robot standing
+            with contextlib.suppress(ProcessLookupError):
+                gateway.terminate()
+        silent = [robot for robot, row in watch.rows.items() if not row.heard]
         if seconds and silent:
             last = (folder / "log").read_text(errors="replace")[-2000:]
             raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words:\n{last}")
@@ -128,8 +137,10 @@ def _free_port() -> int:
 
 
 @contextlib.asynccontextmanager
-async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str) -> AsyncIterator[None]:
-    """Run a simulator and its gateway, each a process of its own."""
+async def _robot(
+    folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a simulator and its gateway, each a process of its own; give the gateway's."""
     found = find_protocol(protocol)
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
@@ -145,8 +156,8 @@ async def _robot(folder: Path, log: IO[bytes], robot: str, protocol: str, endpoi
             f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
             f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
-        async with _process(log, "run", str(file)):
-            yield
+        async with _process(log, "run", str(file)) as gateway:
+            yield gateway
 
 
 def _inline(value: object) -> str:

@@ -84,7 +84,8 @@ async def _talk(protocol: Protocol, address: Address) -> int:
         established, seen = session.version is not None, session.snapshot()
         conversation.close("probed")
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(asyncio.shield(conversation.ended), 1.0)
+            async with asyncio.timeout(1.0):
+                await asyncio.shield(conversation.ended)
         conversation.abandon()
     _show(
         {

@@ -139,7 +139,8 @@ class Driver:
         expires_at = loop.time() + self._lease_s
         while self.loss is None:
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._doubted.wait(), self._lease_s / 3)
+                async with asyncio.timeout(self._lease_s / 3):
+                    await self._doubted.wait()
             self._doubted.clear()
             asked_at = loop.time()
             lease = await self._ask(topics.RPC_RENEW, min(ASK_S, self._lease_s / 3))

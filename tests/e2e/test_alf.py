@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import socket
 import subprocess
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import zbridge
 from tests.e2e.conftest import Bench, Fleet, end, free_port, until
 
 DEADMAN_S = 0.3
@@ -389,3 +391,29 @@ def test_without_the_lease_nothing_moves_and_with_it_one_program_drives(bench: B
     until(lambda: vehicle.first(b"3|0|", back), what="a stop that anybody may send")
     until(lambda: fleet.last("r1/control")["state"] == "stopped", what="stopped")
     other.close()
+
+
+@pytest.mark.parametrize("dialect", ["text", "binary"])
+def test_a_fragile_vehicle_finds_nothing_to_complain_of(bench: Bench, dialect: str) -> None:
+    vehicle = bench.zbridge(
+        *("simulate", "alf", "--strict", "--dialect", dialect),
+        *(argument for _ in range(2) for argument in ("--listen", f"tcp://127.0.0.1:{free_port()}")),
+    )
+    assert vehicle.stdout is not None
+    addresses = [word for word in vehicle.stdout.readline().split() if word.startswith("tcp://")]
+    file = bench.folder / "r1.toml"
+    file.write_text(
+        f'[robot]\nname = "r1"\n[device]\nprotocol = "alf"\nconnect = {json.dumps(addresses)}\n'
+        f'options = {{ dialect = "{dialect}" }}\n[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
+    )
+    gateway = bench.zbridge("run", str(file))
+    with zbridge.blocking.connect(bench.endpoint) as fleet, fleet["r1"].control() as drive:
+        until(lambda: bench.fleet.state("r1") == "established", what="established")
+        for number in range(60):
+            drive(forward=(number % 21 - 10) / 10, turn=(number % 13 - 6) / 6, light=bool(number % 2))
+            time.sleep(0.02)
+    end(gateway)
+    said = end(vehicle)
+    assert len(bench.fleet.seen["fleet/r1/scan"]) > 5
+    assert "violation" not in said, said
+    assert "died" not in said, said

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import msgspec
 
-from zbridge.fleet import topics
 from zbridge.fleet.messages import Device as Entry
 from zbridge.fleet.messages import Devices
-from zbridge.fleet.topics import Topic
 
 DISTANCE, LIGHT, ROTATIONAL, LINEAR = "distance", "light", "rotational", "linear"
 _SENSOR_KINDS = {37: DISTANCE, 38: DISTANCE}
@@ -42,12 +40,6 @@ class Table:
 
     def __repr__(self) -> str:
         return f"<Table of {len(self._by_number)} devices>"
-
-    def __iter__(self) -> object:
-        return iter(self._by_number.values())
-
-    def __len__(self) -> int:
-        return len(self._by_number)
 
     def add(self, device: Device) -> Device | None:
         """Enter a device; None where its number has one already. A name that is taken gets its number behind it."""
@@ -98,8 +90,3 @@ def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
         if kind_byte in types:
             return kind
     return _SENSOR_KINDS.get(kind_byte, f"type{kind_byte}")
-
-
-def sensor_topic(device: Device) -> Topic:
-    """Give the topic of a sensor's readings."""
-    return topics.SENSOR(device.name)

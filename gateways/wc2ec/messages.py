@@ -21,7 +21,6 @@ from zbridge.wire.frames import FrameEnd
 
 FROM_CONTROLLER = range(128)
 """Commands of the Webots controller; the others are the external controller's."""
-HEADER_BYTES = 3
 MAX_FRAME = 4096
 _QUOTED = 16
 

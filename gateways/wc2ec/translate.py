@@ -22,7 +22,6 @@ from gateways.wc2ec.devices import (
     Table,
     kind_of,
     registered,
-    sensor_topic,
     unnamed,
 )
 from gateways.wc2ec.messages import (
@@ -149,7 +148,8 @@ class Wc2EcRobot(Robot):
         self._session: ExternalSession | None = None
         self._table = Table()
         self._listened: set[str] = set(options.pinned)
-        self._ring = Ring(options) if options.bearings_deg else None
+        self._ring: Ring | None = None
+        self._tables = {name: np.array(table).T for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
         self._unregistered = metrics.count("sensor_unregistered")
         self._motor_types = {ROTATIONAL: options.motor_types.rotational, LINEAR: options.motor_types.linear}
@@ -226,15 +226,14 @@ class Wc2EcRobot(Robot):
         low, high = options.bounds.get(name) or options.bounds_default or (-math.inf, math.inf)
         fault = not low <= value <= high or math.isinf(value)
         self._faults.value += fault
-        table = options.tables.get(name)
+        table = self._tables.get(name)
         if table is not None and not fault:
-            values, meanings = zip(*table, strict=True)
-            value = float(np.interp(value, values, meanings))
+            value = float(np.interp(value, table[0], table[1]))
         reading = Reading(value, device.kind, device.number, fault, stamp_ns=stamp_ns)
         if self._ring is None:
-            return ((sensor_topic(device), reading),)
+            return ((topics.SENSOR(device.name), reading),)
         scan = self._ring.take(name, math.nan if fault else value, stamp_ns)
-        return ((sensor_topic(device), reading), *(((topics.SCAN, scan),) if scan is not None else ()))
+        return ((topics.SENSOR(device.name), reading), *(((topics.SCAN, scan),) if scan is not None else ()))
 
     def _error(self, message: Error, stamp_ns: int) -> tuple[Telemetry, ...]:
         return ((topics.TEXT, Text(f"error of device {message.number}", stamp_ns=stamp_ns)),)

@@ -131,8 +131,8 @@ class Authority:
     def renew(self, token: bytes, now: float) -> Lease:
         """Put the end of a lease off."""
         self.expire(now)
-        holder = self._holder
-        if holder is None or not hmac.compare_digest(holder.token, token):
+        holder = self._shown_by(token)
+        if holder is None:
             return self._denied(self._why_not(token), now)
         holder.expires_at = now + holder.lease_s
         return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
@@ -140,8 +140,8 @@ class Authority:
     def release(self, token: bytes, now: float) -> Lease:
         """Give a lease back; a robot that moves is stopped."""
         self.expire(now)
-        holder = self._holder
-        if holder is None or not hmac.compare_digest(holder.token, token):
+        holder = self._shown_by(token)
+        if holder is None:
             return self._denied(self._why_not(token), now)
         self._end("released", What.RELEASED, stops=self.moving)
         self._stopped = False
@@ -158,8 +158,8 @@ class Authority:
             shown = _read_authorization(attachment)
         except (msgspec.MsgspecError, RecursionError, ValueError) as error:
             raise Refused("malformed attachment: expected {token, seq}") from error
-        holder = self._holder
-        if holder is None or not hmac.compare_digest(holder.token, shown.token):
+        holder = self._shown_by(shown.token)
+        if holder is None:
             raise Refused(self._why_not(shown.token))
         if shown.seq <= holder.seq:
             raise Refused("repeated or out of order")
@@ -188,8 +188,9 @@ class Authority:
             token = _read_authorization(attachment or b"").token
         except (msgspec.MsgspecError, RecursionError, ValueError):
             return None
-        if self._holder is not None and hmac.compare_digest(self._holder.token, token):
-            return self._holder.who
+        holder = self._shown_by(token)
+        if holder is not None:
+            return holder.who
         return self._ended.get(token, (None, ""))[0]
 
     def refuse(self, command: str, reason: str, who: str | None = None) -> None:
@@ -263,6 +264,11 @@ class Authority:
                 for (who, command, reason), count in self._refusals.items()
             ),
         )
+
+    def _shown_by(self, token: bytes) -> _Holder | None:
+        """Give the holder if this is its token."""
+        holder = self._holder
+        return holder if holder is not None and hmac.compare_digest(holder.token, token) else None
 
     def _grant(self, request: Acquire, what: What, now: float) -> Lease:
         try:

@@ -13,6 +13,8 @@ from collections import deque
 
 from zbridge.errors import Refused
 
+URGENT = 256
+"""Frames of a stop that may wait: one for each motor there can be."""
 LIMIT = 64
 """Frames that may wait; one more is refused."""
 
@@ -49,7 +51,7 @@ class Outbox:
         self.gap_s = gap_s
         self._limit = limit
         self._queue: deque[bytes] = deque()
-        self._urgent: deque[bytes] = deque(maxlen=max(limit, 256))
+        self._urgent: deque[bytes] = deque(maxlen=URGENT)
         self._standing: dict[str, _Standing] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False

@@ -15,9 +15,16 @@ from urllib.parse import urlsplit
 import msgspec
 
 from zbridge.errors import LinkError
+from zbridge.metrics import Count
 
 READ_BYTES = 64 * 1024
-"""Most bytes taken from a socket before the loop serves others."""
+"""Most bytes taken from a robot's socket before the loop serves others."""
+CLIENT_READ_BYTES = 4096
+"""The same for a peer that connected to us: there may be hundreds."""
+CLIENT_WRITE_BYTES = 64 * 1024
+"""Bytes the kernel keeps for a peer that connected to us and reads slowly: what is older than that helps nobody."""
+CLOSE_S = 1.0
+"""Seconds a peer is given to take what was written before its connection was closed."""
 CONNECT_S = 5.0
 """Longest time a connection attempt may take."""
 
@@ -96,18 +103,24 @@ class Link(Protocol):
     def close(self) -> None:
         """Close the connection; idempotent."""
 
+    def abort(self) -> None:
+        """Close the connection now, whatever was written; idempotent."""
+
 
 class TcpLink(asyncio.BufferedProtocol):
-    """A TCP connection: every write a segment of its own, a vanished peer noticed by keep-alive."""
+    """A TCP connection: every write a segment of its own, a vanished peer noticed by keep-alive.
 
-    def __init__(self, receiver: Receiver, hub: DatagramHub | None = None) -> None:
+    ``buffer``: where reads go; what is read is copied at once, so the links of one loop may share it.
+    """
+
+    def __init__(self, receiver: Receiver, hub: DatagramHub | None = None, buffer: bytearray | None = None) -> None:
         self.peer = ""
         self._hub = hub
+        self._accepted = buffer is not None
         self._datagrams: DatagramSocket | None = None
         self._receiver = receiver
         self._transport: asyncio.Transport | None = None
-        self._buffer = bytearray(READ_BYTES)
-        self._view = memoryview(self._buffer)
+        self._view = memoryview(bytearray(READ_BYTES) if buffer is None else buffer)
         self._held_back = False
 
     def __repr__(self) -> str:
@@ -147,12 +160,15 @@ class TcpLink(asyncio.BufferedProtocol):
             self._transport.resume_reading()
 
     def close(self) -> None:
-        """Close the connection after what was written; idempotent."""
-        if self._transport is not None:
-            self._transport.close()
+        """Close the connection after what was written, within :data:`CLOSE_S`; idempotent."""
+        transport = self._transport
+        if transport is not None and not transport.is_closing():
+            transport.close()
+            if self._held_back:
+                asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
-        """Close the connection now, whatever was written."""
+        """Close the connection now, whatever was written; idempotent."""
         if self._transport is not None:
             self._transport.abort()
 
@@ -166,7 +182,10 @@ class TcpLink(asyncio.BufferedProtocol):
             self._transport.abort()
             return
         self.peer = str(Address(*peer[:2]))
-        _tune(transport.get_extra_info("socket"))
+        sock = transport.get_extra_info("socket")
+        _tune(sock)
+        if self._accepted:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
@@ -224,17 +243,19 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
 
 @contextlib.asynccontextmanager
 async def listen(
-    address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False
+    address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False, foreign: Count | None = None
 ) -> AsyncIterator[Address]:
     """Listen for peers, each with a receiver of its own; give the address, with the port that was had.
 
-    ``datagrams``: serve UDP on the same port number too. Raises LinkError where the address cannot be had.
+    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts those that are no peer's. Raises LinkError
+    where the address cannot be had.
     """
     loop = asyncio.get_running_loop()
-    hub = DatagramHub() if datagrams else None
+    hub = DatagramHub(foreign or Count()) if datagrams else None
+    buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
-            server = await loop.create_server(lambda: TcpLink(receiver(), hub), address.host, address.port)
+            server = await loop.create_server(lambda: TcpLink(receiver(), hub, buffer), address.host, address.port)
             await stack.enter_async_context(server)
             host, port = server.sockets[0].getsockname()[:2]
             if hub is not None:
@@ -318,11 +339,12 @@ class DatagramSocket(_DatagramReader):
 class DatagramHub(_DatagramReader):
     """The UDP socket of a listener: each source belongs to the link of the same host that claimed it."""
 
-    def __init__(self) -> None:
+    def __init__(self, foreign: Count) -> None:
         super().__init__()
-        self._hosts: dict[Link, tuple[str, Receiver]] = {}
-        self._sources: dict[tuple[str, int], Link] = {}
-        self.foreign = 0
+        self._hosts: dict[str, dict[Link, Receiver]] = {}
+        self._owners: dict[tuple[str, int], tuple[Link, Receiver]] = {}
+        self._sources: dict[Link, tuple[str, int]] = {}
+        self._foreign = foreign
 
     def open(self, host: str, port: int) -> None:
         """Bind the port."""
@@ -330,32 +352,37 @@ class DatagramHub(_DatagramReader):
 
     def add(self, link: Link, host: str, receiver: Receiver) -> None:
         """Let a link have the datagrams of its host that it claims."""
-        self._hosts[link] = (host, receiver)
+        self._hosts.setdefault(host, {})[link] = receiver
 
     def remove(self, link: Link) -> None:
         """Forget a link and its source; idempotent."""
-        self._hosts.pop(link, None)
-        self._sources = {source: owner for source, owner in self._sources.items() if owner is not link}
+        for host, links in tuple(self._hosts.items()):
+            links.pop(link, None)
+            if not links:
+                del self._hosts[host]
+        source = self._sources.pop(link, None)
+        if source is not None:
+            del self._owners[source]
 
     def send(self, link: Link, data: bytes) -> None:
         """Send to the source a link has claimed; nowhere while there is none."""
-        for source, owner in self._sources.items():
-            if owner is link:
-                self._send(data, source)
+        source = self._sources.get(link)
+        if source is not None:
+            self._send(data, source)
 
     def _take(self, data: bytes, source: tuple[str, int]) -> None:
-        link = self._sources.get(source) or self._claim(data, source)
-        if link is None:
-            self.foreign += 1
+        owner = self._owners.get(source) or self._claim(data, source)
+        if owner is None:
+            self._foreign.value += 1
         else:
-            self._hosts[link][1].received_datagram(data)
+            owner[1].received_datagram(data)
 
-    def _claim(self, data: bytes, source: tuple[str, int]) -> Link | None:
-        taken = set(self._sources.values())
-        for link, (host, receiver) in self._hosts.items():
-            if host == source[0] and link not in taken and receiver.claims(data):
-                self._sources[source] = link
-                return link
+    def _claim(self, data: bytes, source: tuple[str, int]) -> tuple[Link, Receiver] | None:
+        for link, receiver in self._hosts.get(source[0], {}).items():
+            if link not in self._sources and receiver.claims(data):
+                self._sources[link] = source
+                self._owners[source] = (link, receiver)
+                return self._owners[source]
         return None
 
 
@@ -387,5 +414,9 @@ class FakeLink:
         self.paused = False
 
     def close(self) -> None:
+        """Take note."""
+        self.closed = True
+
+    def abort(self) -> None:
         """Take note."""
         self.closed = True

@@ -57,7 +57,7 @@ class Outbox:
         self._turn_of_queue = False
         self.held = False
         """While set, only what is urgent or stands is given out."""
-        self._exempt: deque[bytes] = deque(maxlen=limit)
+        self._exempt: deque[bytes] = deque()
         self._quiet_until = -math.inf
 
     def __repr__(self) -> str:
@@ -77,7 +77,9 @@ class Outbox:
         self._quiet_until = until
 
     def put_exempt(self, frame: bytes) -> None:
-        """Queue a frame of the handshake: it goes first, and through a silence."""
+        """Queue a frame that goes first, and through a silence; raise Refused when too many wait."""
+        if len(self._exempt) >= self._limit:
+            raise Refused(f"busy: {self._limit} packets of the handshake wait")
         self._exempt.append(frame)
 
     def stand(

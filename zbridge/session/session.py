@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable
 from enum import Enum
 from typing import Generic, TypeVar
@@ -47,11 +48,15 @@ class State(Enum):
 
 
 class Limits(msgspec.Struct, frozen=True):
-    """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes."""
+    """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes.
+
+    rate_hz: frames a second that the peer may send, a second's worth at once; one more ends the session.
+    """
 
     frame_bytes: int
     handshake_s: float
     gap_s: float = 0.0
+    rate_hz: float = math.inf
 
 
 class Datagram(bytes):
@@ -68,6 +73,10 @@ class Traffic(msgspec.Struct):
     malformed: int = 0
     foreign: int = 0
     """Datagrams that came from elsewhere."""
+    dropped: int = 0
+    """Frames that found no place in the queue."""
+    refused: int = 0
+    """Commands of the peer that were not carried out."""
 
 
 class Snapshot(msgspec.Struct, frozen=True):
@@ -82,6 +91,8 @@ class Snapshot(msgspec.Struct, frozen=True):
     features: tuple[str, ...]
     transport: str
     traffic: Traffic
+    left_out: dict[str, int] = {}
+    """What the peer was not told, or was not understood to say, because the other side has no place for it."""
 
 
 class Session(ABC, Generic[M]):
@@ -104,11 +115,14 @@ class Session(ABC, Generic[M]):
         self.features: tuple[str, ...] = ()
         self.transport = "tcp"
         self.traffic = Traffic()
+        self.left_out: Counter[str] = Counter()
         self.last_malformed: str | None = None
         self.outbox = Outbox(limits.gap_s)
         self.tap: Tap | None = None
         self._frames = FrameBuffer(self.frame_end, limits.frame_bytes)
         self._limit_at = math.inf
+        self._allowance = limits.rate_hz
+        self._counted_at = 0.0
 
     def __repr__(self) -> str:
         reason = f" ({self.reason})" if self.reason else ""
@@ -168,10 +182,13 @@ class Session(ABC, Generic[M]):
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         open_to_all = self.state is State.ESTABLISHED
         traffic.bytes_in += len(data)
-        frames = 0
+        frames, allowed = 0, self._frames_allowed(now)
         try:
             for frame in self._frames.feed(data):
                 frames += 1
+                if frames > allowed:
+                    self._flooded()
+                    break
                 if tap is not None:
                     tap("in", frame)
                 try:
@@ -193,6 +210,7 @@ class Session(ABC, Generic[M]):
             self.malformed(str(error))
             self.fail(f"broken stream: {error}")
         traffic.frames_in += frames
+        self._allowance -= frames
         return messages
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
@@ -202,6 +220,10 @@ class Session(ABC, Generic[M]):
         """
         if self.over:
             return []
+        if self._frames_allowed(now) < 1:
+            self._flooded()
+            return []
+        self._allowance -= 1
         self.traffic.frames_in += 1
         self.traffic.bytes_in += len(datagram)
         if self.tap is not None:
@@ -222,6 +244,17 @@ class Session(ABC, Generic[M]):
     def accept_datagram(self, message: M, now: float) -> bool:
         """Take a message that came by datagram; False keeps it for the session itself."""
         return self.accept(message, now)
+
+    def _frames_allowed(self, now: float) -> float:
+        """Give the frames that the peer may send now."""
+        rate_hz = self.limits.rate_hz
+        if rate_hz < math.inf:
+            self._allowance = min(rate_hz, self._allowance + (now - self._counted_at) * rate_hz)
+            self._counted_at = now
+        return self._allowance
+
+    def _flooded(self) -> None:
+        self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")
 
     def malformed(self, what: str) -> None:
         """Count one message of the peer that could not be used."""
@@ -314,4 +347,5 @@ class Session(ABC, Generic[M]):
             features=self.features,
             transport=self.transport,
             traffic=msgspec.structs.replace(self.traffic),
+            left_out=dict(self.left_out),
         )

@@ -41,9 +41,9 @@ def loaded(folder: Path, text: str, **environment: str) -> Plan:
 def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
     made = loaded(tmp_path, MINIMAL)
     assert (made.config.robot.name, made.config.robot.realm) == ("r1", "fleet")
-    assert made.addresses == (Address("127.0.0.1", 11001),)
-    assert made.protocol.name == "tcpudp"
-    assert made.options == made.protocol.options()
+    assert made.device.addresses == (Address("127.0.0.1", 11001),)
+    assert made.device.protocol.name == "tcpudp"
+    assert made.device.options == made.device.protocol.options()
     control = made.config.control
     assert (control.lease_s, control.deadman_s) == (3.0, 2.0)
     assert (control.rate_hz, control.slew_per_s) == (None, None)
@@ -58,7 +58,7 @@ def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
 def test_the_template_of_every_protocol_is_a_configuration(tmp_path: Path, name: str) -> None:
     made = loaded(tmp_path, find_protocol(name).template.replace("{name}", "r7"))
     assert made.config.robot.name == "r7"
-    assert made.options == made.protocol.options()
+    assert made.device.options == made.device.protocol.options()
 
 
 def test_every_table_is_read(tmp_path: Path) -> None:
@@ -86,8 +86,8 @@ audit_files = 2
 listen = "127.0.0.1:9100"
 """,
     )
-    assert made.options.gap_s == 0.05
-    assert made.options.force == ("joystick", 50)
+    assert made.device.options.gap_s == 0.05
+    assert made.device.options.force == ("joystick", 50)
     assert made.config.bus.connect == ("tcp/10.0.0.1:7447",)
     assert made.config.bus.tls is not None
     assert made.config.bus.tls.key == "k.pem"
@@ -119,7 +119,7 @@ def test_variables_of_the_environment_are_put_into_strings_wherever_they_stand()
     raw["device"]["connect"] = ["tcp://${HOST}:${PORT}"]
     made = plan(raw, {"N": "7", "HOST": "robot.test", "PORT": "11001"})
     assert made.config.robot.name == "r-77"
-    assert made.addresses == (Address("robot.test", 11001),)
+    assert made.device.addresses == (Address("robot.test", 11001),)
     assert made.config.bus.connect == ("tcp/robot.test:7447",)
     assert made.config.control.audit == "/log/7.jsonl"
 

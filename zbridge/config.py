@@ -6,9 +6,11 @@ Unknown keys are errors; ``${VAR}`` in a string is taken from the environment. K
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -24,6 +26,8 @@ from zbridge.protocol import Protocol, find_protocol
 
 T = TypeVar("T")
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
+
+Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
@@ -67,6 +71,25 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     options: dict[str, Any] = {}
 
 
+class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and what bounds them.
+
+    name: of the listener on the bus, the protocol's and this process's where left out. clients: most at a time.
+    handshake_s, idle_s: seconds a client has for its handshake, and may be silent (None: for ever). rate_hz: messages a
+    second of one client. allow: networks clients may come from, all where empty.
+    """
+
+    protocol: str
+    listen: str
+    name: str | None = None
+    options: dict[str, Any] = {}
+    clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 256
+    handshake_s: Seconds = 5.0
+    idle_s: Seconds | None = None
+    rate_hz: Annotated[float, msgspec.Meta(ge=1, le=1e6)] = 1000.0
+    allow: tuple[str, ...] = ()
+
+
 class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[control]``: the most a holder may ask for in seconds, limits on motion, and the audit log.
 
@@ -93,19 +116,37 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole configuration."""
 
     robot: RobotSettings
-    device: DeviceSettings
+    device: DeviceSettings | None = None
+    hq: tuple[HqSettings, ...] = ()
     bus: BusSettings = BusSettings()
     control: ControlSettings = ControlSettings()
     metrics: MetricsSettings | None = None
+
+
+class DevicePlan(msgspec.Struct, frozen=True):
+    """The device side: its protocol, the protocol's options, an address for each link."""
+
+    protocol: Protocol
+    options: Any
+    addresses: tuple[Address, ...]
+
+
+class ListenerPlan(msgspec.Struct, frozen=True):
+    """One listener for HQ programs."""
+
+    protocol: Protocol
+    options: Any
+    address: Address
+    settings: HqSettings
+    allow: tuple[Network, ...]
 
 
 class Plan(msgspec.Struct, frozen=True):
     """A configuration with everything its names refer to: what a gateway is started from."""
 
     config: Config
-    protocol: Protocol
-    options: Any
-    addresses: tuple[Address, ...]
+    device: DevicePlan | None
+    listeners: tuple[ListenerPlan, ...] = ()
     metrics: Address | None = None
 
 
@@ -130,19 +171,53 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
         if not is_name(name):
             raise ConfigError(f"{key} = {name!r}: expected letters, digits, '_', '.' and '-' only")
-    try:
-        protocol = find_protocol(config.device.protocol)
-    except ConfigError as error:
-        raise ConfigError(f"device.{error}") from error
-    options = _convert(config.device.options, protocol.options, "device.options.")
-    addresses = tuple(_address("device.connect", text) for text in config.device.connect)
+    if config.device is None and not config.hq:
+        raise ConfigError("device: missing, it is required where there is no [[hq]]")
+    device = _device(config.device) if config.device is not None else None
+    listeners = tuple(_listener(settings, f"hq[{number}]") for number, settings in enumerate(config.hq))
+    named = Counter(settings.name for settings in config.hq if settings.name is not None)
+    for number, settings in enumerate(config.hq):
+        if settings.name is not None and named[settings.name] > 1:
+            raise ConfigError(f"hq[{number}].name = {settings.name!r}: expected a name of its own")
+    metrics = _metrics_address(config.metrics.listen) if config.metrics else None
+    return Plan(config, device, listeners, metrics)
+
+
+def _device(settings: DeviceSettings) -> DevicePlan:
+    protocol = _protocol("device.", settings.protocol)
+    options = _convert(settings.options, protocol.options, "device.options.")
+    addresses = tuple(_address("device.connect", text) for text in settings.connect)
     if len(addresses) > protocol.links:
         raise ConfigError(
-            f"device.connect = {list(config.device.connect)}: a {protocol.name} robot has at most {protocol.links} link"
+            f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
             f"{'s' if protocol.links > 1 else ''}"
         )
-    metrics = _metrics_address(config.metrics.listen) if config.metrics else None
-    return Plan(config, protocol, options, addresses, metrics)
+    return DevicePlan(protocol, options, addresses)
+
+
+def _listener(settings: HqSettings, key: str) -> ListenerPlan:
+    protocol = _protocol(f"{key}.", settings.protocol)
+    if protocol.hq is None:
+        raise ConfigError(f"{key}.protocol = {settings.protocol!r}: serves no HQ programs")
+    if settings.name is not None and not is_name(settings.name):
+        raise ConfigError(f"{key}.name = {settings.name!r}: expected letters, digits, '_', '.' and '-' only")
+    options = _convert(settings.options, protocol.hq_options, f"{key}.options.")
+    allow = tuple(_network(f"{key}.allow[{number}]", text) for number, text in enumerate(settings.allow))
+    return ListenerPlan(protocol, options, _address(f"{key}.listen", settings.listen), settings, allow)
+
+
+def _protocol(prefix: str, name: str) -> Protocol:
+    try:
+        return find_protocol(name)
+    except ConfigError as error:
+        raise ConfigError(f"{prefix}{error}") from error
+
+
+def _network(key: str, text: str) -> Network:
+    try:
+        return ipaddress.ip_network(text)
+    except ValueError as error:
+        raise ConfigError(f"{key} = {text!r}: expected a network like '192.168.1.0/24': {error}") from error
 
 
 def _address(key: str, text: str) -> Address:

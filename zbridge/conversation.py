@@ -121,6 +121,18 @@ class Conversation:
         self.session.close(reason, self._clock())
         self.pump()
 
+    @property
+    def stalled(self) -> bool:
+        """Whether the peer does not take what was written."""
+        return self._link is not None and not self._link.ready
+
+    def cut(self, reason: str) -> None:
+        """End the conversation and its link at once, and say why; what was written is lost."""
+        self.session.lost(reason)
+        if self._link is not None:
+            self._link.abort()
+        self.pump()
+
     def abandon(self) -> None:
         """End the conversation and its link at once, whatever state they are in; idempotent."""
         self.session.lost("abandoned")

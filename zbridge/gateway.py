@@ -14,14 +14,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from zbridge.audience import Audience
 from zbridge.audit import Audit, AuditFile
-from zbridge.bus import Bus, open_bus
+from zbridge.bus import Bus, Handle, Question, open_bus
 from zbridge.claim import Claim
-from zbridge.config import Plan
+from zbridge.config import DevicePlan, Plan
 from zbridge.device import Device
 from zbridge.errors import BusError
 from zbridge.exporter import serve_metrics
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
+from zbridge.listener import Listener
 from zbridge.metrics import Metrics
 from zbridge.session.control import TOKEN_BYTES, Authority
 from zbridge.session.manager import SessionManager
@@ -29,6 +34,8 @@ from zbridge.session.motion import MotionLimits
 
 log = logging.getLogger("zbridge.gateway")
 
+_ZID = 6
+"""Characters of the session id that tell listeners of different processes apart."""
 RETRY_S = 1.0
 """Seconds between attempts to open the bus."""
 
@@ -38,6 +45,7 @@ class Gateway:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
+        self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
         """Whether the bus was left in order; if not, its threads may hang."""
         self.metrics = Metrics()
@@ -47,28 +55,68 @@ class Gateway:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
-        """Serve the robot until cancelled; leave it standing still and the bus in order."""
+        """Serve the robot and its HQ programs until cancelled; leave the robot standing still and the bus in order."""
         with self._audit() as audit:
-            await self._run(audit)
+            bus = await self._open_bus()
+            try:
+                await self._run(bus, audit)
+            finally:
+                self.left = await bus.close()
 
-    async def _run(self, audit: Audit) -> None:
-        robot = self._plan.config.robot
-        bus = await self._open_bus()
-        claim = Claim(bus, KeySpace(robot.realm, robot.name))
+    async def _run(self, bus: Bus, audit: Audit) -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            if self._plan.metrics is not None:
+                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+            audience = Audience(bus, self._keys, self.metrics)
+            work: list[Coroutine[Any, Any, None]] = [
+                Listener(listener, name, audience, bus, self._keys, self.sessions, self.metrics, time.monotonic).run()
+                for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
+            ]
+            if work:
+                audience.open()
+                stack.callback(audience.close)
+            if self._plan.device is not None:
+                work.append(self._robot(bus, audit, self._plan.device))
+            else:
+                stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
+            await together(*work)
+
+    def _listener_names(self, bus: Bus) -> list[str]:
+        """Name the listeners as nobody else on the bus does, where the configuration does not."""
+        names: list[str] = []
+        for number, listener in enumerate(self._plan.listeners, 1):
+            own = f"{listener.protocol.name}-{bus.zid[:_ZID]}"
+            names.append(listener.settings.name or (f"{own}-{number}" if own in names else own))
+        return names
+
+    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
+        """Serve the robot whenever no other gateway does."""
+        claim = Claim(bus, self._keys)
         try:
-            async with contextlib.AsyncExitStack() as stack:
-                if self._plan.metrics is not None:
-                    await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
-                while True:
-                    await claim.take()
-                    await self._serve(bus, claim, audit)
+            while True:
+                shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
+                await claim.take()
+                if shown is not None:
+                    shown.close()
+                shown = self._show_sessions(bus, "gateway")
+                try:
+                    await self._serve(bus, claim, self._device(bus, audit, plan))
+                finally:
+                    shown.close()
         finally:
             claim.release()
-            self.left = await bus.close()
 
-    async def _serve(self, bus: Bus, claim: Claim, audit: Audit) -> None:
+    def _show_sessions(self, bus: Bus, who: str) -> Handle:
+        """Answer who asks for the session table of this process."""
+
+        def answer(question: Question) -> None:
+            question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
+
+        return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
+
+    async def _serve(self, bus: Bus, claim: Claim, device: Device) -> None:
         """Serve the robot until another gateway turns out to have the better claim."""
-        serving = asyncio.ensure_future(self._device(bus, audit).run())
+        serving = asyncio.ensure_future(device.run())
         losing = asyncio.ensure_future(claim.lost())
         try:
             await asyncio.wait((serving, losing), return_when=asyncio.FIRST_COMPLETED)
@@ -79,14 +127,13 @@ class Gateway:
                 task.cancel()
             await asyncio.shield(asyncio.gather(serving, losing, return_exceptions=True))
 
-    def _device(self, bus: Bus, audit: Audit) -> Device:
-        plan, config = self._plan, self._plan.config
-        control = config.control
+    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+        control = self._plan.config.control
         return Device(
             plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,
-            keys=KeySpace(config.robot.realm, config.robot.name),
+            keys=self._keys,
             bus=bus,
             authority=Authority(control.lease_s, control.deadman_s, partial(secrets.token_bytes, TOKEN_BYTES)),
             limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf),
@@ -100,7 +147,7 @@ class Gateway:
     def _audit(self) -> Iterator[Audit]:
         """Keep the audit log open: a file where the configuration names one, always the gateway's own log."""
         control, name = self._plan.config.control, self._plan.config.robot.name
-        if control.audit is None:
+        if control.audit is None or self._plan.device is None:
             yield Audit(name, logging.getLogger("zbridge.audit").debug)
             return
         file = AuditFile(Path(control.audit), self.metrics, file_bytes=control.audit_bytes, files=control.audit_files)
@@ -116,6 +163,20 @@ class Gateway:
             except BusError as error:
                 log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
                 await asyncio.sleep(RETRY_S)
+
+
+async def together(*work: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until all have ended, or one fails: then cancel the others, and raise what failed."""
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in tasks:
+            if task.done():
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
 async def until_signal(work: Coroutine[Any, Any, None]) -> None:

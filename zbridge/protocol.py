@@ -15,9 +15,10 @@ import msgspec
 from zbridge.errors import ConfigError, Refused
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
 from zbridge.link import Address
 from zbridge.metrics import Metrics
-from zbridge.session.session import Session, State
+from zbridge.session.session import Limits, Session, State
 
 GROUP = "zbridge.protocols"
 
@@ -92,6 +93,75 @@ class Robot(ABC):
         return session is not None and session.state is State.ESTABLISHED and session.busy is None
 
 
+Send = Callable[[Any, float], object]
+"""``send(session, now)``: puts what was encoded into the outbox of one client's session; raises Refused."""
+
+
+class HqSide(ABC):
+    """What one listener shows its HQ programs of a robot, and how it understands them. Sans-IO.
+
+    Made with the listener's options and the :class:`RobotView` that all listeners of a process share. What goes to
+    many clients is encoded once: :meth:`show` does it, or does it when the first client needs it.
+    """
+
+    name: ClassVar[str]
+    """The protocol's name: a robot of the same one is passed on whole."""
+    dialect: str | None = None
+    deadman_s: ClassVar[float]
+    """Seconds after which motion of a silent client ends."""
+    modes: ClassVar[bool] = False
+    """Whether a client says first that it wants to drive (:class:`Mode`), and motion before that is refused."""
+    steers: ClassVar[bool] = False
+    """Whether a turn without motion only sets wheels, and so is neutral."""
+    hold: bool = False
+    """Whether what a client set once is repeated while its link lives."""
+    datagrams: bool = False
+    """Whether clients are heard by datagrams too."""
+    numbers: range = range(1, 1_000_000)
+    """The numbers that clients are given."""
+    quiet_s: float = 0.0
+    """Seconds before a number is given again."""
+    follows: tuple[str, ...]
+    """The paths (``pose``, ``sensor/*``) whose messages :meth:`show` is given."""
+
+    @abstractmethod
+    def session(self, number: int, bounds: Limits) -> Session[Any]:
+        """Make the session of a new client; of ``bounds`` the protocol sets what is its own."""
+
+    @abstractmethod
+    def begin(self, session: Any, now: float) -> None:
+        """Send a client whose session was just established what it is to know first."""
+
+    @abstractmethod
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        """Translate what is new of the robot; None where no client is to be told."""
+
+    @abstractmethod
+    def take(self, session: Any, message: Any) -> Iterable[Telemetry]:
+        """Translate what a client sent to commands and queries; raise ProtocolError where it has no meaning."""
+
+    def answer(self, session: Any, topic: Topic, message: FleetMessage | None, now: float) -> None:
+        """Answer a client's question; None where the robot gave no answer. Raises Refused, EncodeError."""
+        raise Refused(f"nothing can be asked for {topic.path}")
+
+    def tell(self, session: Any, text: str, now: float) -> None:
+        """Say something to the people at a client, where the protocol can."""
+        return
+
+    def wanted(self) -> tuple[Topic, ...]:
+        """List what clients want besides ``follows``, only now and then."""
+        return ()
+
+
+class HqSimulation(msgspec.Struct, frozen=True):
+    """How a simulated HQ program is started: where it connects, and what it is. It is as fragile as deployed ones."""
+
+    address: Address
+    version: str | None = None
+    dialect: str | None = None
+    udp: bool = False
+
+
 class Simulation(msgspec.Struct, frozen=True):
     """How a simulated robot is started: one address for each of its links.
 
@@ -108,6 +178,10 @@ class Simulation(msgspec.Struct, frozen=True):
     ready: Callable[[tuple[Address, ...]], None] = lambda addresses: None
 
 
+class _NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
 class Protocol(msgspec.Struct, frozen=True):
     """A protocol: its name, what it can be told in a configuration, and what it makes."""
 
@@ -121,6 +195,12 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be a robot of this protocol until cancelled."""
     simulated: dict[str, Any] = {}
     """The options that fit the simulated robot, where the default ones do not."""
+    hq: Callable[[Any, RobotView, Metrics], HqSide] | None = None
+    """``hq(options, view, metrics)``: what a listener shows HQ programs; None: the protocol has no listeners."""
+    hq_options: type[msgspec.Struct] = _NoOptions
+    """What a listener can be told in a configuration."""
+    simulate_hq: Callable[[HqSimulation], Coroutine[Any, Any, None]] | None = None
+    """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """A commented configuration with the placeholder ``{name}``."""
 

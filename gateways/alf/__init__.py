@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import Dialect
 from gateways.alf.translate import NAME, AlfRobot, Options
 from zbridge.config import COMMON_TEMPLATE
@@ -76,5 +77,7 @@ PROTOCOL = Protocol(
     links=LINKS,
     robot=AlfRobot,
     simulate=_simulate,
+    hq=AlfHq,
+    hq_options=HqOptions,
     template=TEMPLATE,
 )

@@ -6,6 +6,8 @@ is established.
 
 from __future__ import annotations
 
+import msgspec
+
 from gateways.alf.messages import (
     MOST_POINTS,
     POINTS,
@@ -34,16 +36,26 @@ REPEAT_S = 0.02
 ENDED = "ended"
 HANDSHAKE_S = 5.0
 _DRIVE = "drive"
+_BOUNDS = Limits(frame_bytes=0, handshake_s=HANDSHAKE_S)
 
 
 class AlfSession(Session[AlfMessage]):
-    """What both roles share. points: of a measurement, which binary framing has to know."""
+    """What both roles share. points: of a measurement, which binary framing has to know.
+
+    bounds: what a listener demands of its clients.
+    """
 
     handled = frozenset({End})
     _SENT_BY_PEER: frozenset[int]
 
     def __init__(
-        self, dialect: Dialect, *, points: int = POINTS, points_from_scanner: bool = False, gap_s: float = 0.0
+        self,
+        dialect: Dialect,
+        *,
+        points: int = POINTS,
+        points_from_scanner: bool = False,
+        gap_s: float = 0.0,
+        bounds: Limits = _BOUNDS,
     ) -> None:
         self.dialect = dialect
         self.points = points
@@ -58,7 +70,7 @@ class AlfSession(Session[AlfMessage]):
             limit = binary_size(Measurement.spec.id, MOST_POINTS)
             self.frame_end = binary_frame_end(self._ids, lambda: self.points)
             self._read, self._write = read_binary, write_binary
-        super().__init__(Limits(frame_bytes=limit, handshake_s=HANDSHAKE_S, gap_s=gap_s))
+        super().__init__(msgspec.structs.replace(bounds, frame_bytes=limit, gap_s=gap_s))
 
     def send(self, message: AlfMessage) -> None:
         if self.over:

@@ -1,6 +1,7 @@
 """The sans-IO half of the judge in :mod:`gateways.alf.strict`: messages cut, judged, written; a car.
 
-By intention it shares nothing with the gateway's messages.
+What the judge in :mod:`gateways.alf.strict_hq` needs of it is here too. By intention it shares nothing with the
+gateway's messages.
 Section names in the docstrings are those of the protocol page ``alf.md``.
 """
 
@@ -29,12 +30,14 @@ LONGEST_BYTES = 65536
 FULL_PERCENT = 100
 """Speed that is full speed; a vehicle takes more without clamping in ``text``, as 100 in ``binary``."""
 MAX_INT = 2**31 - 1
+NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
+"""What deployed readers take as a field ("Dialect `text`")."""
+INTEGERS = re.compile(rb"(0|-?[1-9][0-9]*)(\|(0|-?[1-9][0-9]*))*;")
+"""A message of integers, as std::to_string prints them."""
 
 _NAMES = {DRIVE: ("speed", "direction", "steering angle", "light"), END: ("end",)}
 _ANGLES = {"text": (-90, 90), "binary": (0, 180)}
 _SIZES = {DRIVE: 4, END: 1}
-_NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
-_INTEGERS = re.compile(rb"(0|-?[1-9][0-9]*)(\|(0|-?[1-9][0-9]*))*;")
 _MOST_DIGITS = 11
 
 _ANGLE_MIN_DEG, _STEP_DEG = -135.0, 360 / 1024
@@ -95,6 +98,22 @@ class Scale(msgspec.Struct, frozen=True, kw_only=True):
     counts_per_deg_s: float = 10.0
 
 
+def deadly(number: str) -> str:
+    """Tell why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
+    whole = number.split(".")[0]
+    if whole in ("", "-"):
+        return f"a number without leading digit, {number[:20]}"
+    if len(whole.lstrip("-0")) > _MOST_DIGITS or not -MAX_INT - 1 <= integer(whole) <= MAX_INT:
+        return f"an integer over 2^31-1, {number[:20]}"
+    return ""
+
+
+def integer(number: str) -> int:
+    """Read the part before the point as std::stoi does, with any number of leading zeros."""
+    whole = number.split(".")[0]
+    return (-1 if whole.startswith("-") else 1) * int(whole.lstrip("-0") or "0")
+
+
 def show(data: bytes, dialect: Dialect, limit: int = 60) -> str:
     """Write bytes for a sentence, shortened: as text or in hex."""
     rest = f"... ({len(data)} bytes)" if len(data) > limit else ""
@@ -121,14 +140,14 @@ class TextReader:
 
     def _read(self, raw: bytes) -> Heard:
         """Read a message as deployed readers do: every number is a field, all else separates."""
-        numbers = _NUMBER.findall(raw.decode("latin-1"))
-        problem = next(filter(None, map(_deadly, numbers)), "")
+        numbers = NUMBER.findall(raw.decode("latin-1"))
+        problem = next(filter(None, map(deadly, numbers)), "")
         if problem:
             return Heard(NO_ID, (), raw, problem, deadly=True)
-        kind, *fields = [_integer(number) for number in numbers] or [NO_ID]
+        kind, *fields = [integer(number) for number in numbers] or [NO_ID]
         if not numbers:
             problem = "a message without a number"
-        elif not _INTEGERS.fullmatch(raw):
+        elif not INTEGERS.fullmatch(raw):
             problem = "not written as std::to_string prints integers"
         elif kind not in self._ids:
             problem = f"id {kind}, of which this server knows nothing"
@@ -205,11 +224,11 @@ class Repeats:
 
 
 def write(dialect: Dialect, kind: int, fields: Sequence[int | float]) -> bytes:
-    """Write a message of the vehicle; ``fields`` as the dialect has them, int or float as they are printed."""
+    """Write a message of either one; ``fields`` as the dialect has them, int or float as they are printed."""
     if dialect == "text":
         texts = [f"{value:.6f}" if isinstance(value, float) else str(value) for value in fields]
         return "|".join([str(kind), *texts]).encode("ascii") + b";"
-    layout = {SCAN: f"<BII{len(fields) - 4}qII", INIT: "<B3f3i", INFO: "<BB6hf", END: "<BB"}[kind]
+    layout = {SCAN: f"<BII{len(fields) - 4}qII", INIT: "<B3f3i", DRIVE: "<5B", INFO: "<BB6hf", END: "<BB"}[kind]
     return struct.pack(layout, kind, *fields)
 
 
@@ -283,22 +302,6 @@ class Machine:
         counts = [value * scale.counts_per_g for value in accelerations_g]
         counts += [value * scale.counts_per_deg_s for value in gyro_deg_s]
         return [speed, *(min(max(round(count), -32768), 32767) for count in counts), temperature]
-
-
-def _deadly(number: str) -> str:
-    """Tell why std::stoi throws at a number, empty if it does not ("The gateway as vehicle")."""
-    whole = number.split(".")[0]
-    if whole in ("", "-"):
-        return f"a number without leading digit, {number[:20]}"
-    if len(whole.lstrip("-0")) > _MOST_DIGITS or not -MAX_INT - 1 <= _integer(whole) <= MAX_INT:
-        return f"an integer over 2^31-1, {number[:20]}"
-    return ""
-
-
-def _integer(number: str) -> int:
-    """Read the part before the point as std::stoi does, with any number of leading zeros."""
-    whole = number.split(".")[0]
-    return (-1 if whole.startswith("-") else 1) * int(whole.lstrip("-0") or "0")
 
 
 def _problem(dialect: Dialect, kind: int, fields: Sequence[int], speed_full: int) -> str:

@@ -43,7 +43,7 @@ _MM_PER_M = 1000
 _MOST_TABLE_MM = 100_000
 _FORWARD, _BACKWARD = 0, 1
 _COUNTER_ENDS = 2**32
-_UNITS = {
+UNITS = {
     Dialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
     Dialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
 }
@@ -75,7 +75,7 @@ class AlfRobot(Robot):
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = Dialect(options.dialect)
         self._sessions: list[HqSession | None] = [None] * links
-        acceleration, gyro = _UNITS[self._dialect]
+        acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
         self._scanner: ScannerInit | None = None

@@ -7,6 +7,7 @@ is as fragile as the deployed ones and shares no code with the others.
 
 from __future__ import annotations
 
+from gateways.tcpudp.hq import HqOptions, TcpUdpHq
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
 from zbridge.config import COMMON_TEMPLATE
@@ -73,5 +74,7 @@ PROTOCOL = Protocol(
     links=1,
     robot=TcpUdpRobot,
     simulate=_simulate,
+    hq=TcpUdpHq,
+    hq_options=HqOptions,
     template=TEMPLATE,
 )

@@ -273,26 +273,60 @@ class HqSession(_TcpUdpSession):
         self.outbox.held = False
 
 
+_FROM_HQ: dict[int, Decode] = {
+    number: decoder(number)
+    for number in range(256)
+    if number not in PACKETS or PACKETS[number].sender is not Sender.ROBOT
+}
+"""How to read what an HQ may send, by packet id."""
+_NOBODYS_IDS = (0, SERVER_ID)
+"""The ``id`` bytes that no client is given."""
+
+
 class RobotSession(_TcpUdpSession):
-    """We play the robot towards an HQ: what we announce, the versions we list verbatim, and the id we give it."""
+    """We play the robot towards an HQ: what we announce, the versions we list verbatim, and the id we give it.
+
+    ``block``: the settings block as it is sent, where that is not the one of ``settings``. ``known``: packet ids that
+    this HQ knows besides those of its version. The ``id`` byte of what it sends is not looked at: the connection tells
+    who it is, and programs send 0 before they have read the settings.
+    """
 
     role = Role.ROBOT
     handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
     sender_id = SERVER_ID
 
-    def __init__(self, limits: Limits, settings: Settings, client_id: int, versions: Iterable[str] = LISTED) -> None:
+    def __init__(
+        self,
+        limits: Limits,
+        settings: Settings,
+        client_id: int,
+        versions: Iterable[str] = LISTED,
+        *,
+        block: bytes | None = None,
+        known: Iterable[int] = (),
+    ) -> None:
         super().__init__(limits)
         self.settings = settings
         self.client_id = client_id
         self.client: Settings | None = None
+        self.known: frozenset[int] = frozenset()
+        """The packet ids that this HQ knows; one it does not know cripples it for good."""
+        self._block = settings.encode() if block is None else block
+        self._also_known = frozenset(known)
         self._versions = tuple(versions)
         self._agreed = ""
         self._probe = Probe(PROBE_S)
         self._report = Probe(REPORT_S)
-        self._decoders = decoders(Sender.ROBOT, (0, client_id))
+
+    def decode(self, frame: bytes) -> Packet:
+        """Read a packet of the stream; ``frame_end`` has checked its length."""
+        decode = _FROM_HQ.get(frame[5])
+        if decode is None:
+            raise ProtocolError(self._odd(frame[4], frame[5]))
+        return decode(frame, HEADER.size)
 
     def opened(self, now: float) -> None:
-        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self.settings.encode()))
+        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self._block))
 
     def accept(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientSettings):
@@ -313,8 +347,18 @@ class RobotSession(_TcpUdpSession):
         return False
 
     def claims(self, datagram: bytes) -> bool:
-        waited_for = self._probe.verdict is Verdict.WAITING
-        return waited_for and datagram == encode_packet(ClientUDPConnection(), self.client_id)
+        """Claim packet 5 while it is waited for; later, of an HQ whose 5 was lost, any packet with its id.
+
+        Deployed HQ programs of version 1.3 send packets 11, 12 and 61 by UDP whatever was agreed.
+        """
+        if len(datagram) < HEADER.size or self.frame_end(datagram, 0) != len(datagram):
+            return False
+        sender_id, packet_id = datagram[4], datagram[5]
+        if self._probe.verdict is Verdict.WAITING:
+            own = sender_id == self.client_id or sender_id in _NOBODYS_IDS
+            return own and packet_id == ClientUDPConnection.spec.id
+        offered = self._probe.verdict is not Verdict.UNKNOWN
+        return offered and sender_id == self.client_id and packet_id in _FROM_HQ
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if not isinstance(message, ClientUDPConnection):
@@ -326,11 +370,9 @@ class RobotSession(_TcpUdpSession):
         return False
 
     def may_send(self, message: Packet) -> None:
-        """Raise Refused for a packet that an HQ of this version does not know: it cripples it for good."""
-        row = newest((self._agreed,), known=VERSIONS)
-        known = VERSIONS[row].known_to_hq if row is not None else frozenset()
+        """Raise Refused for a packet that this HQ does not know."""
         packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
-        if packet_id not in known:
+        if packet_id not in self.known:
             raise Refused(f"an HQ of version {self._agreed} does not know packet {packet_id}")
 
     def _take_settings(self, message: ClientSettings, now: float) -> None:
@@ -342,6 +384,8 @@ class RobotSession(_TcpUdpSession):
             return
         self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
         self._agreed = agreed
+        row = newest((agreed,), known=VERSIONS)
+        self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
         if self.settings.udp and self.client.udp:
             self._limit_at = math.inf
             self.send_first(ServerStartUDP())

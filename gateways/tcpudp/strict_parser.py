@@ -1,4 +1,6 @@
-"""The sans-IO half of the judge in :mod:`gateways.tcpudp.strict`: reads cut into packets, packets judged, the machine.
+"""The sans-IO half of the judges in :mod:`gateways.tcpudp.strict` and :mod:`gateways.tcpudp.strict_hq`.
+
+Reads cut into packets, packets judged, the machine of the simulated robot.
 
 By intention it shares nothing with the gateway's messages.
 Section names in the docstrings are those of the protocol page ``tcpudp.md``.
@@ -55,6 +57,13 @@ UNDERSTOOD = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,
 """The version string a robot takes without harm."""
 DEADLY_ENTRIES = frozenset({1, 2, 4, 8})
 """Lengths of a version list that crash robots 1.3 and "1.4"."""
+HQ_LOSES_BYTES = 2200
+"""An HQ loses TCP packets of so many bytes and more ("The gateway as robot")."""
+HQ_SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3"}
+"""The version string an HQ sends."""
+_TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS, MAP, POSITION})
+KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
+"""The packet ids that do not cripple an HQ of a version."""
 
 
 class Times(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,6 +81,17 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Mean time between packets sent unasked; 0: nothing unasked."""
     flight_s: float = 0.1
     """How long what the HQ sent before it could know better may still arrive."""
+
+
+class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
+    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
+
+    answer_s: float = 0.015
+    """From packet 2 to the answer 3 (as captured)."""
+    probe_s: float = 2.0
+    """How long it waits for 4 and, after its 5, for 6."""
+    gap_s: float = 0.01
+    """Spacing of the robot's packets that exculpates it where this process read later than that."""
 
 
 class Loss(enum.Enum):
@@ -99,6 +119,36 @@ class Settings(msgspec.Struct, frozen=True):
     readable: bool = True
 
 
+class Announced(msgspec.Struct, frozen=True):
+    """What a robot says about itself in packet 2, as one HQ reads it."""
+
+    client: int
+    versions: str
+    block: bytes
+    understood: str = ""
+    """The version whose block the HQ read; empty: it keeps its old flags."""
+    features: frozenset[Feature] = frozenset()
+    map_size: int = 0
+    map_interval: int = 0
+
+    @property
+    def udp(self) -> bool:
+        """Whether the robot set the UDP flag, read or not."""
+        return any(self.block[:1])
+
+    @property
+    def meant(self) -> tuple[int, int]:
+        """Size and interval of the map as a 1.3 HQ should have read them, zeros for others."""
+        size, interval = struct.unpack("<ii", self.block[-8:]) if self.understood == "1.3" else (0, 0)
+        return size, interval
+
+    @property
+    def side(self) -> int:
+        """Cells along a side of the map as announced to a 1.3 HQ, 0 if not."""
+        size, interval = self.meant
+        return max(size // interval, 0) if interval else 0
+
+
 def show(data: bytes, limit: int = 40) -> str:
     """Write bytes in hex for a sentence, shortened."""
     rest = f"... ({len(data)} bytes)" if len(data) > limit else ""
@@ -122,14 +172,20 @@ def cut(data: bytes) -> tuple[list[Packet], bytes, bool]:
 class Reads:
     """The reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = READ_BYTES) -> None:
+        self.joined: list[Packet] = []
+        """The packets of the last read if they were several and whole."""
+        self.hopeless = False
+        """The last read had a wrong length field."""
         self._tail = b""
+        self._most = most
 
     def take(self, data: bytes) -> tuple[Packet | None, str]:
         """Give the packet that one read is, or what is wrong with it; neither for the rest of a split packet."""
         late = bool(self._tail)
-        packets, self._tail, hopeless = cut(self._tail + data)
-        if hopeless:
+        packets, self._tail, self.hopeless = cut(self._tail + data)
+        self.joined = packets if len(packets) > 1 and not self._tail else []
+        if self.hopeless:
             self._tail = b""
             return None, f"no packet in one read, its length field is wrong: {show(data)}"
         if late and len(packets) + bool(self._tail) == 1:
@@ -140,15 +196,18 @@ class Reads:
             return None, f"{some} in one read: {show(data)}"
         if self._tail:
             return None, self._incomplete(data)
-        return packets[0], ""
+        return (packets[0], "") if len(data) <= self._most else (None, self._large(len(data), data))
 
     def _incomplete(self, data: bytes) -> str:
         if len(data) < 4:
             return f"a split packet, {len(data)} bytes in one read: {show(data)}"
         size = 4 + int(struct.unpack_from("<i", data)[0])
-        if size > READ_BYTES:
-            return f"a packet of {size} bytes, over {READ_BYTES}: {show(data)}"
+        if size > self._most:
+            return self._large(size, data)
         return f"a split packet, {len(data)} of {size} bytes in one read: {show(data)}"
+
+    def _large(self, size: int, data: bytes) -> str:
+        return f"a packet of {size} bytes, over {self._most}: {show(data)}"
 
 
 def datagram(data: bytes) -> Packet | None:
@@ -157,9 +216,9 @@ def datagram(data: bytes) -> Packet | None:
     return packets[0] if len(packets) == 1 and not rest else None
 
 
-def packet(kind: int, body: bytes = b"") -> bytes:
-    """Write a packet of the robot ("Framing")."""
-    return struct.pack("<iBB", 2 + len(body), SERVER_ID, kind) + body
+def packet(kind: int, body: bytes = b"", sender: int = SERVER_ID) -> bytes:
+    """Write a packet, of the robot unless told otherwise ("Framing")."""
+    return struct.pack("<iBB", 2 + len(body), sender, kind) + body
 
 
 def string(text: str) -> bytes:
@@ -186,6 +245,46 @@ def client_settings(body: bytes) -> Settings:
         "" if len(flags) == expected else f"{len(flags)} flags for the versions {versions!r} instead of {expected}"
     )
     return Settings(versions, frozenset(flag for flag in Feature if any(flags[flag : flag + 1])), problem)
+
+
+def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Announced:
+    """Read the body of packet 2 as an HQ of ``version`` does; ValueError for what cripples it.
+
+    ``skips_map_flag``: it looks for the map's size where the SLAMMap flag is ("The gateway as robot").
+    """
+    count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
+    if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
+        raise ValueError("no version string")
+    told = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
+    understood = _understood(version, told.versions)
+    if not understood:
+        return told
+    sized = understood == "1.3"
+    flags = FLAGS[understood] - (sized and skips_map_flag)
+    size = flags + 8 * sized
+    if len(told.block) < size:
+        raise ValueError(f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}")
+    features = frozenset(flag for flag in list(Feature)[:flags] if told.block[flag])
+    length, interval = struct.unpack_from("<ii", told.block, flags) if sized else (0, 0)
+    if sized and not interval:
+        raise ValueError("SLAMMapIntervall 0, a division by zero")
+    return Announced(told.client, told.versions, told.block, understood, features, length, interval)
+
+
+def _understood(version: str, versions: str) -> str:
+    """Tell as which version's an HQ reads settings, empty if as none ("Settings and version negotiation")."""
+    if version != "1.3":
+        return version if versions == version else ""
+    return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
+
+
+def announced_problem(told: Announced, *, skips_map_flag: bool = False) -> str:
+    """Tell what is wrong with packet 2 though it cripples nobody ("Settings and version negotiation")."""
+    newest = max((known for known in told.versions.split(",") if known in FLAGS), default="")
+    size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(told.block)
+    if len(told.block) != size and not (skips_map_flag and len(told.block) == size - 1 == 14):
+        return f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}"
+    return f"client id {told.client}" if told.client < 2 else ""
 
 
 def deadly(version: str, settings: Settings) -> bool:
@@ -223,6 +322,32 @@ def body_problem(kind: int, body: bytes) -> str:
         return f"a body of {len(body)} bytes instead of {size}"
     check = _CHECKS.get(kind)
     return check(body) if check else ""
+
+
+def hq_body_problem(kind: int, body: bytes) -> str:
+    """Tell what cripples an HQ that reads this body, empty if nothing ("Packets", "The gateway as robot")."""
+    size = _HQ_SIZES.get(kind, len(body))
+    if len(body) != size:
+        return f"a body of {len(body)} bytes instead of {size}"
+    if kind == DEBUG:
+        return _text(body) or ("" if body != bytes(4) else "an empty text")
+    return _map(body) if kind == MAP and body else ""
+
+
+def hq_value_problem(kind: int, body: bytes, side: int) -> str:
+    """Tell what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
+    if kind == LIDAR_STATUS and body not in _ON_OFF:
+        return f"lidar status {struct.unpack('<i', body)[0]}"
+    if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):
+        return "numbers that are not finite"
+    if kind == MAP and body:
+        count = len(body) - 4
+        if not count:
+            return "n = 0 instead of an empty body"
+        if side not in (0, math.isqrt(count)):
+            return f"{count} cells of a map announced with {side} x {side}"
+        return "a cell that is neither 0, 1 nor 2" if body[4:].translate(None, b"\0\1\2") else ""
+    return ""
 
 
 class Machine:
@@ -324,6 +449,15 @@ def _scan(body: bytes) -> str:
     return "" if len(body) == 4 + 4 * 360 else f"{len(body)} bytes for 360 floats"
 
 
+def _map(body: bytes) -> str:
+    count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
+    if count != len(body) - 4:
+        return f"n = {count} and {max(len(body) - 4, 0)} bytes of a map"
+    return "" if math.isqrt(count) ** 2 == count else f"a map of {count} cells, no square"
+
+
+_ON_OFF = (b"\1\0\0\0", b"\2\0\0\0")
+_HQ_SIZES = {START_UDP: 0, UDP_ANSWER: 1, LIDAR_STATUS: 4, POSITION: 12, GET_SCAN: 0}
 _SIZES = {
     UDP_PROBE: 0,
     UDP_STATUS: 1,

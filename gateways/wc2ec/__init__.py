@@ -8,6 +8,7 @@ the others.
 
 from __future__ import annotations
 
+from gateways.wc2ec.hq import HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect
 from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
 from zbridge.config import COMMON_TEMPLATE
@@ -92,5 +93,7 @@ PROTOCOL = Protocol(
     robot=Wc2EcRobot,
     simulate=_simulate,
     simulated=SIMULATED,
+    hq=Wc2EcHq,
+    hq_options=HqOptions,
     template=TEMPLATE,
 )

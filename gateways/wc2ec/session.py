@@ -26,16 +26,21 @@ HANDSHAKE_S = 5.0
 SETTLE_S = 0.1
 """Seconds without another registration, or data, after which all devices are taken to be registered."""
 
+_BOUNDS = Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S)
+
 
 class Wc2EcSession(Session[Wc2EcMessage]):
-    """What both roles share. values: configuration values of a sensor, which framing has to know."""
+    """What both roles share. values: configuration values of a sensor, which framing has to know.
+
+    bounds: what a listener demands of its clients.
+    """
 
     _PEER: Sender
 
-    def __init__(self, dialect: Dialect, *, values: int = 0) -> None:
+    def __init__(self, dialect: Dialect, *, values: int = 0, bounds: Limits = _BOUNDS) -> None:
         self.dialect = dialect
         self.frame_end = frame_end(dialect, self._PEER, values=values)
-        super().__init__(Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S))
+        super().__init__(bounds)
 
     def encode(self, message: Wc2EcMessage) -> bytes:
         if self.dialect not in message.commands:

@@ -50,8 +50,10 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
     """Run the gateway of a configuration until SIGTERM or SIGINT."""
     set_up_log(verbose=verbose)
     plan = load(file)
-    if only is not None and plan.protocol.name != only:
-        raise ConfigError(f"{file}: device.protocol = {plan.protocol.name!r}: expected {only!r}")
+    parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
+    for key, part in parts.items():
+        if only is not None and part.protocol.name != only:
+            raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
     gc.freeze()  # what start-up made stays, and need not be looked through again
     gateway = Gateway(plan)
     try:

@@ -46,11 +46,12 @@ def run(file: File, verbose: Verbose = False) -> None:
 def check(file: File) -> None:
     """Check a configuration and say what it would do."""
     plan = load(file)
-    robot, device = plan.config.robot, plan.config.device
-    typer.echo(
-        f"{file}: ok: {robot.realm}/{robot.name}, {device.protocol} at "
-        f"{', '.join(map(str, plan.addresses))}, bus as {plan.config.bus.effective_mode}"
-    )
+    robot, parts = plan.config.robot, []
+    if plan.device is not None:
+        parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
+    parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
+    parts.append(f"bus as {plan.config.bus.effective_mode}")
+    typer.echo(f"{file}: ok: {robot.realm}/{robot.name}, {', '.join(parts)}")
 
 
 @app.command()

@@ -95,7 +95,7 @@ async def _talk(protocol: Protocol, address: Address) -> int:
             "features": list(seen.features),
             "transport": seen.transport,
             "reason": seen.reason,
-            "malformed": seen.traffic.malformed,
+            "malformed": seen.counters["malformed"],
         }
     )
     return 0 if established else 1

@@ -257,3 +257,27 @@ class Authorization(msgspec.Struct, frozen=True):
 
     token: bytes
     seq: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class SessionEntry(msgspec.Struct, frozen=True):
+    """One session of the table: with a robot's link (role ``hq``) or with an HQ program (role ``robot``).
+
+    counters: what it carried and lost. left_out: what the peer was not told, or could not be taken from it, by name.
+    """
+
+    name: str
+    peer: str
+    role: str
+    state: str
+    reason: str | None = None
+    version: str | None = None
+    features: tuple[str, ...] = ()
+    transport: str = "tcp"
+    counters: dict[str, int] = {}
+    left_out: dict[str, int] = {}
+
+
+class Sessions(FleetMessage, frozen=True):
+    """The sessions of one process, the live ones first."""
+
+    sessions: tuple[SessionEntry, ...]

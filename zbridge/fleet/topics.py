@@ -151,6 +151,7 @@ CMD_MOTOR = _family("@cmd/motor", Motor, Delivery.COMMAND)
 CMD_SENSOR = _family("@cmd/sensor", SensorSetting, Delivery.COMMAND)
 CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND)
 
+RPC_SESSIONS = _family("@rpc/sessions", Query, Delivery.QUERY)
 RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
 RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
 RPC_ACQUIRE = Topic("@rpc/control/acquire", Acquire, Delivery.QUERY)
@@ -172,6 +173,7 @@ _FAMILIES = {
     "@cmd/motor": CMD_MOTOR,
     "@cmd/sensor": CMD_SENSOR,
     "@cmd/raw": CMD_RAW,
+    "@rpc/sessions": RPC_SESSIONS,
 }
 
 

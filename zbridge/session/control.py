@@ -20,6 +20,8 @@ from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refus
 
 LEASE_ENDED = "the lease has ended"
 """How every refusal of an ended lease's token begins."""
+NEUTRAL_FIRST = ": send a neutral drive first"
+"""How the refusal of motion ends that must wait for neutral."""
 REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
 TOKEN_BYTES = 16
@@ -170,7 +172,7 @@ class Authority:
     def require_motion(self) -> None:
         """Raise Refused where the holder must send neutral before the robot moves."""
         if self._held_back is not None:
-            raise Refused(f"{self._held_back}: send a neutral drive first")
+            raise Refused(f"{self._held_back}{NEUTRAL_FIRST}")
 
     def applied(self, part: str, now: float, *, moving: bool) -> None:
         """Take note that the holder's command for one part of the robot was carried out."""

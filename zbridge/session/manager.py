@@ -6,7 +6,8 @@ import math
 import random
 from typing import Any
 
-from zbridge.session.session import Session, Snapshot
+from zbridge.fleet.messages import SessionEntry
+from zbridge.session.session import Session
 
 REMEMBERED = 32
 """Ended sessions that the table still shows."""
@@ -62,22 +63,22 @@ class SessionManager:
     """The sessions of one process, of every protocol and both roles."""
 
     def __init__(self) -> None:
-        self._live: list[Session[Any]] = []
-        self._ended: list[Snapshot] = []
+        self._live: dict[Session[Any], None] = {}
+        self._ended: list[SessionEntry] = []
 
     def __repr__(self) -> str:
         return f"<SessionManager {len(self._live)} live, {len(self._ended)} ended>"
 
     def add(self, session: Session[Any]) -> None:
         """Take a new session into the table."""
-        self._live.append(session)
+        self._live[session] = None
 
     def remove(self, session: Session[Any]) -> None:
         """Move an ended session to the remembered ones."""
         if session in self._live:
-            self._live.remove(session)
+            del self._live[session]
             self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]
 
-    def snapshots(self) -> tuple[Snapshot, ...]:
+    def snapshots(self) -> tuple[SessionEntry, ...]:
         """Show every session, the live ones first."""
         return (*(session.snapshot() for session in self._live), *self._ended)

@@ -18,6 +18,7 @@ from typing import Generic, TypeVar
 import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
+from zbridge.fleet.messages import SessionEntry
 from zbridge.session.outbox import Outbox
 from zbridge.wire.frames import FrameBuffer, FrameEnd
 
@@ -77,22 +78,6 @@ class Traffic(msgspec.Struct):
     """Frames that found no place in the queue."""
     refused: int = 0
     """Commands of the peer that were not carried out."""
-
-
-class Snapshot(msgspec.Struct, frozen=True):
-    """A session as the session table shows it."""
-
-    name: str
-    peer: str
-    role: Role
-    state: State
-    reason: str | None
-    version: str | None
-    features: tuple[str, ...]
-    transport: str
-    traffic: Traffic
-    left_out: dict[str, int] = {}
-    """What the peer was not told, or was not understood to say, because the other side has no place for it."""
 
 
 class Session(ABC, Generic[M]):
@@ -335,17 +320,17 @@ class Session(ABC, Generic[M]):
         """Queue a message of the handshake: nothing goes before it, and a silence does not hold it."""
         self.outbox.put_exempt(self.encode(message))
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> SessionEntry:
         """Show the session as it is now."""
-        return Snapshot(
+        return SessionEntry(
             name=self.name,
             peer=self.peer,
-            role=self.role,
-            state=self.state,
-            reason=self.reason,
-            version=self.version,
+            role=self.role.value,
+            state=self.state.value,
+            reason=self.reason or self.busy,
+            version=self.version or None,
             features=self.features,
             transport=self.transport,
-            traffic=msgspec.structs.replace(self.traffic),
+            counters=msgspec.structs.asdict(self.traffic),
             left_out=dict(self.left_out),
         )

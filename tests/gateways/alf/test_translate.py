@@ -752,11 +752,13 @@ def test_every_message_of_a_vehicle_has_a_translation(wire: Wire) -> None:
 # Options
 
 
-def planned(connect: int = 1, **options: Any) -> config.Plan:
+def planned(connect: int = 1, **options: Any) -> config.DevicePlan:
     addresses = [f"tcp://127.0.0.1:{6666 + number}" for number in range(connect)]
-    return config.plan(
+    plan = config.plan(
         {"robot": {"name": "r1"}, "device": {"protocol": "alf", "connect": addresses, "options": options}}
     )
+    assert plan.device is not None
+    return plan.device
 
 
 def test_the_defaults_are_those_of_the_page() -> None:
@@ -816,9 +818,10 @@ def test_every_option_can_be_set() -> None:
 
 def test_the_template_is_a_configuration_with_the_defaults() -> None:
     plan = config.plan(tomllib.loads(TEMPLATE.format(name="r1")))
-    assert plan.protocol is PROTOCOL
-    assert plan.options == Options()
-    assert [str(address) for address in plan.addresses] == ["tcp://127.0.0.1:6666"]
+    assert plan.device is not None
+    assert plan.device.protocol is PROTOCOL
+    assert plan.device.options == Options()
+    assert [str(address) for address in plan.device.addresses] == ["tcp://127.0.0.1:6666"]
     for name in Options.__struct_fields__:
         assert f"\n{name} = " in TEMPLATE or f"\n# {name} = " in TEMPLATE
 

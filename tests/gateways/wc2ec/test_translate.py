@@ -57,11 +57,13 @@ FACTORS: dict[str, Any] = {
 NAN, INF = math.nan, math.inf
 
 
-def planned(connect: int = 1, **options: Any) -> config.Plan:
+def planned(connect: int = 1, **options: Any) -> config.DevicePlan:
     addresses = [f"tcp://127.0.0.1:{27015 + number}" for number in range(connect)]
-    return config.plan(
+    plan = config.plan(
         {"robot": {"name": "r1"}, "device": {"protocol": "wc2ec", "connect": addresses, "options": options}}
     )
+    assert plan.device is not None
+    return plan.device
 
 
 def options_of(**options: Any) -> Options:
@@ -999,8 +1001,9 @@ def template() -> str:
 
 def test_the_template_is_a_configuration_and_names_every_option() -> None:
     plan = config.plan(tomllib.loads(template()))
-    assert plan.protocol is PROTOCOL
-    assert [str(address) for address in plan.addresses] == ["tcp://127.0.0.1:27015"]
+    assert plan.device is not None
+    assert plan.device.protocol is PROTOCOL
+    assert [str(address) for address in plan.device.addresses] == ["tcp://127.0.0.1:27015"]
     for name in Options.__struct_fields__:
         assert f"{name} = " in TEMPLATE or f"[device.options.{name}]" in TEMPLATE
 

@@ -1,0 +1,223 @@
+"""What HQ programs of ALF are shown of a robot of any protocol, and what they command. Sans-IO.
+
+Source: "The gateway as vehicle", "Translation" and the dialects of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from gateways.alf.messages import (
+    MOST_POINTS,
+    POINTS,
+    AlfMessage,
+    Dialect,
+    DriveCommand,
+    DriveInfo,
+    Measurement,
+    ScannerInit,
+    write_binary,
+    write_text,
+)
+from gateways.alf.session import VehicleSession
+from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
+from zbridge.errors import ProtocolError
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
+from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
+from zbridge.metrics import Metrics
+from zbridge.protocol import HqSide, Send, Telemetry
+from zbridge.session.session import Limits
+
+DEADMAN_S = 0.3
+"""Deployed HQ programs repeat their command every 20 ms."""
+COUNTER_ENDS = 2**31
+"""Deployed receivers break on larger integers."""
+FULL_INFO = 100
+"""The speed of drive info at full scale."""
+_FULL_SPEED = {Dialect.TEXT: 255, Dialect.BINARY: 100}
+"""The speed of HQ programs that is full scale."""
+_MM_PER_M = 1000
+_RAW_16 = 32767
+
+Ints = npt.NDArray[np.int64]
+
+
+class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    dialect: Literal["text", "binary"] = "text"
+    serve: Literal["both", "drive", "laser"] = "both"
+    points: Annotated[int, msgspec.Meta(ge=2, le=MOST_POINTS)] = POINTS
+    acceleration_m_s2: Scale | None = None
+    gyro_rad_s: Scale | None = None
+    gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
+
+
+class HqClient(VehicleSession):
+    """The session of one client, and the scanner init that it was sent last."""
+
+    scanner: bytes | None = None
+
+    def know(self, scanner: bytes | None) -> None:
+        """Send scanner init where the client does not have this one: before any measurement by it."""
+        if scanner is not None and scanner != self.scanner:
+            self.outbox.clear("scan")
+            self.outbox.put_exempt(scanner)
+            self.scanner = scanner
+
+
+class Sweep:
+    """How scans of one geometry become measurements: the scanner that is announced, and the points that are taken."""
+
+    def __init__(
+        self, scan: Scan | Scanner, points: int, scanner: Scanner | None, write: Callable[[Any], bytes]
+    ) -> None:
+        self.source = _geometry(scan)
+        angle_min, increment, count, range_min, range_max = self.source
+        self.count = count
+        self._points = points
+        known = scanner is not None and scanner.angle_min == angle_min and scanner.angle_increment == increment
+        if count == points:
+            angle_max = scanner.angle_max if known and scanner is not None else angle_min + increment * (count - 1)
+            self._places: npt.NDArray[np.intp] | None = None
+        else:
+            angle_max = angle_min + increment * (count - 1)
+            self._places = np.rint(np.linspace(0, max(0, count - 1), points)).astype(np.intp)
+            increment = increment * (count - 1) / (points - 1) or math.radians(1.0)
+        time_s = scanner.time_increment_s if scanner is not None else 0.0
+        self.init = write(
+            ScannerInit(
+                math.degrees(angle_min),
+                math.degrees(angle_max),
+                math.degrees(increment),
+                _whole(time_s * 1000),
+                _whole(range_min * _MM_PER_M),
+                _whole(range_max * _MM_PER_M),
+            )
+        )
+
+    def measurement(self, scan: Scan, sequence: int) -> Measurement:
+        """Make a measurement: mm, 0 where nothing was measured; valid indices are the first and last of the rest."""
+        ranges = scan.ranges if self._places is None else scan.ranges[self._places]
+        with np.errstate(invalid="ignore"):
+            points_mm = np.rint(ranges.astype(np.float64) * _MM_PER_M)
+        valid = np.flatnonzero((points_mm >= 0) & (points_mm < COUNTER_ENDS))
+        points: Ints = np.zeros(self._points, np.int64)
+        points[valid] = points_mm[valid]
+        first, last = (int(valid[0]), int(valid[-1])) if valid.size else (0, 0)
+        stamp_ms = scan.device_ms if isinstance(scan.device_ms, int) else _stamp_ms(scan)
+        return Measurement(sequence % COUNTER_ENDS, stamp_ms % COUNTER_ENDS, points, first, last)
+
+
+class AlfHq(HqSide):
+    """One listener."""
+
+    name = NAME
+    deadman_s = DEADMAN_S
+    steers = True
+
+    def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+        self.options = options
+        self.view = view
+        self.dialect = options.dialect
+        self._dialect = Dialect(options.dialect)
+        self._write = write_text if self._dialect is Dialect.TEXT else write_binary
+        self._laser, self._drive = options.serve != "drive", options.serve != "laser"
+        self.follows = (("scan", "scanner") if self._laser else ()) + (("motion",) if self._drive else ())
+        acceleration, gyro = UNITS[self._dialect]
+        self._acceleration = options.acceleration_m_s2 or acceleration
+        self._gyro = options.gyro_rad_s or gyro
+        self._full_speed = _FULL_SPEED[self._dialect]
+        self._sweep: Sweep | None = None
+        self._sequence = 0
+
+    def session(self, number: int, bounds: Limits) -> HqClient:
+        return HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
+
+    def begin(self, session: HqClient, now: float) -> None:
+        known = self.view.scan or self.view.scanner
+        if self._laser and known is not None:
+            session.know(self._sweep_of(known).init)
+
+    # The robot, shown
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        if isinstance(message, Scan):
+            return self._measurement(message) if len(message.ranges) else None
+        if isinstance(message, Scanner):
+            init = self._sweep_of(message).init
+            return lambda session, now: session.know(init)
+        return self._info(message) if isinstance(message, Motion) else None
+
+    def _sweep_of(self, known: Scan | Scanner) -> Sweep:
+        if self._sweep is None or self._sweep.source != _geometry(known):
+            self._sweep = Sweep(known, self.options.points, self.view.scanner, self._write)
+        return self._sweep
+
+    def _measurement(self, scan: Scan) -> Send:
+        sweep = self._sweep_of(scan)
+        self._sequence = scan.seq if isinstance(scan.seq, int) else self._sequence + 1
+        frame = self._write(sweep.measurement(scan, self._sequence))
+
+        def send(session: HqClient, now: float) -> None:
+            session.know(sweep.init)
+            session.outbox.stand("scan", (frame,), now)
+
+        return send
+
+    def _info(self, motion: Motion) -> Send:
+        x, y, z = motion.acceleration or (0.0, 0.0, 0.0)
+        turning = motion.gyro or (0.0, 0.0, 0.0)
+        a, b, c = (self._measured(value / self._acceleration) for value in (x, 0.0 - y, z))
+        d, e, f = (self._measured(value / self._gyro) for value in turning)
+        speed = round(min(1.0, abs(motion.speed or 0.0)) * FULL_INFO)
+        message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
+        frame = self._write(message)
+        return lambda session, now: session.outbox.stand("info", (frame,), now)
+
+    def _measured(self, value: float) -> float:
+        value = _finite(value)
+        return value if self._dialect is Dialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
+
+    # What clients command
+
+    def take(self, session: HqClient, message: AlfMessage) -> tuple[Telemetry, ...]:
+        if not isinstance(message, DriveCommand):
+            raise ProtocolError(f"{message.spec.name} from an HQ program")
+        if not self._drive:
+            session.left_out["drive command"] += 1
+            return ()
+        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
+        speed = min(1.0, message.speed / self._full_speed)
+        if not speed and self.view.protocol != NAME:  # it sets the wheels, and others would turn on the spot
+            right = 0.0
+        backward = bool(message.direction) and speed > 0
+        turn = right if backward else 0.0 - right
+        return ((topics.CMD_DRIVE, Drive(forward=-speed if backward else speed, turn=turn, light=message.light)),)
+
+
+def _geometry(known: Scan | Scanner) -> tuple[float, float, int, float, float]:
+    count = len(known.ranges) if isinstance(known, Scan) else known.points
+    return (known.angle_min, known.angle_increment, count, known.range_min, known.range_max)
+
+
+def _stamp_ms(scan: Scan) -> int:
+    return scan.stamp_ns // 1_000_000 if isinstance(scan.stamp_ns, int) else 0
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+def _whole(value: float) -> int:
+    """Give an integer that every receiver can read."""
+    return round(max(0.0, min(value, COUNTER_ENDS - 1))) if math.isfinite(value) else 0

@@ -1,0 +1,328 @@
+"""What external controllers are shown of a robot of any protocol, and what they command. Sans-IO.
+
+Source: "The gateway as Webots controller" and the dialects of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+
+from gateways.wc2ec.devices import DISTANCE, LINEAR, ROTATIONAL
+from gateways.wc2ec.messages import (
+    MAX_FRAME,
+    ChangeSensor,
+    Dialect,
+    DisableSensor,
+    EnableSensor,
+    RegisterSensor,
+    SensorData,
+    SetSensor,
+    SetValue,
+    Wc2EcMessage,
+    write,
+)
+from gateways.wc2ec.session import ControllerSession
+from gateways.wc2ec.translate import NAME, Byte, DeviceOption, Positive
+from zbridge.errors import ConfigError, ProtocolError
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Devices, Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Status
+from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
+from zbridge.metrics import Metrics
+from zbridge.protocol import HqSide, Send, Telemetry
+from zbridge.session.session import Limits
+
+DEADMAN_S = 0.5
+NUMBERS = 255
+"""Devices there can be: numbers 0 to 254."""
+LEFT, RIGHT = "left", "right"
+"""The motors of a robot that has none of its own."""
+_MOST = 1e9
+_NAME_BYTES = 255
+
+
+class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The two sides of wheels that are shown of a robot without motors. speed_full, turn_full: of a drive of 1."""
+
+    wheel_radius_m: Positive = 0.05
+    track_m: Positive = 0.3
+    speed_full_m_s: Positive = 0.5
+    turn_full_rad_s: Positive = 1.0
+
+
+class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    dialect: Literal["deployed", "draft"] = "deployed"
+    hold: bool = True
+    sectors: Annotated[int, msgspec.Meta(ge=1, le=128)] = 8
+    sector_unit_m: Positive = 1.0
+    wheels: Wheels = Wheels()
+    distance_type: Byte = 37
+    rotational_type: Byte = 53
+    linear_type: Byte = 46
+    devices: tuple[DeviceOption, ...] = ()
+    values: Byte = 3
+
+    def __post_init__(self) -> None:
+        """Raise ConfigError for what cannot go together."""
+        if (self.dialect == "draft") is not bool(self.devices):
+            raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
+        for field in ("number", "name"):
+            if len({getattr(device, field) for device in self.devices}) < len(self.devices):
+                raise ConfigError(f"devices: a {field} twice")
+
+
+class Shown(msgspec.Struct, frozen=True):
+    """A device as controllers know it."""
+
+    name: str
+    number: int
+    type: int
+    kind: str
+
+    @property
+    def motor(self) -> bool:
+        """Whether it can be set."""
+        return self.kind in (ROTATIONAL, LINEAR)
+
+
+class HqClient(ControllerSession):
+    """The session of one controller: what it was told there is, what it wants to know, what it set."""
+
+    def __init__(self, dialect: Dialect, *, values: int, bounds: Limits) -> None:
+        super().__init__(dialect, values=values, bounds=bounds)
+        self.registered: set[int] = set()
+        self.enabled: set[int] = set()
+        self.wheels = {LEFT: 0.0, RIGHT: 0.0}
+
+
+class Wc2EcHq(HqSide):
+    """One listener. Its devices keep their names and numbers for as long as it lives."""
+
+    name = NAME
+    deadman_s = DEADMAN_S
+
+    def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+        self.options = options
+        self.view = view
+        self.dialect = options.dialect
+        self.hold = options.hold
+        self._dialect = Dialect(options.dialect)
+        self._draft = self._dialect is Dialect.DRAFT
+        self.follows = ("scan",) if self._draft else ("scan", "devices", "sensor/*")
+        self._sessions: list[HqClient] = []
+        self._by_name: dict[str, Shown] = {}
+        self._by_number: dict[int, Shown] = {}
+        self._sectors: dict[str, float] = {}
+        self._sectoring: tuple[tuple[float, float, int], list[tuple[str, Any]]] | None = None
+        for device in options.devices:
+            self._enter(device.name, device.number, device.kind)
+
+    # Clients
+
+    def session(self, number: int, bounds: Limits) -> HqClient:
+        self._sessions = [session for session in self._sessions if not session.over]
+        session = HqClient(
+            self._dialect,
+            values=self.options.values,
+            bounds=msgspec.structs.replace(bounds, frame_bytes=MAX_FRAME),
+        )
+        self._sessions.append(session)
+        return session
+
+    def begin(self, session: HqClient, now: float) -> None:
+        self._learn()
+        self._register(session)
+        for name, value in self._values().items():
+            self._put(session, self._by_name[name], value, now)
+
+    def wanted(self) -> tuple[Topic, ...]:
+        enabled = set().union(*(session.enabled for session in self._sessions if not session.over))
+        return tuple(topics.SENSOR(self._by_number[number].name) for number in sorted(enabled))
+
+    def _values(self) -> dict[str, float]:
+        """Give what is known of the devices there are."""
+        readings = {name: reading.value for name, reading in self.view.readings.items()}
+        return {name: value for name, value in {**readings, **self._sectors}.items() if name in self._by_name}
+
+    # Devices
+
+    def _learn(self) -> None:
+        """Enter what the robot has; a robot without motors of its own gets two."""
+        if self._draft or self.view.protocol is None:
+            return
+        devices = self.view.devices.devices if self.view.devices is not None else None
+        for device in devices or ():
+            self._enter(device.name, device.number, device.kind)
+        if self.view.protocol != NAME or devices is not None:
+            for reading in self.view.readings:
+                self._enter(reading, None, self.view.readings[reading].kind or DISTANCE)
+            if not any(device.motor for device in self._by_name.values()):
+                self._enter(LEFT, None, ROTATIONAL)
+                self._enter(RIGHT, None, ROTATIONAL)
+
+    def _enter(self, name: str, number: int | None, kind: str) -> None:
+        if name in self._by_name or not 0 < len(_bytes(name)) <= _NAME_BYTES:
+            return
+        if number is None or number in self._by_number or not 0 <= number < NUMBERS:
+            number = next((free for free in range(NUMBERS) if free not in self._by_number), None)
+        if number is not None:
+            device = Shown(name, number, 0 if self._draft else self._type(kind), kind)
+            self._by_name[name] = self._by_number[number] = device
+
+    def _type(self, kind: str) -> int:
+        types = {
+            ROTATIONAL: self.options.rotational_type,
+            LINEAR: self.options.linear_type,
+            DISTANCE: self.options.distance_type,
+        }
+        digits = kind.removeprefix("type")
+        return types.get(kind, int(digits) if digits.isdigit() and int(digits) < 256 else self.options.distance_type)
+
+    def _register(self, session: HqClient) -> None:
+        """Register what the controller does not know yet: each name once, and before any data."""
+        new = [device for device in self._by_number.values() if device.number not in session.registered]
+        if new and not self._draft:
+            frames = (RegisterSensor(device.type, device.number, _bytes(device.name)) for device in new)
+            session.outbox.put_exempt(b"".join(write(frame, self._dialect) for frame in frames))
+        session.registered.update(device.number for device in new)
+
+    # The robot, shown
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        if isinstance(message, Reading):
+            return self._reading(topics.unescape(topic.path.rpartition("/")[2]), message)
+        if isinstance(message, Scan):
+            return self._scan(message)
+        if isinstance(message, Devices | Status):
+            before = len(self._by_name)
+            self._learn()
+            return (lambda session, now: self._register(session)) if len(self._by_name) > before else None
+        return None
+
+    def _reading(self, name: str, message: Reading) -> Send | None:
+        if name not in self._by_name:
+            self._learn()
+        device = self._by_name.get(name)
+        return self._data(((device, message.value),)) if device is not None else None
+
+    def _scan(self, scan: Scan) -> Send | None:
+        """Cut a scan of a robot without distance sensors into sectors: the nearest point of each."""
+        if self.view.protocol in (None, NAME) or not len(scan.ranges):
+            return None
+        self._learn()
+        values = []
+        for name, points in self._sectors_of(scan):
+            ranges = scan.ranges[points]
+            nearest = float(np.nanmin(ranges, initial=scan.range_max))
+            if not self._draft:
+                self._enter(name, None, DISTANCE)
+            self._sectors[name] = nearest / self.options.sector_unit_m
+            if name in self._by_name:
+                values.append((self._by_name[name], self._sectors[name]))
+        return self._data(values)
+
+    def _sectors_of(self, scan: Scan) -> list[tuple[str, Any]]:
+        """Give the indices of each sector that the scan covers; sector 0 is ahead, they go on counter-clockwise."""
+        geometry = (scan.angle_min, scan.angle_increment, len(scan.ranges))
+        if self._sectoring is None or self._sectoring[0] != geometry:
+            angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+            width = 2 * math.pi / self.options.sectors
+            sectors = np.floor_divide(angles + width / 2, width).astype(np.int64) % self.options.sectors
+            cut = [(f"sector{number}", np.flatnonzero(sectors == number)) for number in range(self.options.sectors)]
+            self._sectoring = (geometry, [(name, points) for name, points in cut if points.size])
+        return self._sectoring[1]
+
+    def _data(self, values: Iterable[tuple[Shown, float]]) -> Send | None:
+        """Encode sensor data once for every controller."""
+        frames = [(device, self._frame(device, value)) for device, value in values if math.isfinite(value)]
+        if not frames:
+            return None
+
+        def send(session: HqClient, now: float) -> None:
+            for device, frame in frames:
+                self._stand(session, device, frame, now)
+
+        return send
+
+    def _frame(self, device: Shown, value: float) -> bytes:
+        return write(SensorData(device.type, device.number, value), self._dialect)
+
+    def _put(self, session: HqClient, device: Shown, value: float, now: float) -> None:
+        if math.isfinite(value):
+            self._stand(session, device, self._frame(device, value), now)
+
+    def _stand(self, session: HqClient, device: Shown, frame: bytes, now: float) -> None:
+        """Let a value stand until it is written, if the controller wants it; the newest wins."""
+        if device.number not in session.registered:
+            self._register(session)
+        if not self._draft or device.number in session.enabled:
+            session.outbox.stand(f"sensor {device.number}", (frame,), now)
+
+    # What controllers command
+
+    def take(self, session: HqClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
+        device = self._by_number.get(message.number)
+        if device is None:
+            raise ProtocolError(f"device {message.number} is not registered")
+        return _TAKEN[type(message)](self, session, device, message)
+
+    def _set(self, session: HqClient, device: Shown, message: SetValue) -> tuple[Telemetry, ...]:
+        if not device.motor:
+            raise ProtocolError(f"device {device.number} ({device.name!r}) is no motor")
+        if not abs(message.value) <= _MOST:
+            raise ProtocolError(f"{message.value} is no value of a motor")
+        if self._has_motors:
+            return ((topics.CMD_MOTOR(device.name), Motor(message.value)),)
+        if device.name not in session.wheels:
+            raise ProtocolError(f"the robot has no motor {device.name!r} any more")
+        session.wheels[device.name] = message.value
+        return ((topics.CMD_DRIVE, self._drive(**session.wheels)),)
+
+    @property
+    def _has_motors(self) -> bool:
+        """Whether the robot has motors of its own now."""
+        devices = self.view.devices.devices if self.view.devices is not None else ()
+        return any(device.kind in (ROTATIONAL, LINEAR) for device in devices)
+
+    def _drive(self, left: float, right: float) -> Drive:
+        """Turn velocities of two sides, rad/s, into a drive, to full scale where they are more."""
+        wheels = self.options.wheels
+        forward = wheels.wheel_radius_m * (left + right) / 2 / wheels.speed_full_m_s
+        turn = wheels.wheel_radius_m * (right - left) / wheels.track_m / wheels.turn_full_rad_s
+        scale = max(1.0, abs(forward), abs(turn))
+        return Drive(forward=forward / scale, turn=turn / scale)
+
+    def _enable(self, session: HqClient, device: Shown, message: EnableSensor) -> tuple[Telemetry, ...]:
+        session.enabled.add(device.number)
+        return ()
+
+    def _disable(self, session: HqClient, device: Shown, message: DisableSensor) -> tuple[Telemetry, ...]:
+        session.enabled.discard(device.number)
+        session.outbox.clear(f"sensor {device.number}")
+        return ()
+
+    def _change(self, session: HqClient, device: Shown, message: ChangeSensor) -> tuple[Telemetry, ...]:
+        return ((topics.CMD_SENSOR(device.name), SensorSetting(index=message.index, value=message.value)),)
+
+    def _configure(self, session: HqClient, device: Shown, message: SetSensor) -> tuple[Telemetry, ...]:
+        return ((topics.CMD_SENSOR(device.name), SensorSetting(values=tuple(message.values.tolist()))),)
+
+
+def _bytes(name: str) -> bytes:
+    return name.encode("utf-8", "surrogateescape")
+
+
+_TAKEN: dict[type[Wc2EcMessage], Callable[[Wc2EcHq, HqClient, Shown, Any], tuple[Telemetry, ...]]] = {
+    SetValue: Wc2EcHq._set,
+    EnableSensor: Wc2EcHq._enable,
+    DisableSensor: Wc2EcHq._disable,
+    ChangeSensor: Wc2EcHq._change,
+    SetSensor: Wc2EcHq._configure,
+}

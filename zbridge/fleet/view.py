@@ -1,0 +1,96 @@
+"""What a process knows of one robot from the bus: the last value of what it publishes. Sans-IO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from zbridge.fleet import topics
+from zbridge.fleet.messages import (
+    Control,
+    Devices,
+    FleetMessage,
+    Map,
+    Motion,
+    Pose,
+    Reading,
+    Scan,
+    Scanner,
+    Status,
+    Switch,
+)
+from zbridge.fleet.topics import Topic
+
+READINGS = 256
+"""Sensors whose last reading is kept; one more is not."""
+
+
+class RobotView:
+    """The robot as it was last seen; None for what was not seen yet.
+
+    ``protocol``, ``version`` and ``features`` are those of the last time it was established: a robot that is away for
+    a moment has not become another one.
+    """
+
+    def __init__(self) -> None:
+        self.alive = False
+        """Whether a gateway serves the robot."""
+        self.status: Status | None = None
+        self.control: Control | None = None
+        self.protocol: str | None = None
+        self.version: str | None = None
+        self.features: tuple[str, ...] | None = None
+        self.pose: Pose | None = None
+        self.map: Map | None = None
+        self.scan: Scan | None = None
+        self.motion: Motion | None = None
+        self.scanner: Scanner | None = None
+        self.lidar: Switch | None = None
+        self.camera: Switch | None = None
+        self.devices: Devices | None = None
+        self.readings: dict[str, Reading] = {}
+
+    def __repr__(self) -> str:
+        return f"<RobotView {self.protocol} {self.missing or 'established'}>"
+
+    @property
+    def missing(self) -> str | None:
+        """Say why the robot cannot be used now; None where it can."""
+        if not self.alive or self.status is None:
+            return "no gateway serves the robot"
+        if self.status.state != "established":
+            return f"robot {self.status.state}: {self.status.reason}" if self.status.reason else self.status.state
+        return None
+
+    def note(self, topic: Topic, message: FleetMessage) -> None:
+        """Take note of what was published."""
+        if isinstance(message, Reading):
+            name = topics.unescape(topic.path.rpartition("/")[2])
+            if name in self.readings or len(self.readings) < READINGS:
+                self.readings[name] = message
+            return
+        if isinstance(message, Status) and message.state == "established":
+            if self.protocol is not None and self.protocol != message.protocol:
+                self.forget()
+            self.protocol, self.version, self.features = message.protocol, message.version, message.features
+        keep = _KEPT.get(topic.path)
+        if keep is not None:
+            keep(self, message)
+
+    def forget(self) -> None:
+        """Forget what was seen: the robot has become another one."""
+        control, alive = self.control, self.alive
+        self.__init__()  # type: ignore[misc]
+        self.control, self.alive = control, alive
+
+
+def _keeper(name: str) -> Callable[[RobotView, FleetMessage], None]:
+    return lambda view, message: setattr(view, name, message)
+
+
+_KEPT = {
+    topic.path: _keeper(topic.path)
+    for topic in (
+        *(topics.STATUS, topics.CONTROL, topics.POSE, topics.MAP, topics.SCAN, topics.MOTION),
+        *(topics.SCANNER, topics.LIDAR, topics.CAMERA, topics.DEVICES),
+    )
+}

@@ -1,0 +1,377 @@
+"""One HQ program's hand on the robot: carries out on the bus what its intent decides. Knows no protocol and no link."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import msgspec
+
+from zbridge.bus import Bus, Handle, Publisher
+from zbridge.errors import BusError, PayloadError, Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import (
+    Acquire,
+    Authorization,
+    Control,
+    Drive,
+    FleetMessage,
+    Lease,
+    LeaseToken,
+    Mode,
+    Motor,
+    Raw,
+    Refusal,
+)
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.view import RobotView
+from zbridge.session.control import LEASE_ENDED, NEUTRAL_FIRST
+from zbridge.session.intent import Do, Intent
+
+log = logging.getLogger("zbridge.hq")
+
+ASK_S = 1.0
+"""Longest time a question about the lease waits for its answer."""
+REPEAT_S = 0.1
+"""Seconds between repetitions of what a client set once."""
+WAITING = 64
+"""Commands of one client that may wait for the bus; one more is refused."""
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class Bridge:
+    """What the clients of a listener share: publishers, questions, and tasks. ``spawn`` starts a task."""
+
+    def __init__(
+        self, bus: Bus, keys: KeySpace, view: RobotView, spawn: Callable[[Coroutine[Any, Any, None]], object]
+    ) -> None:
+        self.bus = bus
+        self.keys = keys
+        self.view = view
+        self.spawn = spawn
+        self._publishers: dict[str, Publisher] = {}
+
+    def __repr__(self) -> str:
+        return f"<Bridge to {self.keys.robot}>"
+
+    def put(self, topic: Topic, message: FleetMessage, attachment: bytes | None = None) -> None:
+        """Put a command on the bus."""
+        publisher = self._publishers.get(topic.path)
+        if publisher is None:
+            publisher = self._publishers[topic.path] = self.bus.publisher(self.keys.key(topic.path), topic)
+        publisher.put(payloads.encode(message), attachment)
+
+    async def ask_lease(self, topic: Topic, question: FleetMessage) -> Lease:
+        """Ask one thing about the lease; where there is no answer, the answer is no, and says so."""
+        why = "no gateway answers"
+        try:
+            answers = await self.bus.ask(self.keys.key(topic.path), payloads.encode(question), timeout_s=ASK_S)
+            for answer in answers:
+                if answer.error is None:
+                    return payloads.decode(Lease, answer.payload)
+                why = answer.error
+        except (BusError, PayloadError) as error:
+            why = str(error)
+        return Lease(ok=False, reason=why)
+
+    def close(self) -> None:
+        """Give the keys up."""
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
+class Helm:
+    """What one client commands. ``tell`` says something to its people; who, alive: its names on the bus.
+
+    modes: the protocol whose robots are told the control mode. steers, hold: see :class:`zbridge.protocol.HqSide`.
+    """
+
+    def __init__(
+        self,
+        intent: Intent,
+        bridge: Bridge,
+        *,
+        who: str,
+        alive: str,
+        modes: str | None,
+        steers: bool,
+        hold: bool,
+        tell: Callable[[str], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self.intent = intent
+        self.who = who
+        self._bridge = bridge
+        self._alive = alive
+        self._modes = modes
+        self._steers = steers
+        self._hold = hold
+        self._tell = tell
+        self._clock = clock
+        self._token: bytes | None = None
+        self._seq = 0
+        self._light = False
+        self._set: dict[str, tuple[Topic, FleetMessage]] = {}
+        """What is in motion, by path."""
+        self._queue: list[tuple[Topic, FleetMessage]] = []
+        self._writing = False
+        self._doubting = False
+        self._closed = False
+        self._due = 0.0
+        self._seen: dict[tuple[str, str], int] = {}
+        self._handle: Handle | None = None
+        if bridge.view.control is not None:  # what was refused to a client of our name before us
+            self._new_refusals(bridge.view.control)
+
+    def __repr__(self) -> str:
+        return f"<Helm {self.who} {self.intent!r}>"
+
+    @property
+    def active(self) -> bool:
+        """Whether :meth:`tick` has anything to do."""
+        return self.intent.held or self.intent.asking
+
+    # What the client says
+
+    def command(self, topic: Topic, message: FleetMessage) -> None:
+        """Carry out a command of the client; raise Refused with the reason where it may not be."""
+        now = self._clock()
+        if isinstance(message, Drive | Motor):
+            self._move(topic, message, now)
+        elif isinstance(message, Mode):
+            self._choose(message, now)
+        elif isinstance(message, Raw):
+            self._require_robot()
+            self._follow(self.intent.motion(now), topic, message)
+        else:
+            self._bridge.put(topic, message)
+
+    def tick(self) -> None:
+        """Repeat what is held, keep the lease or give it back; to be called every :data:`REPEAT_S` while active."""
+        now, intent = self._clock(), self.intent
+        intent.expire(now)
+        if not intent.held:
+            return
+        if self._hold and intent.held_back is None:
+            for topic, message in tuple(self._set.values()):
+                intent.motion(now)
+                self._send(topic, message)
+        if intent.wants_release(now):
+            self._release("unused")
+        elif intent.mode == "autonomous" and now >= self._due:
+            self._due = now + intent.lease_s / 3
+            self._doubt()
+
+    def close(self) -> None:
+        """Give the robot back: the client is gone; idempotent."""
+        if not self._closed:
+            self._closed = True
+            if self.intent.held:
+                self._release("disconnected")
+            elif not self.intent.asking:
+                self._forget_token()
+
+    # What the robot's gateway says
+
+    def look(self, control: Control) -> None:
+        """Take news from ``control``: whether the robot is still ours, and what was refused."""
+        if self.intent.held and (control.state != "held" or control.holder != self.who):
+            self._doubt()
+        for refusal in self._new_refusals(control):
+            self._refused(refusal)
+
+    def gateway_lost(self) -> None:
+        """Take note that the robot's gateway is gone, and every lease with it."""
+        if self.active:
+            self._lose("the robot's gateway is gone")
+
+    def _new_refusals(self, control: Control) -> list[Refusal]:
+        news, seen = [], {}
+        for refusal in control.refusals:
+            if refusal.who == self.who:
+                key = (refusal.command, refusal.reason)
+                if refusal.count != self._seen.get(key, 0):
+                    news.append(refusal)
+                seen[key] = refusal.count
+        self._seen = seen
+        return news
+
+    def _refused(self, refusal: Refusal) -> None:
+        if refusal.reason.startswith(LEASE_ENDED):
+            if self.intent.held:
+                self._doubt()
+        elif refusal.command != "acquire":
+            if refusal.reason.endswith(NEUTRAL_FIRST):
+                self.intent.refused(refusal.reason.removesuffix(NEUTRAL_FIRST))
+                self._set.clear()
+            self._tell(f"{refusal.command}: {refusal.reason}")
+
+    # Motion
+
+    def _move(self, topic: Topic, message: Drive | Motor, now: float) -> None:
+        intent = self.intent
+        moves = message.moving
+        if isinstance(message, Drive):
+            if moves and self._steers and not (message.forward or message.left):
+                if not intent.may_steer:
+                    message = Drive(light=message.light)
+                moves = False
+            message = self._lit(message)
+        if not moves:
+            self._set.pop(topic.path, None)
+            self._follow(intent.neutral(now), topic, message)
+            return
+        try:
+            self._require_robot()
+            do = intent.motion(now)
+        except Refused:
+            self._set.clear()
+            raise
+        self._set[topic.path] = (topic, message)
+        self._follow(do, topic, message)
+
+    def _lit(self, message: Drive) -> Drive:
+        """Say how the light should be only where that is new: programs repeat it with every command."""
+        if message.light is None or message.light == self._light:
+            return msgspec.structs.replace(message, light=None) if message.light is not None else message
+        if self.intent.held:
+            self._light = message.light
+        return message
+
+    def _choose(self, message: Mode, now: float) -> None:
+        if message.mode == "autonomous":
+            self._require_robot()
+        do = self.intent.choose(message.mode, now)
+        if do is Do.RELEASE:
+            self._mode_first()
+            self._release("control mode none")
+        elif do is Do.ACQUIRE:
+            self._bridge.spawn(self._acquire())
+        elif do is Do.SEND:
+            self._mode_first()
+
+    def _follow(self, do: Do, topic: Topic, message: FleetMessage) -> None:
+        match do:
+            case Do.SEND:
+                self._send(topic, message)
+            case Do.WAIT:
+                self._wait(topic, message)
+            case Do.ACQUIRE:
+                self._wait(topic, message)
+                self._bridge.spawn(self._acquire())
+
+    def _require_robot(self) -> None:
+        missing = self._bridge.view.missing
+        if missing is not None:
+            self.intent.refused(missing)
+            raise Refused(missing)
+
+    def _mode_first(self) -> None:
+        """Tell the robot its control mode, if it is of a protocol that has any."""
+        if self.intent.held and self._modes is not None and self._bridge.view.protocol == self._modes:
+            self._send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
+
+    # The lease
+
+    async def _acquire(self) -> None:
+        bridge = self._bridge
+        if self._handle is None:
+            self._handle = bridge.bus.announce(bridge.keys.alive(self._alive))
+        request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self._alive)
+        lease = await bridge.ask_lease(topics.RPC_ACQUIRE, request)
+        if not lease.ok or lease.token is None:
+            if self.intent.asking:
+                self._lose(lease.reason or "refused")
+        elif self._closed or not self.intent.asking:
+            await bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(lease.token))
+        else:
+            self._begin(lease.token, lease.expires_in_s)
+        if self._closed:
+            self._forget_token()
+
+    def _begin(self, token: bytes, lease_s: float | None) -> None:
+        intent, now = self.intent, self._clock()
+        self._token, self._seq, self._light = token, 0, False
+        intent.granted(lease_s or intent.lease_s)
+        intent.expire(now)
+        waiting, self._queue = self._queue, []
+        self._mode_first()
+        for topic, message in waiting:
+            if intent.held_back is None:
+                self._send(topic, message)
+        log.info("%s drives %s", self.who, self._bridge.keys.robot)
+
+    def _doubt(self) -> None:
+        """Ask whether the lease is still ours, which also renews it."""
+        if not self._doubting and self._token is not None:
+            self._doubting = True
+            self._bridge.spawn(self._verify(self._token))
+
+    async def _verify(self, token: bytes) -> None:
+        lease = await self._bridge.ask_lease(topics.RPC_RENEW, LeaseToken(token))
+        self._doubting = False
+        if not lease.ok and token == self._token:
+            self._lose(lease.reason or "the lease has ended")
+
+    def _lose(self, why: str) -> None:
+        self._drop(why)
+        self.intent.lost(why)
+        self._tell(f"not driving: {why}")
+
+    def _release(self, why: str) -> None:
+        token, self._token = self._token, None
+        self._drop(why)
+        self.intent.released()
+        self._bridge.spawn(self._give_back(token))
+
+    async def _give_back(self, token: bytes | None) -> None:
+        if token is not None:
+            with contextlib.suppress(BusError):  # what was commanded before, goes before
+                await self._bridge.bus.flush()
+            await self._bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(token))
+        if self._closed:
+            self._forget_token()
+
+    def _drop(self, why: str) -> None:
+        log.info("%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
+        self._token = None
+        self._queue.clear()
+        self._set.clear()
+
+    def _forget_token(self) -> None:
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            handle.close()
+
+    # The bus
+
+    def _send(self, topic: Topic, message: FleetMessage) -> None:
+        """Put a command on the bus, after those before it: they are numbered, and must not overtake each other."""
+        if self._writing or self._token is None:
+            self._wait(topic, message)
+            return
+        self._seq += 1
+        self._bridge.put(topic, message, _encode(Authorization(self._token, self._seq)))
+        if topic is not topics.CMD_DRIVE:  # goes by way of a thread
+            self._writing = True
+            self._bridge.spawn(self._written())
+
+    def _wait(self, topic: Topic, message: FleetMessage) -> None:
+        """Let a command wait; of motion the newest wins."""
+        if isinstance(message, Drive | Motor):
+            self._queue = [entry for entry in self._queue if entry[0].path != topic.path]
+        if len(self._queue) >= WAITING:
+            raise Refused(f"busy: {WAITING} commands wait for the bus")
+        self._queue.append((topic, message))
+
+    async def _written(self) -> None:
+        try:
+            await self._bridge.bus.flush()
+        except BusError as error:
+            log.warning("%s: %s", self.who, error)
+        self._writing = False
+        while self._queue and not self._writing and self._token is not None:
+            self._send(*self._queue.pop(0))

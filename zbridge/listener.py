@@ -1,0 +1,361 @@
+"""One listener for HQ programs: accepts them, shows each the robot, and lets each command as far as it may.
+
+Every client has a session, an outbox and a hand on the robot of its own: what one does or fails to do costs the
+others nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from zbridge.audience import Audience
+from zbridge.bus import Bus
+from zbridge.config import ListenerPlan
+from zbridge.conversation import Accepted, Conversation
+from zbridge.errors import BusError, EncodeError, PayloadError, ProtocolError, Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control, FleetMessage, Status
+from zbridge.fleet.topics import Delivery, KeySpace, Topic
+from zbridge.helm import REPEAT_S, Bridge, Helm
+from zbridge.link import Link, listen
+from zbridge.metrics import Metrics
+from zbridge.protocol import HqSide, Send
+from zbridge.session.intent import Intent
+from zbridge.session.manager import ClientIds, SessionManager
+from zbridge.session.session import Limits, Session, State
+
+log = logging.getLogger("zbridge.hq")
+
+STALL_S = 5.0
+"""Seconds of not taking what is written after which a client is given up; seconds of taking it make up for them."""
+SWEEP_S = 0.5
+"""Seconds between two looks at all clients."""
+TELL_S = 5.0
+"""Seconds within which a client is not told the same thing again."""
+ANSWER_S = 2.5
+"""Longest time a client's question waits for the robot's answer."""
+LEAVE_S = 0.7
+"""Longest time clients are given to hear that the listener ends, and the robot's gateway to hear of it."""
+_FRAME_BYTES = 64 * 1024
+_ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
+
+
+class Client:
+    """One HQ program: its session, its conversation, and its hand on the robot."""
+
+    def __init__(self, number: int, session: Session[Any], host: str) -> None:
+        self.number = number
+        self.session = session
+        self.host = host
+        self.helm: Helm
+        self.conversation: Conversation
+        self.begun = False
+        self.heard = 0
+        self.silent_s = 0.0
+        self.stalled_s = 0.0
+        self.told: dict[str, float] = {}
+
+    def __repr__(self) -> str:
+        return f"<Client {self.number} {self.session!r}>"
+
+
+class Listener:
+    """Serves the clients of one ``[[hq]]`` until cancelled. ``name``: of the listener on the bus."""
+
+    def __init__(
+        self,
+        plan: ListenerPlan,
+        name: str,
+        audience: Audience,
+        bus: Bus,
+        keys: KeySpace,
+        manager: SessionManager,
+        metrics: Metrics,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        assert plan.protocol.hq is not None
+        self.name = name
+        self.address = plan.address
+        self.ready = asyncio.Event()
+        self.clients: dict[int, Client] = {}
+        self._plan = plan
+        self._settings = plan.settings
+        self._audience = audience
+        self._side: HqSide = plan.protocol.hq(plan.options, audience.view, metrics)
+        self._keys = keys
+        self._manager = manager
+        self._loop = asyncio.get_running_loop()
+        self._clock = clock or self._loop.time
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._bridge = Bridge(bus, keys, audience.view, self._spawn)
+        self._bus = bus
+        self._ids = ClientIds(self._side.numbers[: plan.settings.clients], self._side.quiet_s)
+        self._asked: dict[str, list[Client]] = {}
+        self._active: set[Client] = set()
+        self._closing = False
+        self._limits = Limits(
+            frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
+        )
+        self._wanted: set[str] = set()
+        self._missing: str | None = audience.view.missing
+        self._accepted = metrics.count("hq_accepted", listener=name)
+        self._turned_away = metrics.count("hq_turned_away", listener=name)
+        self._dropped = metrics.count("hq_dropped", listener=name)
+        self._left_out = metrics.count("hq_left_out", listener=name)
+        self._commands = metrics.count("hq_commands", listener=name)
+        self._refused = metrics.count("hq_refused", listener=name)
+        self._malformed = metrics.count("hq_malformed", listener=name)
+        self._foreign = metrics.count("hq_foreign_datagrams", listener=name)
+
+    def __repr__(self) -> str:
+        return f"<Listener {self.name} {self.address}, {len(self.clients)} clients>"
+
+    async def run(self) -> None:
+        """Listen until cancelled; then take leave of every client, and give the robot back. Raises LinkError."""
+        self._audience.follow(self._side.follows, self._on_message, self._on_gateway)
+        async with listen(
+            self._plan.address, lambda: Accepted(self._admit), datagrams=self._side.datagrams, foreign=self._foreign
+        ) as self.address:
+            log.info("%s: HQ programs connect at %s", self.name, self.address)
+            self.ready.set()
+            try:
+                await self._attend()
+            finally:
+                await asyncio.shield(self._leave())
+
+    async def _attend(self) -> None:
+        sweep_at = self._clock() + SWEEP_S
+        while True:
+            await asyncio.sleep(REPEAT_S)
+            for client in tuple(self._active):
+                client.helm.tick()
+                if not client.helm.active:
+                    self._active.discard(client)
+            if self._clock() >= sweep_at:
+                sweep_at += SWEEP_S
+                self._sweep()
+
+    async def _leave(self) -> None:
+        self._closing = True
+        clients = tuple(self.clients.values())
+        for client in clients:
+            client.helm.close()
+            client.conversation.close("gateway stopped")
+        waiting = {client.conversation.ended for client in clients} | self._tasks
+        if waiting:
+            await asyncio.wait(waiting, timeout=LEAVE_S)
+        for client in clients:
+            client.conversation.abandon()
+        for task in tuple(self._tasks):
+            task.cancel()
+        self._bridge.close()
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # Clients come and go
+
+    def _admit(self, link: Link) -> Conversation | None:
+        """Take a client in; None where its network is not allowed, or there is no place."""
+        host = link.peer.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+        reason = self._unwelcome(host)
+        number = self._ids.take(self._clock()) if reason is None else None
+        if number is None:
+            self._turned_away.value += 1
+            log.warning("%s: %s turned away: %s", self.name, link.peer, reason or "as many clients as there can be")
+            return None
+        self._accepted.value += 1
+        session = self._side.session(number, self._limits)
+        session.name = f"{self.name}.{number}"
+        client = self.clients[number] = Client(number, session, host)
+        client.helm = self._helm(client)
+        client.conversation = Conversation(
+            session,
+            self._loop,
+            deliver=lambda messages: self._deliver(client, messages),
+            changed=lambda: self._on_session(client),
+            malformed=self._malformed,
+            foreign=self._foreign,
+            clock=self._clock,
+        )
+        client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
+        self._manager.add(session)
+        log.info("%s: %s connected as client %d", self.name, link.peer, number)
+        return client.conversation
+
+    def _unwelcome(self, host: str) -> str | None:
+        if self._closing:
+            return "the gateway stops"
+        allow = self._plan.allow
+        if allow and not any(ipaddress.ip_address(host.partition("%")[0]) in network for network in allow):
+            return "its network is not allowed"
+        return None
+
+    def _helm(self, client: Client) -> Helm:
+        side, who = self._side, f"hq.{self.name}.{client.number}"
+        return Helm(
+            Intent(side.deadman_s, modes=side.modes),
+            self._bridge,
+            who=who,
+            alive=who,
+            modes=side.name if side.modes else None,
+            steers=side.steers,
+            hold=side.hold,
+            tell=lambda text: self._tell(client, text),
+            clock=self._clock,
+        )
+
+    def _on_session(self, client: Client) -> None:
+        if client.session.state is State.ESTABLISHED and not client.begun:
+            client.begun = True
+            agreed = f", version {client.session.version}" if client.session.version else ""
+            log.info("%s: client %d established%s", self.name, client.number, agreed)
+            self._send(client, self._side.begin)
+            missing = self._audience.view.missing
+            if missing is not None:
+                self._tell(client, missing)
+        elif client.session.over:
+            client.helm.close()
+
+    def _dismiss(self, client: Client) -> None:
+        """Forget a client whose conversation has ended; its number is free again after a while."""
+        client.helm.close()
+        self.clients.pop(client.number, None)
+        self._active.discard(client)
+        self._ids.release(client.number, self._clock())
+        self._manager.remove(client.session)
+        self._follow_wanted()
+        log.info("%s: client %d gone: %s", self.name, client.number, client.session.reason)
+
+    def _sweep(self) -> None:
+        """Give up clients that take nothing, and those that say nothing for too long."""
+        idle_s = self._settings.idle_s
+        for client in tuple(self.clients.values()):
+            stalled = client.conversation.stalled
+            client.stalled_s = max(0.0, client.stalled_s + (SWEEP_S if stalled else -SWEEP_S))
+            heard = client.session.traffic.bytes_in
+            client.silent_s = client.silent_s + SWEEP_S if heard == client.heard else 0.0
+            client.heard = heard
+            if client.stalled_s >= STALL_S:
+                client.conversation.cut(f"took nothing for {STALL_S:g} s")
+            elif idle_s is not None and client.silent_s >= idle_s:
+                client.conversation.close(f"silent for {idle_s:g} s")
+
+    # What the robot says
+
+    def _on_message(self, topic: Topic, message: FleetMessage) -> None:
+        if isinstance(message, Control):
+            for client in tuple(self.clients.values()):
+                client.helm.look(message)
+            return
+        if isinstance(message, Status):
+            self._tell_of_robot()
+        if not self.clients:
+            return
+        try:
+            send = self._side.show(topic, message)
+        except (EncodeError, ProtocolError) as error:
+            self._left_out.value += 1
+            log.debug("%s: %s not shown: %s", self.name, topic.path, error)
+            return
+        if send is not None:
+            for client in tuple(self.clients.values()):
+                if client.begun and not client.session.over:
+                    self._send(client, send)
+
+    def _on_gateway(self, alive: bool) -> None:
+        self._tell_of_robot()
+        if not alive:
+            for client in tuple(self.clients.values()):
+                client.helm.gateway_lost()
+
+    def _tell_of_robot(self) -> None:
+        """Say that the robot is gone, or there again."""
+        missing = self._audience.view.missing
+        if missing != self._missing:
+            self._missing = missing
+            for client in tuple(self.clients.values()):
+                self._tell(client, missing or "the robot is there")
+
+    def _send(self, client: Client, send: Send) -> None:
+        """Let a client have something, as far as its queue takes it."""
+        try:
+            send(client.session, self._clock())
+        except Refused:
+            client.session.traffic.dropped += 1
+            self._dropped.value += 1
+        except EncodeError as error:
+            self._left_out.value += 1
+            log.debug("%s: client %d not sent: %s", self.name, client.number, error)
+        client.conversation.pump()
+
+    def _tell(self, client: Client, text: str) -> None:
+        """Say something to the people at a client, not the same thing all the time."""
+        now = self._clock()
+        if client.begun and now - client.told.get(text, -TELL_S) >= TELL_S:
+            client.told = {old: at for old, at in client.told.items() if now - at < TELL_S} | {text: now}
+            self._send(client, lambda session, now: self._side.tell(session, text, now))
+
+    # What clients say
+
+    def _deliver(self, client: Client, messages: list[Any]) -> None:
+        client.helm.intent.heard(self._clock())
+        for message in messages:
+            try:
+                for topic, command in self._side.take(client.session, message):
+                    self._carry_out(client, topic, command)
+            except (ProtocolError, EncodeError) as error:
+                client.session.malformed(str(error))
+        if client.helm.active:
+            self._active.add(client)
+        self._follow_wanted()
+
+    def _follow_wanted(self) -> None:
+        """Follow what clients want now and did not before, and no more what none of them wants."""
+        wanted = {topic.path for topic in self._side.wanted()}
+        for path in wanted - self._wanted:
+            self._audience.also_follow(path, self._on_message)
+        for path in self._wanted - wanted:
+            self._audience.unfollow(path, self._on_message)
+        self._wanted = wanted
+
+    def _carry_out(self, client: Client, topic: Topic, command: FleetMessage) -> None:
+        self._commands.value += 1
+        try:
+            if topic.delivery is Delivery.QUERY:
+                self._ask(client, topic)
+            else:
+                client.helm.command(topic, command)
+        except Refused as refusal:
+            client.session.traffic.refused += 1
+            self._refused.value += 1
+            self._tell(client, str(refusal))
+
+    def _ask(self, client: Client, topic: Topic) -> None:
+        """Ask the robot for a client; who asks the same meanwhile gets the same answer."""
+        asking = self._asked.get(topic.path)
+        if asking is None:
+            self._asked[topic.path] = [client]
+            self._spawn(self._question(topic))
+        elif client not in asking:
+            asking.append(client)
+
+    async def _question(self, topic: Topic) -> None:
+        shown = _ANSWERED[topic.path]
+        message: FleetMessage | None = None
+        try:
+            for answer in await self._bus.ask(self._keys.key(topic.path), timeout_s=ANSWER_S):
+                if answer.error is None:
+                    message = payloads.decode(shown.message, answer.payload)
+        except (BusError, PayloadError) as error:
+            log.debug("%s: %s: %s", self.name, topic.path, error)
+        for client in self._asked.pop(topic.path):
+            if not client.session.over:
+                self._send(client, lambda session, now: self._side.answer(session, topic, message, now))

@@ -1,0 +1,130 @@
+"""What an old HQ program means, which knows of no lease: when it acquires the robot, and gives it back. Sans-IO.
+
+Such a program says what its stick says, again and again. After it connected, and after a stop, a refusal or an
+expiry, nothing moves before it has once said neutral: a stick that was left pushed moves no robot.
+Source: the design's "Old HQ programs".
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from zbridge.errors import Refused
+
+LEASE_S = 3.0
+"""Seconds of neutral or silence after which a robot is given back, until a lease says otherwise."""
+
+
+class Do(Enum):
+    """What is to be done with what a program said."""
+
+    NOTHING = "nothing"
+    ACQUIRE = "acquire"
+    WAIT = "wait"
+    SEND = "send"
+    RELEASE = "release"
+
+
+class Intent:
+    """One program. deadman_s: silence after which its motion has ended. modes: it must say first that it will drive."""
+
+    def __init__(self, deadman_s: float, *, modes: bool = False) -> None:
+        self.mode = "none" if modes else "manual"
+        self.held = False
+        """Whether it holds the robot."""
+        self.asking = False
+        """Whether it was asked for the robot, and there is no answer yet."""
+        self.held_back: str | None = "connected"
+        """Why neutral must come before motion; None where it need not."""
+        self.lease_s = LEASE_S
+        self.deadman_s = deadman_s
+        self._moving = False
+        self._moved_at = -math.inf
+        self._heard_at = -math.inf
+
+    def __repr__(self) -> str:
+        return f"<Intent {self.mode} {'held' if self.held else 'asking' if self.asking else 'idle'} {self.held_back}>"
+
+    @property
+    def may_steer(self) -> bool:
+        """Whether wheels may be set: the robot is held, and nothing need be said first."""
+        return self.held and self.held_back is None
+
+    # What the program says
+
+    def heard(self, now: float) -> None:
+        """Take note that anything at all came."""
+        self._heard_at = now
+
+    def motion(self, now: float) -> Do:
+        """Take motion; raise Refused where the program may not move the robot now."""
+        self.expire(now)
+        if self.held_back is not None:
+            raise Refused(f"{self.held_back}: let go of the stick first")
+        if self.mode == "none":
+            raise Refused("control mode is none")
+        self._moved_at, self._moving = now, True
+        return self._act()
+
+    def neutral(self, now: float) -> Do:
+        """Take neutral."""
+        self.expire(now)
+        self.held_back, self._moving = None, False
+        return Do.SEND if self.held else Do.WAIT if self.asking else Do.NOTHING
+
+    def choose(self, mode: str, now: float) -> Do:
+        """Take a control mode, which stands; autonomous is motion, none gives the robot back."""
+        self.expire(now)
+        if mode == "autonomous" and self.held_back is not None:
+            raise Refused(f"{self.held_back}: let go of the stick first")
+        self.mode = mode
+        if mode == "none":
+            self._moving = False
+            return Do.RELEASE if self.held or self.asking else Do.NOTHING
+        if mode == "autonomous":
+            self._moved_at = now
+            return self._act()
+        return Do.SEND if self.held else Do.WAIT if self.asking else Do.NOTHING
+
+    def _act(self) -> Do:
+        if self.held:
+            return Do.SEND
+        if self.asking:
+            return Do.WAIT
+        self.asking = True
+        return Do.ACQUIRE
+
+    # What becomes of the lease
+
+    def granted(self, lease_s: float) -> None:
+        """Take note that the robot is ours."""
+        self.asking, self.held, self.lease_s = False, True, lease_s
+
+    def lost(self, why: str) -> None:
+        """Take note that it is not, or not any more."""
+        self.asking = self.held = self._moving = False
+        self.held_back = why
+
+    def released(self) -> None:
+        """Take note that it was given back."""
+        self.asking = self.held = self._moving = False
+
+    def refused(self, why: str) -> None:
+        """Take note that motion was not carried out, and neutral must come."""
+        self.held_back, self._moving = why, False
+
+    # Time
+
+    def expire(self, now: float) -> None:
+        """Let motion end that was not said again in time: the robot's gateway has stopped it."""
+        if self._moving and now - self._moved_at >= self.deadman_s:
+            self.refused("deadman")
+
+    def wants_release(self, now: float) -> bool:
+        """Tell whether the robot has not been used for so long that it is to be given back.
+
+        A robot that moves by itself is used as long as anything at all is heard.
+        """
+        used_at = max(self._moved_at, self._heard_at) if self.mode == "autonomous" else self._moved_at
+        return self.held and now - used_at >= self.lease_s

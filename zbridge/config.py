@@ -33,7 +33,26 @@ _VARIABLE = re.compile(r"\$\{(\w+)\}")
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
-COMMON_TEMPLATE = """\
+METRICS_TEMPLATE = """\
+# [metrics]
+# listen = "127.0.0.1:9100"             # counters for Prometheus
+"""
+LISTENER_TEMPLATE = """\
+# name = "desk"                         # of the listener on the bus; left out: made of its protocol and the process
+clients = 256                           # most at a time; one more is turned away
+handshake_s = 5.0                       # what a client has for its handshake
+# idle_s = 60.0                         # close clients that say nothing for so long; left out: they may be silent
+rate_hz = 1000.0                        # messages a second of one client; one that sends more is closed
+allow = []                              # networks that clients may come from, ["192.168.1.0/24"]; empty: all
+
+"""
+ROBOT_TEMPLATE = """\
+[robot]
+name = "{name}"                         # its keys begin with fleet/{name}/
+realm = "fleet"
+
+"""
+BUS_TEMPLATE = """\
 [bus]
 mode = "peer"                           # peer, client, router (embedded); client when only connect is given
 connect = []                            # for example ["tcp/127.0.0.1:7447"]
@@ -41,6 +60,16 @@ listen = []
 multicast = true                        # find peers on the local network
 stream = "drop"                         # "block": lose nothing when the bus is slower than the robot
 
+"""
+COMMON_TEMPLATE = (
+    """\
+# [[hq]]                                # HQ programs connect here as if this were the robot, any number of them;
+# protocol = "alf"                      # zbridge init --hq PROTOCOL prints all there is to set
+# listen = "tcp://127.0.0.1:6667"
+
+"""
+    + BUS_TEMPLATE
+    + """\
 [control]
 lease_s = 3.0                           # the most a holder may ask for: a lease not renewed for so long ends
 deadman_s = 2.0                         # the most a holder may ask for: motion without a fresh command ends
@@ -50,10 +79,16 @@ audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it
 audit_bytes = 1000000                   # rotated at this size,
 audit_files = 5                         # with so many older ones kept
 
-# [metrics]
-# listen = "127.0.0.1:9100"             # counters for Prometheus
 """
+    + METRICS_TEMPLATE
+)
 """The part of a commented configuration that all protocols share."""
+
+
+def listener_template(hq_template: str) -> str:
+    """Write the commented configuration of a process that serves HQ programs of a robot and has none of its own."""
+    head = "# A listener for HQ programs of one robot. Start it with: zbridge run FILE\n\n"
+    return f"{head}{ROBOT_TEMPLATE}[[hq]]\n{hq_template}\n{BUS_TEMPLATE}{METRICS_TEMPLATE}"
 
 
 class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

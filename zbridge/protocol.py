@@ -203,6 +203,8 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """A commented configuration with the placeholder ``{name}``."""
+    hq_template: str = ""
+    """The part of one that describes a listener, from its ``protocol`` on."""
 
 
 def protocol_names() -> tuple[str, ...]:

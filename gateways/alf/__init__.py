@@ -10,10 +10,10 @@ from __future__ import annotations
 from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import Dialect
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.config import COMMON_TEMPLATE
+from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
 from zbridge.errors import ConfigError
 from zbridge.link import Address
-from zbridge.protocol import Protocol, Simulation
+from zbridge.protocol import HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
@@ -21,10 +21,9 @@ TEMPLATE = (
     """\
 # A gateway for one ALF vehicle. Start it with: zbridge run FILE
 
-[robot]
-name = "{name}"                         # its keys begin with fleet/{name}/
-realm = "fleet"
-
+"""
+    + ROBOT_TEMPLATE
+    + """\
 [device]
 protocol = "alf"
 connect = ["tcp://127.0.0.1:6666"]      # the vehicle; or its drive server, then its laser server
@@ -41,6 +40,30 @@ gap_s = 0.0                             # least time between two messages
 """
     + COMMON_TEMPLATE
 )
+HQ_TEMPLATE = (
+    """\
+protocol = "alf"
+listen = "tcp://127.0.0.1:6667"
+"""
+    + LISTENER_TEMPLATE
+    + """\
+[hq.options]
+dialect = "text"                        # what programs in the field speak; "binary": the document's packed fields
+serve = "both"                          # "drive", "laser": some programs that drive stop reading after ten measurements
+points = 769                            # points of a measurement; scans of another number are resampled by angle
+# acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
+# gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
+gap_s = 0.0                             # least time between two messages
+"""
+)
+
+
+def _dialect(name: str | None) -> Dialect:
+    try:
+        return Dialect(name or "text")
+    except ValueError:
+        names = ", ".join(dialect.value for dialect in Dialect)
+        raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
 
 
 async def _simulate(simulation: Simulation) -> None:
@@ -48,11 +71,7 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError("an ALF vehicle has no versions and no datagrams")
     if len(simulation.addresses) > LINKS:
         raise ConfigError(f"an ALF vehicle has at most {LINKS} links")
-    try:
-        dialect = Dialect(simulation.dialect or "text")
-    except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
-        raise ConfigError(f"dialect {simulation.dialect!r}: expected one of {names}") from None
+    dialect = _dialect(simulation.dialect)
     if simulation.strict:
         from gateways.alf.strict import simulate_strict
 
@@ -70,6 +89,15 @@ async def _simulate(simulation: Simulation) -> None:
         await simulate(simulation)
 
 
+async def _simulate_hq(simulation: HqSimulation) -> None:
+    from gateways.alf.strict_hq import simulate_strict_hq
+
+    if simulation.version is not None or simulation.udp:
+        raise ConfigError("ALF HQ programs have no versions and no datagrams")
+    dialect = _dialect(simulation.dialect)
+    await simulate_strict_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
+
+
 PROTOCOL = Protocol(
     name=NAME,
     summary="ALF: a vehicle with a laser scanner",
@@ -79,5 +107,7 @@ PROTOCOL = Protocol(
     simulate=_simulate,
     hq=AlfHq,
     hq_options=HqOptions,
+    simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    hq_template=HQ_TEMPLATE,
 )

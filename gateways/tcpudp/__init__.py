@@ -8,21 +8,21 @@ is as fragile as the deployed ones and shares no code with the others.
 from __future__ import annotations
 
 from gateways.tcpudp.hq import HqOptions, TcpUdpHq
+from gateways.tcpudp.settings import HQ_BLOCKS
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.config import COMMON_TEMPLATE
+from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
 from zbridge.errors import ConfigError
 from zbridge.link import Address
-from zbridge.protocol import Protocol, Simulation
+from zbridge.protocol import HqSimulation, Protocol, Simulation
 
 TEMPLATE = (
     """\
 # A gateway for one robot of the TCP/UDP package protocol. Start it with: zbridge run FILE
 
-[robot]
-name = "{name}"                         # its keys begin with fleet/{name}/
-realm = "fleet"
-
+"""
+    + ROBOT_TEMPLATE
+    + """\
 [device]
 protocol = "tcpudp"
 connect = ["tcp://127.0.0.1:11001"]     # the robot's address
@@ -42,6 +42,28 @@ map_cell_m = 0.01                       # side of a map cell where the robot doe
 
 """
     + COMMON_TEMPLATE
+)
+HQ_TEMPLATE = (
+    """\
+protocol = "tcpudp"
+listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and hear datagrams from this address and port
+"""
+    + LISTENER_TEMPLATE
+    + """\
+[hq.options]
+versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
+udp = true                              # offer datagrams: 1.3 programs drive by nothing else
+gap_s = 0.01                            # least time between two packets: programs take one read as one packet
+quiet_s = 2.0                           # before a client's id is given again
+known = []                              # packet ids that these programs know besides those of their version
+skip_map_flag = false                   # leave out the byte that some 1.3 programs skip, so that they see the map size
+slam_map_size = 1000                    # announced while the robot's map is not known yet, in its unit of length
+slam_map_interval = 10
+speed_full = 1.0                        # packet speed at full scale
+turn_full = 1.0                         # packet turn speed at full scale
+length_unit_m = 0.01                    # the programs' unit of length in metres
+heading_offset = 1.5707963267948966     # what is subtracted from the robot's heading, radians
+"""
 )
 
 
@@ -67,6 +89,17 @@ async def _simulate(simulation: Simulation) -> None:
         await simulate(simulation)
 
 
+async def _simulate_hq(simulation: HqSimulation) -> None:
+    from gateways.tcpudp.strict_hq import simulate_strict_hq
+
+    version = simulation.version or "1.3"
+    if simulation.dialect is not None:
+        raise ConfigError("TCP/UDP HQ programs have no dialects")
+    if version not in HQ_BLOCKS:
+        raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
+    await simulate_strict_hq(simulation.address.host, simulation.address.port, version=version, udp=simulation.udp)
+
+
 PROTOCOL = Protocol(
     name=NAME,
     summary="TCP/UDP package protocol: joystick, lidar, SLAM map",
@@ -76,5 +109,7 @@ PROTOCOL = Protocol(
     simulate=_simulate,
     hq=TcpUdpHq,
     hq_options=HqOptions,
+    simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    hq_template=HQ_TEMPLATE,
 )

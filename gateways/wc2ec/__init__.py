@@ -11,19 +11,18 @@ from __future__ import annotations
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect
 from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
-from zbridge.config import COMMON_TEMPLATE
+from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
 from zbridge.errors import ConfigError
 from zbridge.link import Address
-from zbridge.protocol import Protocol, Simulation
+from zbridge.protocol import HqSimulation, Protocol, Simulation
 
 TEMPLATE = (
     """\
 # A gateway for one Webots robot. Start it with: zbridge run FILE
 
-[robot]
-name = "{name}"                         # its keys begin with fleet/{name}/
-realm = "fleet"
-
+"""
+    + ROBOT_TEMPLATE
+    + """\
 [device]
 protocol = "wc2ec"
 connect = ["tcp://127.0.0.1:27015"]     # the Webots controller: one port per robot
@@ -52,6 +51,32 @@ motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors
 """
     + COMMON_TEMPLATE
 )
+HQ_TEMPLATE = (
+    """\
+protocol = "wc2ec"
+listen = "tcp://127.0.0.1:27016"
+"""
+    + LISTENER_TEMPLATE
+    + """\
+[hq.options]
+dialect = "deployed"                    # what controllers in the field speak; "draft": the document's, without names
+hold = true                             # repeat what a controller set once while its connection lives: one that hangs
+                                        # keeps the robot moving; false: it must set values twice a second
+sectors = 8                             # a scan is shown as so many distance sensors, sector0 ahead, counter-clockwise
+sector_unit_m = 1.0                     # what their value 1 is in metres
+distance_type = 37                      # type bytes; they move with the Webots version
+rotational_type = 53
+linear_type = 46
+# devices = [{ name = "light0", number = 0 }]  # draft only: the sensors there are, by their names on the bus
+values = 3                              # draft only: configuration values of a sensor
+
+[hq.options.wheels]                     # the motors "left" and "right" of a robot that has none of its own
+wheel_radius_m = 0.05
+track_m = 0.3
+speed_full_m_s = 0.5                    # over ground at a drive of 1
+turn_full_rad_s = 1.0
+"""
+)
 SIMULATED = {
     "bounds_default": [0.0, 1000.0],
     "differential": {"left": ["left wheel"], "right": ["right wheel"], "wheel_radius_m": 0.05, "track_m": 0.3},
@@ -61,16 +86,20 @@ SIMULATED = {
 }
 
 
+def _dialect(name: str | None) -> Dialect:
+    try:
+        return Dialect(name or "deployed")
+    except ValueError:
+        names = ", ".join(dialect.value for dialect in Dialect)
+        raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
+
+
 async def _simulate(simulation: Simulation) -> None:
     if simulation.version is not None or simulation.udp:
         raise ConfigError("a Webots robot has no versions and no datagrams")
     if len(simulation.addresses) > 1:
         raise ConfigError("a Webots robot has one link")
-    try:
-        dialect = Dialect(simulation.dialect or "deployed")
-    except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
-        raise ConfigError(f"dialect {simulation.dialect!r}: expected one of {names}") from None
+    dialect = _dialect(simulation.dialect)
     (address,) = simulation.addresses
     if simulation.strict:
         from gateways.wc2ec.strict import simulate_strict
@@ -85,6 +114,15 @@ async def _simulate(simulation: Simulation) -> None:
         await simulate(simulation)
 
 
+async def _simulate_hq(simulation: HqSimulation) -> None:
+    from gateways.wc2ec.strict_hq import simulate_strict_hq
+
+    if simulation.version is not None or simulation.udp:
+        raise ConfigError("external controllers have no versions and no datagrams")
+    dialect = _dialect(simulation.dialect)
+    await simulate_strict_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
+
+
 PROTOCOL = Protocol(
     name=NAME,
     summary="WC2EC: Webots robots, by their controller program",
@@ -95,5 +133,7 @@ PROTOCOL = Protocol(
     simulated=SIMULATED,
     hq=Wc2EcHq,
     hq_options=HqOptions,
+    simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    hq_template=HQ_TEMPLATE,
 )

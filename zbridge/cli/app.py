@@ -10,10 +10,10 @@ import typer
 
 from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
-from zbridge.config import load
+from zbridge.config import listener_template, load
 from zbridge.gateway import until_signal
 from zbridge.link import Address
-from zbridge.protocol import Simulation, find_protocol, protocol_names
+from zbridge.protocol import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
 app = typer.Typer(
     help=__doc__,
@@ -58,9 +58,14 @@ def check(file: File) -> None:
 def init(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     name: Annotated[str, typer.Option(help="the robot's name on the bus")] = "r1",
+    hq: Annotated[bool, typer.Option("--hq", help="of a process that serves HQ programs of that protocol")] = False,
 ) -> None:
     """Print a commented configuration to start from."""
-    typer.echo(find_protocol(protocol).template.replace("{name}", name), nl=False)
+    found = find_protocol(protocol)
+    if hq and found.hq is None:
+        give_up(2, f"{protocol} serves no HQ programs")
+    template = listener_template(found.hq_template) if hq else found.template
+    typer.echo(template.replace("{name}", name), nl=False)
 
 
 @app.command()
@@ -68,7 +73,10 @@ def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     listen: Annotated[
         list[str], typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one; one for each link")
-    ],
+    ] = [],
+    hq: Annotated[
+        str, typer.Option(help="be an HQ program instead, as fragile as a deployed one, and connect there")
+    ] = "",
     seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
@@ -76,9 +84,14 @@ def simulate(
     strict: Annotated[bool, typer.Option("--strict", help="be as fragile as a deployed robot")] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Be a robot to play with, until SIGTERM or SIGINT."""
+    """Be a robot to play with, or an HQ program, until SIGTERM or SIGINT."""
     set_up_log(verbose=verbose)
     simulated = find_protocol(protocol)
+    if bool(listen) == bool(hq):
+        give_up(2, "give either --listen, to be a robot, or --hq, to be an HQ program")
+    if hq:
+        simulate_hq(simulated, HqSimulation(Address.parse(hq), version or None, dialect or None, udp))
+        return
     simulation = Simulation(
         tuple(map(Address.parse, listen)),
         seed,
@@ -89,6 +102,16 @@ def simulate(
         lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
     )
     run_loop(until_signal(simulated.simulate(simulation)))
+
+
+def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
+    """Be an HQ program until SIGTERM or SIGINT, or until it dies or is left."""
+    if simulated.simulate_hq is None:
+        give_up(2, f"there is no HQ program of {simulated.name} to play with")
+    try:
+        run_loop(until_signal(simulated.simulate_hq(simulation)))
+    except OSError as error:
+        give_up(1, f"{simulation.address}: {error.strerror or error}")
 
 
 @app.command()
@@ -124,12 +147,16 @@ def demo(
 def ls(
     connect: Connect = [],
     realm: Realm = "fleet",
+    sessions: Annotated[
+        bool, typer.Option("--sessions", help="list sessions: with robots, and with HQ programs")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
 ) -> None:
-    """List the robots on the bus."""
+    """List the robots on the bus, or the sessions of their gateways and listeners."""
     from zbridge.cli import bus
 
-    run_loop(bus.list_robots(bus_settings(connect), realm, as_json=json))
+    show = bus.list_sessions if sessions else bus.list_robots
+    run_loop(show(bus_settings(connect), realm, as_json=json))
 
 
 @app.command()

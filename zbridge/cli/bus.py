@@ -19,11 +19,13 @@ from zbridge.client import connect
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import FleetMessage, Status
+from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
 
 _SHOWN = 8
+_TABLE = 180
+"""Characters of the widest table that is printed to a file."""
 
 console = Console(highlight=False, soft_wrap=True)
 errors = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -51,6 +53,51 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
         console.print(_robot_table(robots))
     else:
         errors.print(f"no robots on {realm}/")
+
+
+async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> None:
+    """Print the session table of every process that serves a robot or HQ programs."""
+    async with connect(settings=settings, realm=realm) as fleet:
+        tables = await fleet.sessions()
+    if as_json:
+        for (robot, who), sessions in tables.items():
+            for entry in sessions:
+                console.print(json.dumps({"robot": robot, "who": who, **msgspec.to_builtins(entry)}), markup=False)
+    elif tables:
+        console.print(_session_table(tables), width=max(console.width, _TABLE), crop=False)
+    else:
+        errors.print(f"no gateways on {realm}/")
+
+
+def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> Table:
+    titles = (
+        "robot",
+        "process",
+        "session",
+        "peer",
+        "state",
+        "version",
+        "by",
+        "in",
+        "out",
+        "lost",
+        "left out",
+        "reason",
+    )
+    table = Table(box=None)
+    for title in titles:
+        table.add_column(title, no_wrap=True)
+    for (robot, who), sessions in tables.items():
+        for entry in sessions:
+            counters = entry.counters
+            lost = counters.get("malformed", 0) + counters.get("dropped", 0) + counters.get("refused", 0)
+            left_out = ", ".join(f"{name} {count}" for name, count in entry.left_out.items())
+            carried = [str(counters.get(name, 0)) for name in ("frames_in", "frames_out")]
+            agreed = (entry.state, entry.version or "", entry.transport)
+            table.add_row(
+                robot, who, entry.name, entry.peer, *agreed, *carried, str(lost), left_out, entry.reason or ""
+            )
+    return table
 
 
 def _robot_table(robots: dict[str, Status | None]) -> Table:

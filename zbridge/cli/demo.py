@@ -1,4 +1,4 @@
-"""The demo: simulated robots, a gateway process each, an embedded router, and a live table. Loopback only."""
+"""The demo: simulated robots, a gateway with a listener each, an embedded router, a live table. Loopback only."""
 
 from __future__ import annotations
 
@@ -101,13 +101,17 @@ async def run_demo(seconds: float) -> None:
         log = stack.enter_context((folder / "log").open("w+b"))
         bus, endpoint = await _router()
         stack.push_async_callback(bus.close)
+        listeners = {robot: f"tcp://127.0.0.1:{_free_port()}" for robot in robots}
         gateways = [
-            await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint))
+            await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint, listeners[robot]))
             for robot, protocol in robots.items()
         ]
         for key_expr in ("*", "sensor/*"):
             bus.subscribe(f"{REALM}/*/{key_expr}", watch.take)
-        print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --connect {endpoint}")  # noqa: T201
+        print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}")  # noqa: T201
+        print("HQ programs connect to a robot here, for example one to play with:")  # noqa: T201
+        for robot, protocol in robots.items():
+            print(f"  {robot}: zbridge simulate {protocol} --hq {listeners[robot]}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
         for gateway in gateways:  # all at once: each takes its time to leave its robot standing
             with contextlib.suppress(ProcessLookupError):
@@ -138,9 +142,9 @@ def _free_port() -> int:
 
 @contextlib.asynccontextmanager
 async def _robot(
-    folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str
+    folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str, listener: str
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a simulator and its gateway, each a process of its own; give the gateway's."""
+    """Run a simulator and its gateway with a listener, each a process of its own; give the gateway's."""
     found = find_protocol(protocol)
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
@@ -154,6 +158,7 @@ async def _robot(
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
             f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
+            f'[[hq]]\nprotocol = "{protocol}"\nlisten = "{listener}"\n'
             f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
         async with _process(log, "run", str(file)) as gateway:

@@ -34,6 +34,7 @@ from zbridge.fleet.messages import (
     Scan,
     Scanner,
     SensorSetting,
+    SessionEntry,
     Status,
     Switch,
     Text,
@@ -105,6 +106,10 @@ class Fleet:
     def robots(self) -> dict[str, Status | None]:
         """List the robots that have a gateway or a status."""
         return self._loop.run(self._fleet.robots())
+
+    def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
+        """Give the session tables by robot and process; see :meth:`zbridge.client.fleet.Fleet.sessions`."""
+        return self._loop.run(self._fleet.sessions())
 
     def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
         """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""

@@ -27,6 +27,8 @@ from zbridge.fleet.messages import (
     Scan,
     Scanner,
     SensorSetting,
+    SessionEntry,
+    Sessions,
     Status,
     Stop,
     Switch,
@@ -68,6 +70,17 @@ class Fleet:
                 with contextlib.suppress(PayloadError):
                     robots[split[1]] = payloads.decode(Status, answer.payload)
         return dict(sorted(robots.items()))
+
+    async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
+        """Give the session tables by robot and process: who is connected to which robot, how, and what was left out."""
+        tables: dict[tuple[str, str], tuple[SessionEntry, ...]] = {}
+        for answer in await self._bus.ask(f"{self.realm}/*/@rpc/sessions/*"):
+            split = split_key(answer.key)
+            if split is not None and answer.error is None:
+                with contextlib.suppress(PayloadError):
+                    who = split[2].rpartition("/")[2]
+                    tables[split[1], who] = payloads.decode(Sessions, answer.payload).sessions
+        return dict(sorted(tables.items()))
 
     async def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
         """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""

@@ -41,6 +41,8 @@ ANSWER_S = 2.5
 """Longest time a client's question waits for the robot's answer."""
 LEAVE_S = 0.7
 """Longest time clients are given to hear that the listener ends, and the robot's gateway to hear of it."""
+ATTEND_EVERY = 64
+"""Clients that are written to between two looks at the stops and commands that wait."""
 _FRAME_BYTES = 64 * 1024
 _ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
@@ -168,8 +170,7 @@ class Listener:
         reason = self._unwelcome(host)
         number = self._ids.take(self._clock()) if reason is None else None
         if number is None:
-            self._turned_away.value += 1
-            log.warning("%s: %s turned away: %s", self.name, link.peer, reason or "as many clients as there can be")
+            self._turn_away(link, reason or "as many clients as there can be")
             return None
         self._accepted.value += 1
         session = self._side.session(number, self._limits)
@@ -193,10 +194,18 @@ class Listener:
     def _unwelcome(self, host: str) -> str | None:
         if self._closing:
             return "the gateway stops"
-        allow = self._plan.allow
-        if allow and not any(ipaddress.ip_address(host.partition("%")[0]) in network for network in allow):
-            return "its network is not allowed"
-        return None
+        if not self._plan.allow:
+            return None
+        address = ipaddress.ip_address(host.partition("%")[0])
+        address = getattr(address, "ipv4_mapped", None) or address
+        return None if any(address in network for network in self._plan.allow) else "its network is not allowed"
+
+    def _turn_away(self, link: Link, reason: str) -> None:
+        """Count it, and warn at the first, second, fourth ... one: the log stays readable in a flood."""
+        before = self._turned_away.value
+        self._turned_away.value += 1
+        if before.bit_length() != self._turned_away.value.bit_length():
+            log.warning("%s: %s turned away (%d so far): %s", self.name, link.peer, before + 1, reason)
 
     def _helm(self, client: Client) -> Helm:
         side, who = self._side, f"hq.{self.name}.{client.number}"
@@ -265,10 +274,13 @@ class Listener:
             self._left_out.value += 1
             log.debug("%s: %s not shown: %s", self.name, topic.path, error)
             return
-        if send is not None:
-            for client in tuple(self.clients.values()):
-                if client.begun and not client.session.over:
-                    self._send(client, send)
+        if send is None:
+            return
+        for number, client in enumerate(tuple(self.clients.values()), 1):
+            if not number % ATTEND_EVERY:
+                self._bus.attend()
+            if client.begun and not client.session.over:
+                self._send(client, send)
 
     def _on_gateway(self, alive: bool) -> None:
         self._tell_of_robot()

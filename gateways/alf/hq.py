@@ -27,7 +27,7 @@ from gateways.alf.messages import (
 )
 from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
-from zbridge.errors import ProtocolError
+from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
@@ -73,6 +73,12 @@ class HqClient(VehicleSession):
             self.outbox.put_exempt(scanner)
             self.scanner = scanner
 
+    def close(self, reason: str, now: float) -> None:
+        """Say END, and let it be the last word: telemetry that still waits is not sent."""
+        self.outbox.clear("scan")
+        self.outbox.clear("info")
+        super().close(reason, now)
+
 
 class Sweep:
     """How scans of one geometry become measurements: the scanner that is announced, and the points that are taken."""
@@ -80,7 +86,7 @@ class Sweep:
     def __init__(
         self, scan: Scan | Scanner, points: int, scanner: Scanner | None, write: Callable[[Any], bytes]
     ) -> None:
-        self.source = _geometry(scan)
+        self.source, self.scanner = _geometry(scan), scanner
         angle_min, increment, count, range_min, range_max = self.source
         self.count = count
         self._points = points
@@ -93,6 +99,9 @@ class Sweep:
             self._places = np.rint(np.linspace(0, max(0, count - 1), points)).astype(np.intp)
             increment = increment * (count - 1) / (points - 1) or math.radians(1.0)
         time_s = scanner.time_increment_s if scanner is not None else 0.0
+        angles = (angle_min, angle_max, increment)
+        if not all(map(math.isfinite, map(math.degrees, angles))):  # receivers break on NaN
+            raise EncodeError(f"scanner with angles {angles}")
         self.init = write(
             ScannerInit(
                 math.degrees(angle_min),
@@ -143,7 +152,8 @@ class AlfHq(HqSide):
         return HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
 
     def begin(self, session: HqClient, now: float) -> None:
-        known = self.view.scan or self.view.scanner
+        scan = self.view.scan
+        known = scan if scan is not None and len(scan.ranges) else self.view.scanner
         if self._laser and known is not None:
             session.know(self._sweep_of(known).init)
 
@@ -158,9 +168,10 @@ class AlfHq(HqSide):
         return self._info(message) if isinstance(message, Motion) else None
 
     def _sweep_of(self, known: Scan | Scanner) -> Sweep:
-        if self._sweep is None or self._sweep.source != _geometry(known):
-            self._sweep = Sweep(known, self.options.points, self.view.scanner, self._write)
-        return self._sweep
+        sweep, scanner = self._sweep, self.view.scanner
+        if sweep is None or sweep.source != _geometry(known) or sweep.scanner is not scanner:
+            sweep = self._sweep = Sweep(known, self.options.points, scanner, self._write)
+        return sweep
 
     def _measurement(self, scan: Scan) -> Send:
         sweep = self._sweep_of(scan)
@@ -178,7 +189,7 @@ class AlfHq(HqSide):
         turning = motion.gyro or (0.0, 0.0, 0.0)
         a, b, c = (self._measured(value / self._acceleration) for value in (x, 0.0 - y, z))
         d, e, f = (self._measured(value / self._gyro) for value in turning)
-        speed = round(min(1.0, abs(motion.speed or 0.0)) * FULL_INFO)
+        speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
         message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
         return lambda session, now: session.outbox.stand("info", (frame,), now)

@@ -5,6 +5,7 @@ Source: "The gateway as robot", "Translation" and "Settings and version negotiat
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -39,7 +40,7 @@ from gateways.tcpudp.session import RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, PacketId, Scale
 from gateways.tcpudp.versions import LISTED
-from zbridge.errors import ProtocolError
+from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
@@ -77,6 +78,10 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn_full: Scale = 1.0
     length_unit_m: Scale = 0.01
     heading_offset: Angle = math.pi / 2
+
+    def __post_init__(self) -> None:
+        if self.slam_map_size < self.slam_map_interval:
+            raise ValueError("slam_map_size is smaller than slam_map_interval: a map of no cells")
 
 
 class HqClient(RobotSession):
@@ -127,41 +132,46 @@ class TcpUdpHq(HqSide):
         self.quiet_s = options.quiet_s
         self._unit_m = options.length_unit_m
         self._most_side = MOST_SIDE if options.udp else most_side(TCP_BYTES)
+        self._last: dict[str, tuple[FleetMessage, Send | None]] = {}
+        """What was shown last of each path: clients that come or ask later get the same bytes."""
 
     # Clients
 
     def session(self, number: int, bounds: Limits) -> HqClient:
         geometry = self._geometry()
-        settings, left_out = self._settings(geometry)
         bounds = msgspec.structs.replace(bounds, gap_s=self.options.gap_s)
-        session = HqClient(bounds, settings, number, self.options, geometry)
-        session.left_out.update(left_out)
-        return session
+        return HqClient(bounds, self._settings(geometry), number, self.options, geometry)
 
     def begin(self, session: HqClient, now: float) -> None:
+        known = ROBOT_BLOCKS[newest((session.version or "",), known=ROBOT_BLOCKS) or "1.1"]
+        has = self.view.features if self.view.protocol == NAME else None
+        session.left_out.update(f"feature {name}" for name in has or () if not hasattr(known, name))
         for topic, message in ((topics.MAP, self.view.map), (topics.POSE, self.view.pose)):
-            send = self.show(topic, message) if message is not None else None
-            if send is not None:
-                send(session, now)
+            try:
+                send = self.show(topic, message) if message is not None else None
+                if send is not None:
+                    send(session, now)
+            except EncodeError:  # the other one is shown all the same
+                session.left_out[topic.path] += 1
 
     def _geometry(self) -> Geometry:
         if self.view.map is not None and self.view.map.cells.size:
-            return announceable(self.view.map, self._unit_m, self._most_side)
+            with contextlib.suppress(EncodeError):
+                return announceable(self.view.map, self._unit_m, self._most_side)
         size, interval = self.options.slam_map_size, self.options.slam_map_interval
         return Geometry(min(size, self._most_side * interval), interval)
 
-    def _settings(self, geometry: Geometry) -> tuple[Settings, list[str]]:
-        """Announce what the robot has, as far as the newest version listed has a flag for it; list what is left out.
+    def _settings(self, geometry: Geometry) -> Settings:
+        """Announce what the robot has, as far as the newest version listed has a flag for it.
 
         A robot of another protocol can be driven; of one that nobody has seen yet, all is announced.
         """
         has = self._features()
         block = ROBOT_BLOCKS[newest(self.options.versions, known=ROBOT_BLOCKS) or "1.1"]
         flags: dict[str, Any] = {feature.value: feature in has for feature in Feature if hasattr(block, feature.value)}
-        left_out = [f"feature {feature.value}" for feature in has if feature.value not in flags]
         if block is RobotSettings13:
             flags |= {"slam_map_size": geometry.size, "slam_map_interval": geometry.interval}
-        return msgspec.convert({**flags, "udp": self.options.udp}, block), left_out
+        return msgspec.convert({**flags, "udp": self.options.udp}, block)
 
     def _features(self) -> set[Feature]:
         view = self.view
@@ -172,15 +182,23 @@ class TcpUdpHq(HqSide):
         has = {Feature(name) for name in view.features or () if name in _FEATURES}
         if Feature.LIDAR in has and view.version in ("1.1", "1.2"):  # which have no flag of their own for the map
             has.add(Feature.SLAM_MAP)
-        return has - {Feature.UDP}
+        return has
 
     # The robot, shown
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         translate = _SHOWN.get(topic.path)
-        return translate(self, message) if translate is not None else None
+        if translate is None:
+            return None
+        last, send = self._last.get(topic.path, (None, None))
+        if last is not message:
+            send = translate(self, message)
+            self._last[topic.path] = message, send
+        return send
 
     def _pose(self, message: Pose) -> Send:
+        if not math.isfinite(message.x + message.y + message.heading):
+            raise EncodeError(f"position {message.x:g}, {message.y:g}, {message.heading:g}")
         heading_deg = math.degrees(message.heading - self.options.heading_offset)
         return _to_all("pose", ServerPosition(message.x / self._unit_m, message.y / self._unit_m, heading_deg))
 
@@ -275,6 +293,7 @@ class TcpUdpHq(HqSide):
     def _take_text(self, session: HqClient, message: DebugMessage) -> tuple[Telemetry, ...]:
         return ((topics.CMD_TEXT, Text(message.text, sender=session.name)),) if message.text else ()
 
+    @np.errstate(all="ignore")  # absurd numbers are points the scan does not have
     def _take_scan(self, session: HqClient, message: ClientSimulatedLidarData) -> tuple[Telemetry, ...]:
         """Take simulated lidar data: a turn of ranges counter-clockwise from straight ahead, 0 where there is none."""
         count = len(message.ranges)
@@ -321,6 +340,8 @@ def _may_go_by_datagram(packet: Packet) -> bool:
 def _once(packet: Packet) -> Send:
     """Encode a packet once; it is queued, and nothing replaces it."""
     frame = encode_packet(packet, RobotSession.sender_id)
+    if len(frame) > TCP_BYTES:
+        raise EncodeError(f"packet of {len(frame)} bytes, HQ programs take {TCP_BYTES} by TCP")
     packet_id = frame[5]
 
     def send(session: HqClient, now: float) -> None:

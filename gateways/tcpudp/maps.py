@@ -10,6 +10,7 @@ import math
 import msgspec
 import numpy as np
 
+from zbridge.errors import EncodeError
 from zbridge.fleet.messages import Cells, Map
 
 TCP_BYTES = 2199
@@ -18,6 +19,10 @@ UDP_BYTES = 60_000
 """Bytes of the longest packet that passes by UDP."""
 _AROUND = 10
 """Bytes of a map packet that are no cells: header and count."""
+_CELL_M = (1e-6, 1e6)
+"""Sides of a cell, metres, that can be calculated with; whatever is on the bus."""
+_MOST_UNITS = 2**31 - 1
+_OCCUPIED = 2
 
 
 class Geometry(msgspec.Struct, frozen=True):
@@ -38,12 +43,18 @@ def most_side(packet_bytes: int) -> int:
 
 
 def announceable(grid: Map, unit_m: float, most: int) -> Geometry:
-    """Choose what to announce for a map: its own cells where they are whole units and few enough, else larger ones."""
+    """Choose what to announce for a map: its own cells where they are whole units and few enough, else larger ones.
+
+    Raises EncodeError where its cells are of no size that can be announced.
+    """
+    _check(grid)
     extent = max(grid.rows, grid.columns) * grid.cell / unit_m
     interval = max(1, math.ceil(round(grid.cell / unit_m, 6)))
     while math.ceil(round(extent / interval, 6)) > most:
         interval = max(interval + 1, math.ceil(extent / most))
     side = max(1, math.ceil(round(extent / interval, 6)))
+    if side * interval > _MOST_UNITS:
+        raise EncodeError(f"map of {side} x {interval} units")
     return Geometry(side * interval, interval)
 
 
@@ -58,16 +69,25 @@ def resampled(grid: Map, side: int, cell_m: float) -> bytes:
     """Give a map's cells, x-major, on a square grid of other cells that begins where the map does.
 
     A cell is an obstacle where any it covers is, else free where any is, else unknown; so is what lies outside.
+    One that lies across a border counts where it ends. Raises EncodeError where the map's cells are of no size.
     """
     cells: Cells = np.zeros((side, side), np.uint8)
     if grid.cells.size:
+        _check(grid)
         ratio = cell_m / grid.cell
         rows, row_starts = _starts(grid.rows, side, ratio)
         columns, column_starts = _starts(grid.columns, side, ratio)
         covered = grid.cells[:rows, :columns]
+        if covered.size and covered.max() > _OCCUPIED:
+            covered = np.where(covered > _OCCUPIED, np.uint8(0), covered)
         pooled = np.maximum.reduceat(np.maximum.reduceat(covered, row_starts, axis=0), column_starts, axis=1)
         cells[: len(row_starts), : len(column_starts)] = pooled
     return np.ascontiguousarray(cells.T).tobytes()
+
+
+def _check(grid: Map) -> None:
+    if not _CELL_M[0] <= grid.cell <= _CELL_M[1]:
+        raise EncodeError(f"map with cells of {grid.cell:g} m")
 
 
 def _starts(count: int, side: int, ratio: float) -> tuple[int, np.ndarray[tuple[int], np.dtype[np.intp]]]:

@@ -28,6 +28,7 @@ from gateways.tcpudp.messages import (
     decoder,
     encode_packet,
     frame_end,
+    read_header,
 )
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.versions import LISTED, VERSIONS, announced
@@ -351,9 +352,10 @@ class RobotSession(_TcpUdpSession):
 
         Deployed HQ programs of version 1.3 send packets 11, 12 and 61 by UDP whatever was agreed.
         """
-        if len(datagram) < HEADER.size or self.frame_end(datagram, 0) != len(datagram):
+        try:
+            sender_id, packet_id = read_header(datagram)
+        except ProtocolError:
             return False
-        sender_id, packet_id = datagram[4], datagram[5]
         if self._probe.verdict is Verdict.WAITING:
             own = sender_id == self.client_id or sender_id in _NOBODYS_IDS
             return own and packet_id == ClientUDPConnection.spec.id

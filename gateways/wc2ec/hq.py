@@ -6,6 +6,7 @@ Source: "The gateway as Webots controller" and the dialects of the protocol page
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Literal
 
@@ -44,6 +45,7 @@ LEFT, RIGHT = "left", "right"
 """The motors of a robot that has none of its own."""
 _MOST = 1e9
 _NAME_BYTES = 255
+_ESCAPED = re.compile(r"\\x([89a-f][0-9a-f])")
 
 
 class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,6 +121,8 @@ class Wc2EcHq(HqSide):
         self._sessions: list[HqClient] = []
         self._by_name: dict[str, Shown] = {}
         self._by_number: dict[int, Shown] = {}
+        self._registrations: dict[int, bytes] = {}
+        self._unregistered = (metrics or Metrics()).count("hq_devices_left_out")
         self._sectors: dict[str, float] = {}
         self._sectoring: tuple[tuple[float, float, int], list[tuple[str, Any]]] | None = None
         for device in options.devices:
@@ -149,7 +153,8 @@ class Wc2EcHq(HqSide):
     def _values(self) -> dict[str, float]:
         """Give what is known of the devices there are."""
         readings = {name: reading.value for name, reading in self.view.readings.items()}
-        return {name: value for name, value in {**readings, **self._sectors}.items() if name in self._by_name}
+        sectors = self._sectors if self.view.scan is not None else {}  # of this robot, not of one before it
+        return {name: value for name, value in {**readings, **sectors}.items() if name in self._by_name}
 
     # Devices
 
@@ -159,22 +164,33 @@ class Wc2EcHq(HqSide):
             return
         devices = self.view.devices.devices if self.view.devices is not None else None
         for device in devices or ():
-            self._enter(device.name, device.number, device.kind)
+            self._enter(_name(device.name), device.number, device.kind)
         if self.view.protocol != NAME or devices is not None:
-            for reading in self.view.readings:
-                self._enter(reading, None, self.view.readings[reading].kind or DISTANCE)
-            if not any(device.motor for device in self._by_name.values()):
+            for name, reading in self.view.readings.items():
+                self._enter(name, reading.device, reading.kind or DISTANCE)
+            if self._complete and not any(device.motor for device in self._by_name.values()):
                 self._enter(LEFT, None, ROTATIONAL)
                 self._enter(RIGHT, None, ROTATIONAL)
 
+    @property
+    def _complete(self) -> bool:
+        """Whether the table is whole: a Webots robot registers until it is established, motors last maybe."""
+        status = self.view.status
+        return self.view.protocol != NAME or (status is not None and status.state == "established")
+
     def _enter(self, name: str, number: int | None, kind: str) -> None:
-        if name in self._by_name or not 0 < len(_bytes(name)) <= _NAME_BYTES:
+        if name in self._by_name:
             return
         if number is None or number in self._by_number or not 0 <= number < NUMBERS:
             number = next((free for free in range(NUMBERS) if free not in self._by_number), None)
-        if number is not None:
+        if number is None or not 0 < len(_bytes(name)) <= _NAME_BYTES:
+            self._unregistered.value += 1
+        else:
             device = Shown(name, number, 0 if self._draft else self._type(kind), kind)
             self._by_name[name] = self._by_number[number] = device
+            if not self._draft:
+                registration = RegisterSensor(device.type, number, _bytes(name))
+                self._registrations[number] = write(registration, self._dialect)
 
     def _type(self, kind: str) -> int:
         types = {
@@ -183,14 +199,14 @@ class Wc2EcHq(HqSide):
             DISTANCE: self.options.distance_type,
         }
         digits = kind.removeprefix("type")
-        return types.get(kind, int(digits) if digits.isdigit() and int(digits) < 256 else self.options.distance_type)
+        known = digits.isdecimal() and len(digits) <= 3 and int(digits) < 256
+        return types.get(kind, int(digits) if known else self.options.distance_type)
 
     def _register(self, session: HqClient) -> None:
         """Register what the controller does not know yet: each name once, and before any data."""
         new = [device for device in self._by_number.values() if device.number not in session.registered]
         if new and not self._draft:
-            frames = (RegisterSensor(device.type, device.number, _bytes(device.name)) for device in new)
-            session.outbox.put_exempt(b"".join(write(frame, self._dialect) for frame in frames))
+            session.outbox.put_exempt(b"".join(self._registrations[device.number] for device in new))
         session.registered.update(device.number for device in new)
 
     # The robot, shown
@@ -309,10 +325,22 @@ class Wc2EcHq(HqSide):
         return ()
 
     def _change(self, session: HqClient, device: Shown, message: ChangeSensor) -> tuple[Telemetry, ...]:
-        return ((topics.CMD_SENSOR(device.name), SensorSetting(index=message.index, value=message.value)),)
+        return _setting(device, SensorSetting(index=message.index, value=message.value), message.value)
 
     def _configure(self, session: HqClient, device: Shown, message: SetSensor) -> tuple[Telemetry, ...]:
-        return ((topics.CMD_SENSOR(device.name), SensorSetting(values=tuple(message.values.tolist()))),)
+        values = tuple(message.values.tolist())
+        return _setting(device, SensorSetting(values=values), *values)
+
+
+def _setting(device: Shown, setting: SensorSetting, *values: float) -> tuple[Telemetry, ...]:
+    if not all(map(math.isfinite, values)):
+        raise ProtocolError(f"{values} to sensor {device.number}: no numbers")
+    return ((topics.CMD_SENSOR(device.name), setting),)
+
+
+def _name(shown: str) -> str:
+    """Read the name in keys back from how the device table shows it: with bytes that are not UTF-8 escaped."""
+    return _ESCAPED.sub(lambda escaped: chr(0xDC00 + int(escaped[1], 16)), shown)
 
 
 def _bytes(name: str) -> bytes:

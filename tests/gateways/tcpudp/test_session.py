@@ -419,12 +419,20 @@ def test_packets_before_the_settings_of_an_hq_are_malformed() -> None:
     assert session.state is State.HANDSHAKING
 
 
-@pytest.mark.parametrize("sender", [1, 2, 4, 6, 255])
-def test_a_robot_takes_no_packet_of_another_client(sender: int) -> None:
+@pytest.mark.parametrize("sender", [0, 1, 2, 4, 5, 6, 255])
+def test_a_robot_knows_a_client_by_its_connection_and_not_by_the_id_it_writes(sender: int) -> None:
+    """Recorded HQ programs write 1, others 0 until they have read the settings."""
     session = established_robot()
-    assert session.receive(bytes.fromhex("02000000") + bytes([sender, 13]), 0.2) == []
-    assert session.traffic.malformed == 1
+    assert session.receive(bytes.fromhex("02000000") + bytes([sender, 13]), 0.2) == [ClientJoystickStop()]
+    assert session.traffic.malformed == 0
     assert session.state is State.ESTABLISHED
+
+
+@pytest.mark.parametrize("sender", [0, 1, 5, 6])
+def test_a_robot_takes_the_settings_whatever_id_they_carry(sender: int) -> None:
+    session = opened_robot()
+    session.receive(HQ_SETTINGS[:4] + bytes([sender]) + HQ_SETTINGS[5:], 0.1)
+    assert (session.state, session.traffic.malformed) == (State.ESTABLISHED, 0)
 
 
 @pytest.mark.parametrize("packet_id", [2, 4, 6, 31, 51, 53, 55, 60])

@@ -434,7 +434,6 @@ def test_an_hq_that_never_reports_is_established_all_the_same() -> None:
 def test_a_datagram_after_the_refusal_changes_nothing() -> None:
     timed = waiting()
     timed.until(2.15)
-    assert not timed.session.claims(PROBE)
     timed.datagram(PROBE, 2.2)
     timed.stream(STATUS_TRUE, 2.3)
     timed.until(10.0)
@@ -462,20 +461,30 @@ def test_a_second_datagram_is_not_answered_again() -> None:
         PROBE[:-1],
         PROBE + b"\x00",
         bytes.fromhex("03000000 05 05"),
-        bytes.fromhex("01000000 05 05"),
         bytes.fromhex("02000000 06 05"),
-        bytes.fromhex("02000000 01 05"),
+        bytes.fromhex("02000000 ff 05"),
         bytes.fromhex("02000000 05 04"),
+        *(bytes.fromhex(length) + PROBE[4:] for length in ("01000000", "00000000", "ffffffff", "00000080")),
         MOVE,
+        STOP,
     ],
 )
 def test_a_datagram_that_is_no_probe_is_not_claimed(datagram: bytes) -> None:
     assert not waiting().session.claims(datagram)
 
 
-@pytest.mark.parametrize(
-    "datagram", [b"", PROBE[:-1], PROBE + b"\x00", bytes.fromhex("03000000 05 05"), bytes.fromhex("02000000 06 05")]
-)
+@pytest.mark.parametrize("sender", [5, 0, 1])
+def test_a_probe_is_claimed_with_the_id_that_was_given_or_one_that_nobody_has(sender: int) -> None:
+    """Recorded HQ programs write 1, others 0 until they have read the settings."""
+    probe = bytes.fromhex("02000000") + bytes([sender, 5])
+    timed = waiting()
+    assert timed.session.claims(probe)
+    timed.datagram(probe, 0.2)
+    assert timed.frames("udp") == [ANSWER_TRUE]
+    assert timed.session.traffic.malformed == 0
+
+
+@pytest.mark.parametrize("datagram", [b"", PROBE[:-1], PROBE + b"\x00", bytes.fromhex("03000000 05 05")])
 def test_a_probe_that_is_none_is_counted_and_waited_past(datagram: bytes) -> None:
     timed = waiting()
     timed.datagram(datagram, 0.2)
@@ -485,11 +494,39 @@ def test_a_probe_that_is_none_is_counted_and_waited_past(datagram: bytes) -> Non
     assert timed.frames("udp") == [ANSWER_TRUE]
 
 
-def test_a_probe_is_claimed_only_while_it_is_waited_for() -> None:
+def test_nothing_is_claimed_before_the_settings_of_the_hq() -> None:
     before = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
-    assert not before.session.claims(PROBE)
-    assert waiting().session.claims(PROBE)
-    assert not served().session.claims(PROBE)
+    assert not any(before.session.claims(datagram) for datagram in (PROBE, MOVE, ROTATE, STOP))
+
+
+def test_nothing_is_claimed_for_an_hq_that_has_no_datagrams() -> None:
+    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
+    timed.stream(client_settings(block="00000000000100"), 0.1)
+    assert timed.session.state is State.ESTABLISHED
+    assert not any(timed.session.claims(datagram) for datagram in (PROBE, MOVE, ROTATE, STOP))
+
+
+def test_motion_by_datagram_of_an_hq_whose_probe_was_lost_is_claimed_and_taken() -> None:
+    """Deployed HQ programs of 1.3 send 11, 12 and 61 by UDP whatever was agreed."""
+    timed = waiting()
+    timed.until(2.15)
+    timed.stream(STATUS_FALSE, 2.2)
+    assert timed.session.claims(MOVE)
+    assert timed.datagram(MOVE, 2.3) == [ClientJoystickMove(0.0, 1.0, 0.5)]
+    assert timed.session.transport == "tcp", "what it can hear is not known by that"
+
+
+@pytest.mark.parametrize("sender", [0, 1, 4, 6, 255])
+def test_motion_by_datagram_with_another_id_is_nobodys_after_the_probe(sender: int) -> None:
+    timed = waiting()
+    timed.until(2.15)
+    assert not timed.session.claims(MOVE[:4] + bytes([sender]) + MOVE[5:])
+    assert not timed.session.claims(PROBE[:4] + bytes([sender]) + PROBE[5:])
+
+
+@pytest.mark.parametrize("packet_id", [2, 4, 6, 31, 51, 53, 55, 60])
+def test_a_datagram_of_our_own_side_is_never_claimed(packet_id: int) -> None:
+    assert not served().session.claims(bytes.fromhex("02000000 05") + bytes([packet_id]))
 
 
 def test_a_probe_by_tcp_is_refused() -> None:

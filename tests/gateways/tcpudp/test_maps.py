@@ -1,0 +1,228 @@
+"""Maps as HQ programs take them. Expected cells are drawn by hand.
+
+The protocol page: index = x * side + y, 0 unknown, 1 free, 2 obstacle.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from gateways.tcpudp.maps import TCP_BYTES, UDP_BYTES, Geometry, announceable, most_side, resampled, squared
+from zbridge.errors import EncodeError
+from zbridge.fleet.messages import Map
+
+UNIT_M = 0.01
+HEADER = 10
+"""Length, two ids, and the count of the cells."""
+
+
+def drawn(*rows: str, cell: float = 0.1) -> Map:
+    """A map from rows of y (the first is y = 0), a digit for each x."""
+    cells = np.array([[int(digit) for digit in row] for row in rows], np.uint8)
+    return Map(len(rows), len(rows[0]), cell, (0.0, 0.0), cells)
+
+
+def columns(cells: bytes) -> tuple[str, ...]:
+    """What a program draws: for each x its cells from y = 0."""
+    side = math.isqrt(len(cells))
+    assert side * side == len(cells)
+    return tuple("".join(map(str, cells[x * side : (x + 1) * side])) for x in range(side))
+
+
+@st.composite
+def maps(draw: st.DrawFn, most: int = 60) -> Map:
+    shape = (draw(st.integers(1, most)), draw(st.integers(1, most)))
+    cells = draw(arrays.arrays(np.uint8, shape, elements=st.sampled_from([0, 1, 2]), fill=st.just(0)))
+    cell = draw(st.one_of(st.sampled_from([0.01, 0.05, 0.1, 0.015, 1 / 3]), st.floats(0.001, 5.0)))
+    return Map(*shape, cell, (0.0, 0.0), cells)
+
+
+# Squares, for those who were told no size
+
+
+def test_a_square_map_stays_as_it_is_with_columns_for_rows() -> None:
+    assert columns(squared(drawn("012", "120", "201"), 100)) == ("012", "120", "201")
+    assert columns(squared(drawn("01", "22"), 100)) == ("02", "12")
+    assert squared(drawn("2"), 100) == b"\x02"
+
+
+def test_a_map_that_is_no_square_is_filled_with_unknown_cells() -> None:
+    assert columns(squared(drawn("120", "002"), 100)) == ("100", "200", "020")
+    assert columns(squared(drawn("1", "2", "1"), 100)) == ("121", "000", "000")
+
+
+def test_a_map_that_is_too_large_is_pooled_obstacles_first_then_free_cells() -> None:
+    grid = drawn("1100", "1200", "0000", "1001")
+    assert columns(squared(grid, 2)) == ("21", "01")
+    assert columns(squared(grid, 1)) == ("2",)
+    assert columns(squared(drawn("112", "111", "111"), 2)) == ("11", "21")
+
+
+def test_a_long_corridor_is_shown_whole() -> None:
+    assert columns(squared(drawn("1" * 99 + "2"), 10)) == ("1" + "0" * 9,) * 9 + ("2" + "0" * 9,)
+
+
+# Cells of another size
+
+
+def test_cells_of_twice_the_size_hold_four() -> None:
+    assert columns(resampled(drawn("1000", "0000", "0012", "0010"), 2, 0.2)) == ("10", "02")
+
+
+def test_cells_of_half_the_size_repeat_one() -> None:
+    assert columns(resampled(drawn("12", "01", cell=0.2), 4, 0.1)) == ("1100", "1100", "2211", "2211")
+
+
+def test_cells_of_half_as_much_again_lose_no_obstacle() -> None:
+    for x in range(6):
+        for y in range(6):
+            grid = drawn(*("".join("2" if (column, row) == (x, y) else "1" for column in range(6)) for row in range(6)))
+            assert resampled(grid, 4, 0.15).count(2) == 1
+
+
+def test_what_lies_beyond_the_square_is_cut_and_what_lies_beyond_the_map_is_unknown() -> None:
+    assert columns(resampled(drawn("12", "21"), 3, 0.1)) == ("120", "210", "000")
+    assert columns(resampled(drawn("112", "112", "222"), 2, 0.1)) == ("11", "11")
+
+
+def test_a_step_that_is_no_binary_fraction_moves_no_cell() -> None:
+    grid = Map(300, 300, 0.1, (0.0, 0.0), np.arange(90_000, dtype=np.uint32).reshape(300, 300).astype(np.uint8) % 3)
+    assert resampled(grid, 300, 10 * 0.01) == grid.cells.T.tobytes()
+    finer = resampled(grid, 900, 0.1 / 3)
+    assert np.array_equal(np.frombuffer(finer, np.uint8).reshape(900, 900)[::3, ::3], grid.cells.T)
+
+
+def test_an_empty_map_is_unknown_everywhere() -> None:
+    assert resampled(Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), 2, 0.1) == bytes(4)
+
+
+def test_cells_that_are_none_of_the_three_are_unknown_and_hide_no_obstacle() -> None:
+    assert columns(squared(drawn("39", "12"), 2)) == ("01", "02")
+    assert columns(squared(drawn("39", "12"), 1)) == ("2",)
+    grid = Map(1, 1, 0.1, (0.0, 0.0), np.array([[255]], np.uint8))
+    assert squared(grid, 1) == b"\x00"
+
+
+def test_a_map_that_is_read_only_is_taken() -> None:
+    cells = np.frombuffer(bytes((1, 2, 0, 7)), np.uint8).reshape(2, 2)
+    assert columns(squared(Map(2, 2, 0.1, (0.0, 0.0), cells), 2)) == ("10", "20")
+
+
+@pytest.mark.parametrize("cell", [0.0, -1.0, math.nan, math.inf, -math.inf, 5e-324, 1e300])
+def test_cells_of_no_size_are_refused(cell: float) -> None:
+    grid = drawn("12", "01", cell=cell)
+    with pytest.raises(EncodeError):
+        squared(grid, 1)
+    with pytest.raises(EncodeError):
+        resampled(grid, 2, 0.1)
+    with pytest.raises(EncodeError):
+        announceable(grid, UNIT_M, 100)
+
+
+# What is announced
+
+
+@pytest.mark.parametrize(
+    ("grid", "most", "size", "interval"),
+    [
+        (drawn("11", "11"), 244, 20, 10),
+        (drawn("111"), 244, 30, 10),
+        (drawn("1", cell=0.01), 244, 1, 1),
+        (drawn("11", cell=0.07), 244, 14, 7),  # 0.07 / 0.01 is more than 7
+        (drawn("111", cell=0.001), 244, 1, 1),  # smaller than a unit of length
+        (drawn("1111", cell=0.015), 244, 6, 2),  # 6 units in cells of 1.5: cells of 2
+        (drawn("1" * 400), 244, 4012, 17),  # 4000 units in 244 cells at most: 17 units each, 236 of them
+        (drawn("1" * 244), 244, 2440, 10),
+        (drawn("1" * 245), 244, 2453, 11),
+        (drawn("1" * 10), 1, 100, 100),
+    ],
+)
+def test_a_map_is_announced_in_its_own_cells_or_in_larger_ones(grid: Map, most: int, size: int, interval: int) -> None:
+    assert announceable(grid, UNIT_M, most) == Geometry(size, interval)
+
+
+def test_a_map_that_no_int32_measures_is_refused() -> None:
+    with pytest.raises(EncodeError):
+        announceable(drawn("1", cell=1e6), 1e-4, 244)
+    assert announceable(drawn("1", cell=1e6), 1e-3, 244) == Geometry(10**9, 10**9)
+
+
+def test_the_side_of_the_largest_map_fits_its_packet_and_one_more_does_not() -> None:
+    assert (most_side(TCP_BYTES), most_side(UDP_BYTES)) == (46, 244)
+    assert 46 * 46 + HEADER < 2200 <= 47 * 47 + HEADER
+    assert 244 * 244 + HEADER <= 60_000 < 245 * 245 + HEADER
+
+
+# Whatever the map
+
+
+@given(maps(), st.integers(1, 80))
+def test_a_square_fits_and_an_obstacle_never_vanishes(grid: Map, most: int) -> None:
+    cells = squared(grid, most)
+    side = min(most, max(grid.rows, grid.columns))
+    assert len(cells) == side * side
+    assert set(cells) <= {0, 1, 2}
+    assert (2 in cells) == (2 in grid.cells)
+    assert (max(cells) > 0) == bool(grid.cells.any())
+
+
+@given(maps())
+def test_what_fits_comes_back_as_it_was(grid: Map) -> None:
+    side = max(grid.rows, grid.columns)
+    back = np.frombuffer(squared(grid, side), np.uint8).reshape(side, side).T
+    assert np.array_equal(back[: grid.rows, : grid.columns], grid.cells)
+    assert not back[grid.rows :].any()
+    assert not back[:, grid.columns :].any()
+    assert squared(grid, side + 100) == squared(grid, side) == resampled(grid, side, grid.cell)
+
+
+@given(maps(), st.sampled_from([46, 244]), st.sampled_from([0.01, 0.001, 0.1, 1.0]))
+def test_an_announced_map_fits_covers_the_whole_and_keeps_every_obstacle(grid: Map, most: int, unit_m: float) -> None:
+    geometry = announceable(grid, unit_m, most)
+    assert geometry.size == geometry.side * geometry.interval
+    assert 1 <= geometry.side <= most
+    extent = max(grid.rows, grid.columns) * grid.cell
+    assert geometry.size * unit_m >= extent * (1 - 1e-5)
+    assert geometry.interval * unit_m >= grid.cell * (1 - 1e-5)
+    cells = resampled(grid, geometry.side, geometry.interval * unit_m)
+    assert len(cells) == geometry.side**2
+    assert (2 in cells) == (2 in grid.cells)
+    assert (max(cells) > 0) == bool(grid.cells.any())
+
+
+@given(
+    st.integers(1, 40), st.integers(1, 40), st.data(), st.floats(0.01, 1.0), st.integers(1, 50), st.floats(0.01, 1.0)
+)
+@example(3, 3, None, 0.1, 2, 0.15)
+def test_an_obstacle_is_shown_where_it_is(
+    rows: int, columns: int, data: st.DataObject | None, cell: float, side: int, cell_m: float
+) -> None:
+    row = data.draw(st.integers(0, rows - 1)) if data is not None else 1
+    column = data.draw(st.integers(0, columns - 1)) if data is not None else 1
+    cells = np.ones((rows, columns), np.uint8)
+    cells[row, column] = 2
+    shown = np.frombuffer(resampled(Map(rows, columns, cell, (0.0, 0.0), cells), side, cell_m), np.uint8)
+    places = np.argwhere(shown.reshape(side, side) == 2)
+    noise = 1e-5 * max(cell, cell_m)
+    if max(row, column) * cell + cell <= side * cell_m - noise:
+        assert len(places) > 0
+    for x, y in places:
+        assert x * cell_m < (column + 1) * cell + noise
+        assert (x + 1) * cell_m > column * cell - noise
+        assert y * cell_m < (row + 1) * cell + noise
+        assert (y + 1) * cell_m > row * cell - noise
+
+
+@given(maps(20), st.integers(2, 4), st.integers(1, 20))
+def test_cells_of_a_whole_multiple_hold_the_most_of_what_they_cover(grid: Map, factor: int, side: int) -> None:
+    shown = np.frombuffer(resampled(grid, side, grid.cell * factor), np.uint8).reshape(side, side).T
+    for row in range(side):
+        for column in range(side):
+            covered = grid.cells[row * factor : (row + 1) * factor, column * factor : (column + 1) * factor]
+            assert shown[row, column] == (covered.max() if covered.size else 0)

@@ -1,0 +1,816 @@
+"""What external controllers are shown and what they command: bytes of the protocol page, written by hand."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateways.wc2ec import hq as module
+from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq
+from gateways.wc2ec.messages import Dialect as WireDialect
+from gateways.wc2ec.messages import Wc2EcMessage
+from gateways.wc2ec.strict_hq import Reader
+from gateways.wc2ec.translate import DeviceOption, Options, Wc2EcRobot
+from tests.captures import payloads, stream
+from zbridge.errors import ConfigError, ProtocolError
+from zbridge.fleet import payload, topics
+from zbridge.fleet.messages import Device, Devices, Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Status
+from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
+from zbridge.protocol import Telemetry
+from zbridge.session.session import Limits, Role, State
+
+NAN, INF = math.nan, math.inf
+LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)
+CAPTURE, PORT = "wc2ec-deployed.hex", 27515
+DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
+LEFT_RIGHT = bytes.fromhex("00 35 00 04 6c656674") + bytes.fromhex("00 35 01 05 7269676874")
+"""The two motors of a robot without any: devices 0 and 1."""
+CAR = (Device("fl", 0, "rotational"), Device("fr", 1, "rotational"), Device("lift", 4, "linear"))
+CAR += (Device("front", 7, "distance"),)
+CAR_BYTES = (
+    bytes.fromhex("00 35 00 02 666c")
+    + bytes.fromhex("00 35 01 02 6672")
+    + bytes.fromhex("00 2e 04 04 6c696674")
+    + bytes.fromhex("00 25 07 05 66726f6e74")
+)
+RECORDED = (
+    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
+    Device("slider_curb_lf", 4, "linear"),
+    Device("slider_curb_lf2", 5, "linear"),
+    *(
+        Device(name, 6 + at, "distance")
+        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
+    ),
+)
+RECORDED_VALUES = (1000.0, 750.5, 123.456, 0.0, -1.0, 0.001)
+LIGHTS = (DeviceOption("light0", 0), DeviceOption("light1", 9), DeviceOption("sector0", 3, "distance"))
+
+
+class Scene:
+    """One listener, what is known of its robot, and its clients."""
+
+    def __init__(
+        self,
+        protocol: str | None = "wc2ec",
+        devices: Iterable[Device] | None = None,
+        *,
+        clients: int = 1,
+        options: HqOptions | None = None,
+        **more: Any,
+    ) -> None:
+        self.view = RobotView()
+        self.side = Wc2EcHq(options or HqOptions(**more), self.view)
+        self.clients: list[HqClient] = []
+        if devices is not None:
+            self.tell(topics.DEVICES, Devices(tuple(devices)))
+        if protocol is not None:
+            self.established(protocol)
+        for _ in range(clients):
+            self.connect()
+
+    def connect(self) -> HqClient:
+        client = self.side.session(len(self.clients) + 1, LIMITS)
+        client.open(0.0)
+        self.side.begin(client, 0.0)
+        self.clients.append(client)
+        return client
+
+    def established(self, protocol: str) -> None:
+        self.tell(topics.STATUS, Status("established", protocol=protocol))
+
+    def tell(self, topic: Topic, message: FleetMessage) -> None:
+        """Let the robot publish something, which the listener follows or does not."""
+        self.view.note(topic, message)
+        wanted = {topic.path for topic in self.side.wanted()} | {"status"}
+        family = f"{topic.path.rpartition('/')[0]}/*"
+        if not self.clients or not {topic.path, family} & {*self.side.follows, *wanted}:
+            return
+        send = self.side.show(topic, message)
+        for client in self.clients:
+            if send is not None and not client.over:
+                send(client, 0.0)
+
+    def reads(self, name: str, value: float, number: int | None = None, kind: str | None = "distance") -> None:
+        self.tell(topics.SENSOR(name), Reading(value, kind, number))
+
+    def told(self, client: int = 0) -> bytes:
+        """What leaves for a client now."""
+        return b"".join(drained(self.clients[client]))
+
+    def says(self, data: bytes, client: int = 0) -> list[Telemetry]:
+        """What comes of bytes of a client."""
+        session = self.clients[client]
+        return [told for message in session.receive(data, 0.0) for told in self.side.take(session, message)]
+
+
+def drained(client: HqClient, now: float = 0.0) -> list[bytes]:
+    frames = []
+    while (frame := client.outgoing(now)) is not None:
+        frames.append(frame)
+        assert len(frames) < 1000
+    return frames
+
+
+def registration(kind: int, number: int, name: bytes) -> bytes:
+    return bytes((0, kind, number, len(name))) + name
+
+
+def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> bytes:
+    return struct.pack("<BBBd", command, kind, number, value)
+
+
+def light(number: int, value: float) -> bytes:
+    return data(number, value, 0, 0)
+
+
+def set_value(number: int, value: float, kind: int = ROTATIONAL) -> bytes:
+    return struct.pack("<BBBd", 130, kind, number, value)
+
+
+def around(ranges: Iterable[float], *, first_deg: float = 0.0, step_deg: float = 1.0, range_max: float = 10.0) -> Scan:
+    metres = np.array(list(ranges), np.float32)
+    return Scan(math.radians(first_deg), math.radians(step_deg), 0.02, range_max, metres)
+
+
+def draft(protocol: str = "wc2ec", *, clients: int = 1, values: int = 3) -> Scene:
+    return Scene(protocol, clients=clients, options=HqOptions(dialect="draft", devices=LIGHTS, values=values))
+
+
+# Registration
+
+
+def test_a_client_is_told_all_devices_with_the_robots_own_numbers_at_once() -> None:
+    scene = Scene(devices=CAR)
+    assert drained(scene.clients[0]) == [CAR_BYTES], "joined, in one write"
+    assert (scene.clients[0].role, scene.clients[0].state) == (Role.ROBOT, State.ESTABLISHED)
+
+
+def test_the_last_known_values_follow_the_registration() -> None:
+    devices = (*CAR, Device("rear", 9, "distance"), Device("bottom", 8, "distance"))
+    scene = Scene(devices=devices, clients=0)
+    scene.reads("front", 1.5, 7)
+    scene.reads("front", 2.5, 7)
+    scene.reads("rear", -1.0, 9)
+    scene.connect()
+    assert scene.told() == (
+        CAR_BYTES
+        + registration(DISTANCE, 9, b"rear")
+        + registration(DISTANCE, 8, b"bottom")
+        + bytes.fromhex("01 25 07 0000000000000440")
+        + bytes.fromhex("01 25 09 000000000000f0bf")
+    )
+
+
+def test_a_device_is_registered_once_however_often_the_robot_says_it_has_it() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    for stamp in range(3):
+        scene.tell(topics.DEVICES, Devices(CAR, stamp_ns=stamp))
+        scene.established("wc2ec")
+    assert scene.told() == b""
+    scene.reads("front", 0.0, 7)
+    assert scene.told() == data(7, 0.0)
+
+
+def test_a_device_that_appears_later_is_registered_with_everybody_and_before_its_data() -> None:
+    scene = Scene(devices=CAR, clients=2)
+    scene.told(0)
+    scene.told(1)
+    scene.tell(topics.DEVICES, Devices((*CAR, Device("rear", 9, "distance"))))
+    scene.reads("rear", 1.0, 9)
+    scene.connect()
+    new = registration(DISTANCE, 9, b"rear") + data(9, 1.0)
+    assert scene.told(0) == scene.told(1) == new
+    assert scene.told(2) == CAR_BYTES + new
+
+
+def test_data_that_waits_is_overtaken_by_the_registration_of_another_device() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    scene.reads("front", 1.0, 7)
+    scene.tell(topics.DEVICES, Devices((*CAR, Device("rear", 9, "distance"))))
+    scene.reads("rear", 2.0, 9)
+    assert scene.told() == registration(DISTANCE, 9, b"rear") + data(7, 1.0) + data(9, 2.0)
+
+
+def test_a_sensor_that_the_device_table_does_not_name_is_registered_with_its_number() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    scene.reads("distance-200", 3.0, 200)
+    assert scene.told() == registration(DISTANCE, 200, b"distance-200") + data(200, 3.0)
+
+
+def test_a_client_that_came_before_the_robot_is_told_its_devices_when_it_is_there() -> None:
+    scene = Scene(None)
+    assert scene.told() == b""
+    for count in range(1, len(CAR) + 1):
+        scene.tell(topics.DEVICES, Devices(CAR[-count:]))
+    scene.established("wc2ec")
+    assert sorted(registered(scene.told())) == sorted(registered(CAR_BYTES)), "and no left or right"
+
+
+def registered(sent: bytes) -> list[tuple[int, str]]:
+    """Number and name of every registration."""
+    told = Reader("deployed").take(sent)
+    assert not any(one.deadly for one in told)
+    return [(one.number, one.value) for one in told if isinstance(one.value, str)]
+
+
+def test_a_client_that_comes_while_the_robot_is_still_registering_gets_no_motors_in_place_of_its_own() -> None:
+    """A simulation that was started again; its table grows device by device, sensors first."""
+    scene = Scene("wc2ec", clients=0)
+    table = (Device("front", 0, "distance"), Device("rear", 1, "distance"), Device("wheel", 2, "rotational"))
+    scene.tell(topics.STATUS, Status("handshaking", protocol="wc2ec"))
+    scene.tell(topics.DEVICES, Devices(table[:1]))
+    scene.connect()
+    scene.tell(topics.DEVICES, Devices(table[:2]))
+    scene.tell(topics.DEVICES, Devices(table))
+    scene.established("wc2ec")
+    assert registered(scene.told()) == [(0, "front"), (1, "rear"), (2, "wheel")]
+
+
+def test_devices_keep_their_numbers_when_the_robot_comes_back_with_others() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    scene.tell(topics.STATUS, Status("connecting", protocol="wc2ec"))
+    changed = (Device("front", 0, "distance"), Device("fl", 7, "rotational"), Device("new", 1, "distance"))
+    scene.tell(topics.DEVICES, Devices(changed))
+    scene.established("wc2ec")
+    ((number, name),) = registered(scene.told())
+    assert name == "new"
+    assert number not in (0, 1, 4, 7), "those are taken"
+    scene.reads("front", 1.0, 0)
+    assert scene.told() == data(7, 1.0)
+    assert scene.says(set_value(0, 2.0)) == [(topics.CMD_MOTOR("fl"), Motor(2.0))]
+    scene.connect()
+    assert {*registered(scene.told(1))} == {*registered(CAR_BYTES), (number, "new")}
+
+
+def test_the_type_bytes_are_settings() -> None:
+    scene = Scene(devices=CAR, distance_type=38, rotational_type=54, linear_type=47)
+    expected = [(54, 0, b"fl"), (54, 1, b"fr"), (47, 4, b"lift"), (38, 7, b"front")]
+    assert scene.told() == b"".join(registration(*device) for device in expected)
+    scene.reads("front", 1.0, 7)
+    assert scene.told() == data(7, 1.0, 38)
+
+
+@pytest.mark.parametrize(
+    ("kind", "shown"),
+    [("distance", 37), ("type90", 90), ("type255", 255), ("type256", 37), ("light", 37), ("type", 37), ("type²", 37)],
+)
+def test_a_device_of_another_kind_keeps_its_type_byte_where_it_is_known(kind: str, shown: int) -> None:
+    scene = Scene(devices=(*CAR, Device("x", 9, kind)))
+    assert scene.told() == CAR_BYTES + registration(shown, 9, b"x")
+
+
+def test_names_that_are_not_utf_8_reach_controllers_as_the_robot_has_them() -> None:
+    """The table on the bus shows their bytes escaped, the keys hold them: ``caf%E9``."""
+    devices = (
+        Device("caf\\xe9", 0, "distance"),
+        Device("r\\xe4der", 1, "rotational"),
+        Device("gr\u00fcn", 2, "distance"),
+    )
+    scene = Scene(devices=devices, clients=0)
+    scene.connect()
+    scene.reads("caf\udce9", 1.0, 0)
+    scene.reads("gr\u00fcn", 2.0, 2)
+    assert scene.told() == (
+        registration(DISTANCE, 0, b"caf\xe9")
+        + registration(ROTATIONAL, 1, b"r\xe4der")
+        + registration(DISTANCE, 2, b"gr\xc3\xbcn")
+        + data(0, 1.0)
+        + data(2, 2.0)
+    )
+    ((topic, command),) = scene.says(set_value(1, 3.0))
+    assert (topic.path, command) == ("@cmd/motor/r%E4der", Motor(3.0))
+    assert topics.SENSOR("caf\udce9").path == "sensor/caf%E9"
+
+
+def test_255_devices_have_the_numbers_0_to_254_and_one_more_has_none() -> None:
+    devices = [Device(f"d{number}", number, "distance") for number in range(254)]
+    scene = Scene(devices=(*devices, Device("m", 254, "rotational"), Device("late", 255, "distance")))
+    assert registered(scene.told()) == [*((number, f"d{number}") for number in range(254)), (254, "m")]
+    for number in range(254):
+        scene.reads(f"d{number}", number / 2, number)
+    scene.reads("late", 1.0, 255)
+    sent = [struct.unpack("<BBBd", frame) for frame in drained(scene.clients[0])]
+    assert sorted(sent) == [(1, DISTANCE, number, number / 2) for number in range(254)]
+
+
+def test_a_number_beyond_254_is_replaced_while_there_is_a_free_one() -> None:
+    scene = Scene(devices=(Device("m", 255, "rotational"), Device("d", -1, "distance")))
+    assert sorted(registered(scene.told())) == [(0, "m"), (1, "d")]
+
+
+@pytest.mark.parametrize(("name", "fits"), [("n" * 255, True), ("n" * 256, False), ("ü" * 128, False), ("", False)])
+def test_a_name_that_a_registration_cannot_hold_is_not_shown(name: str, fits: bool) -> None:
+    scene = Scene(devices=(*CAR, Device(name, 9, "distance")))
+    assert scene.told() == CAR_BYTES + (registration(DISTANCE, 9, name.encode()) if fits else b"")
+
+
+# Readings
+
+
+def test_a_reading_is_passed_on_as_sensor_data_to_everybody() -> None:
+    scene = Scene(devices=CAR, clients=3)
+    for client in range(3):
+        scene.told(client)
+    scene.reads("front", 123.456, 7)
+    for client in range(3):
+        assert scene.told(client) == bytes.fromhex("01 25 07 77be9f1a2fdd5e40")
+
+
+def test_of_readings_that_wait_the_newest_is_sent() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    for value in range(1000):
+        scene.reads("front", float(value), 7)
+    assert scene.told() == data(7, 999.0)
+    assert drained(scene.clients[0], 1000.0) == [], "and once"
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_a_reading_that_is_no_number_is_not_sent_at_once_nor_later(value: float) -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    scene.reads("front", value, 7)
+    assert scene.told() == b""
+    scene.connect()
+    assert scene.told(1) == CAR_BYTES
+
+
+def test_readings_of_a_robot_of_another_protocol_are_distance_sensors() -> None:
+    scene = Scene("tcpudp", clients=0)
+    scene.tell(topics.SENSOR("battery"), Reading(12.5))
+    scene.connect()
+    sent = scene.told()
+    assert {name for _, name in registered(sent)} == {"left", "right", "battery"}
+    number = {name: number for number, name in registered(sent)}["battery"]
+    assert sent.endswith(data(number, 12.5))
+    scene.tell(topics.SENSOR("battery"), Reading(12.25))
+    assert scene.told() == data(number, 12.25)
+
+
+# A scan, cut into sectors
+
+
+def sectors_of(scene: Scene) -> dict[str, float]:
+    """The values of what was registered as distance sensors, by name."""
+    sent = Reader("deployed").take(scene.told())
+    names = {one.number: one.value for one in sent if isinstance(one.value, str)}
+    return {str(names[one.number]): one.value for one in sent if isinstance(one.value, float)}
+
+
+def test_a_scan_is_cut_into_sectors_counter_clockwise_from_straight_ahead() -> None:
+    """A point a degree, 10 m but for one obstacle in each sector of 45 degrees; sector 0 is -22.5 to 22.5 degrees."""
+    ranges = np.full(360, 10.0)
+    for degree, metres in ((-22, 1.0), (22, 1.5), (23, 2.0), (90, 2.5), (112, 3.0), (180, 4.0), (247, 5.0), (248, 6.0)):
+        ranges[degree % 360] = metres
+    scene = Scene("tcpudp")
+    scene.told()
+    scene.tell(topics.SCAN, around(ranges))
+    assert sectors_of(scene) == {
+        "sector0": 1.0,
+        "sector1": 2.0,
+        "sector2": 2.5,
+        "sector3": 10.0,
+        "sector4": 4.0,
+        "sector5": 5.0,
+        "sector6": 6.0,
+        "sector7": 10.0,
+    }
+
+
+@pytest.mark.parametrize("first_deg", [-180.0, -135.0, 0.0, 90.0, 360.0])
+def test_where_a_scan_begins_does_not_move_its_sectors(first_deg: float) -> None:
+    degrees = first_deg + np.arange(360)
+    ranges = [2.0 if round(degree) % 360 == 90 else 9.0 for degree in degrees]
+    scene = Scene("alf", sectors=4)
+    scene.told()
+    scene.tell(topics.SCAN, around(ranges, first_deg=first_deg))
+    assert sectors_of(scene) == {"sector0": 9.0, "sector1": 2.0, "sector2": 9.0, "sector3": 9.0}
+
+
+def test_a_clockwise_scan_is_cut_alike() -> None:
+    scene = Scene("alf", sectors=4)
+    scene.told()
+    scene.tell(topics.SCAN, around([9.0] * 89 + [9.0, 2.0] + [9.0] * 269, step_deg=-1.0))
+    assert sectors_of(scene) == {"sector0": 9.0, "sector1": 9.0, "sector2": 9.0, "sector3": 2.0}
+
+
+def test_only_sectors_that_the_scan_covers_are_registered() -> None:
+    scene = Scene("alf")
+    scene.told()
+    scene.tell(topics.SCAN, around([1.0] * 91, first_deg=-45.0))
+    assert sectors_of(scene) == {"sector7": 1.0, "sector0": 1.0, "sector1": 1.0}
+
+
+def test_a_sector_where_nothing_was_measured_is_free_as_far_as_the_scanner_sees() -> None:
+    scene = Scene("tcpudp", sectors=2)
+    scene.told()
+    scene.tell(topics.SCAN, around([NAN] * 180 + [INF] * 90 + [3.0] + [NAN] * 89, range_max=5.5))
+    assert sectors_of(scene) == {"sector0": 3.0, "sector1": 5.5}
+    scene.tell(topics.SCAN, around([NAN] * 360, range_max=INF))
+    assert scene.told() == b"", "how far it sees is not known"
+
+
+def test_the_unit_of_sectors_is_a_setting() -> None:
+    scene = Scene("tcpudp", sectors=1, sector_unit_m=0.01)
+    scene.told()
+    scene.tell(topics.SCAN, around([2.5] * 10))
+    assert sectors_of(scene) == {"sector0": 250.0}
+
+
+def test_sectors_are_registered_once_keep_their_numbers_and_go_to_who_comes_later() -> None:
+    scene = Scene("tcpudp", sectors=2)
+    assert scene.told() == LEFT_RIGHT
+    scene.tell(topics.SCAN, around([2.0] * 360))
+    sectors = registration(DISTANCE, 2, b"sector0") + registration(DISTANCE, 3, b"sector1")
+    assert scene.told() == sectors + data(2, 2.0) + data(3, 2.0)
+    scene.tell(topics.SCAN, around([3.0] * 360))
+    assert scene.told() == data(2, 3.0) + data(3, 3.0)
+    scene.connect()
+    assert scene.told(1) == LEFT_RIGHT + sectors + data(2, 3.0) + data(3, 3.0)
+
+
+def test_a_webots_robot_has_its_own_sensors_and_its_scan_is_not_cut() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    scene.tell(topics.SCAN, around([1.0] * 8, step_deg=45.0))
+    assert scene.told() == b""
+
+
+# What controllers set
+
+
+def test_a_motor_of_the_robot_is_set_by_its_name() -> None:
+    scene = Scene(devices=CAR)
+    scene.told()
+    assert scene.says(bytes.fromhex("82 35 01 0000000000000440")) == [(topics.CMD_MOTOR("fr"), Motor(2.5))]
+    assert scene.says(set_value(4, -0.125, LINEAR)) == [(topics.CMD_MOTOR("lift"), Motor(-0.125))]
+    assert scene.says(set_value(0, 0.0, 99)) == [(topics.CMD_MOTOR("fl"), Motor(0.0))], "never by the type alone"
+    assert scene.told() == b""
+
+
+@pytest.mark.parametrize("protocol", ["tcpudp", "alf"])
+def test_a_robot_without_motors_gets_a_left_and_a_right_one(protocol: str) -> None:
+    assert Scene(protocol).told() == LEFT_RIGHT
+
+
+def test_a_webots_robot_whose_table_has_no_motors_gets_them_too_beside_its_own_numbers() -> None:
+    scene = Scene(devices=(Device("front", 0, "distance"),))
+    assert scene.told() == registration(DISTANCE, 0, b"front") + registration(ROTATIONAL, 1, b"left") + registration(
+        ROTATIONAL, 2, b"right"
+    )
+
+
+def test_a_webots_robot_whose_table_is_not_known_yet_gets_none() -> None:
+    assert Scene("wc2ec").told() == b""
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "forward", "turn"),
+    [
+        (10.0, 10.0, 1.0, 0.0),
+        (-5.0, -5.0, -0.5, 0.0),
+        (-3.0, 3.0, 0.0, 1.0),
+        (3.0, -3.0, 0.0, -1.0),
+        (3.5, 6.5, 0.5, 0.5),
+        (0.0, 3.0, 0.15, 0.5),
+        (20.0, 20.0, 1.0, 0.0),
+        (8.0, 16.0, 0.9, 1.0),
+        (-30.0, 30.0, 0.0, 1.0),
+        (1e9, -1e9, 0.0, -1.0),
+        (0.0, 0.0, 0.0, 0.0),
+    ],
+)
+def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(
+    left: float, right: float, forward: float, turn: float
+) -> None:
+    """Wheels of 5 cm, 30 cm apart; full scale is 0.5 m/s and 1 rad/s. Too fast keeps the curve: 1.2, 4/3 is 0.9, 1."""
+    scene = Scene("tcpudp")
+    commands = scene.says(set_value(0, left) + set_value(1, right))
+    assert [topic for topic, _ in commands] == [topics.CMD_DRIVE] * 2
+    command = commands[-1][1]
+    assert isinstance(command, Drive)
+    assert (command.forward, command.turn) == pytest.approx((forward, turn), abs=1e-12)
+    assert (command.left, command.light) == (0.0, None)
+    assert max(abs(command.forward), abs(command.turn)) <= 1.0
+
+
+def test_the_wheels_of_the_kinematics_are_settings() -> None:
+    wheels = module.Wheels(wheel_radius_m=0.1, track_m=0.5, speed_full_m_s=2.0, turn_full_rad_s=4.0)
+    scene = Scene("alf", wheels=wheels)
+    *_, (_, command) = scene.says(set_value(0, 5.0) + set_value(1, 15.0))
+    assert isinstance(command, Drive)
+    assert (command.forward, command.turn) == pytest.approx((0.5, 0.5))
+
+
+def test_every_controller_has_wheels_of_its_own() -> None:
+    scene = Scene("tcpudp", clients=2)
+    scene.says(set_value(0, 3.0), client=0)
+    ((_, command),) = scene.says(set_value(1, 3.0), client=1)
+    assert isinstance(command, Drive)
+    assert (command.forward, command.turn) == pytest.approx((0.15, 0.5))
+
+
+def test_what_is_held_and_for_how_long_is_said_to_the_core() -> None:
+    side = Scene("tcpudp").side
+    assert (side.name, side.hold, side.steers, side.modes) == ("wc2ec", True, False, False)
+    assert Scene("tcpudp", hold=False).side.hold is False
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        set_value(7, 1.0, DISTANCE),
+        set_value(7, 1.0, ROTATIONAL),
+        set_value(9, 1.0),
+        set_value(255, 1.0),
+        set_value(0, NAN),
+        set_value(0, INF),
+        set_value(0, -INF),
+        set_value(0, 1.001e9),
+    ],
+)
+def test_what_no_motor_can_be_set_to_is_refused_and_the_next_command_is_taken(said: bytes) -> None:
+    scene = Scene(devices=CAR)
+    with pytest.raises(ProtocolError):
+        scene.says(said)
+    assert scene.says(set_value(0, 1.0)) == [(topics.CMD_MOTOR("fl"), Motor(1.0))]
+    assert scene.clients[0].state is State.ESTABLISHED
+
+
+@pytest.mark.parametrize("value", [NAN, INF])
+def test_a_wheel_that_is_set_to_no_number_keeps_its_velocity(value: float) -> None:
+    scene = Scene("tcpudp")
+    scene.says(set_value(0, 10.0))
+    with pytest.raises(ProtocolError):
+        scene.says(set_value(0, value))
+    ((_, command),) = scene.says(set_value(1, 10.0))
+    assert command == Drive(forward=1.0)
+
+
+def test_a_motor_of_a_robot_that_has_become_another_one_is_refused() -> None:
+    scene = Scene(devices=CAR)
+    scene.established("tcpudp")
+    with pytest.raises(ProtocolError):
+        scene.says(set_value(0, 1.0))
+
+
+@pytest.mark.parametrize("command", [0, 1, 2, 127, 128, 129, 131, 255])
+def test_a_command_that_no_controller_of_the_field_sends_ends_its_session(command: int) -> None:
+    scene = Scene(devices=CAR)
+    said = set_value(0, 1.0) + bytes((command, 0, 0)) + set_value(0, 2.0)
+    assert scene.says(said) == [(topics.CMD_MOTOR("fl"), Motor(1.0))]
+    assert scene.clients[0].state is State.CLOSED
+
+
+def test_commands_may_be_split_into_their_fields_or_at_every_byte_or_be_joined() -> None:
+    said = set_value(0, 10.0) + set_value(1, 10.0)
+    whole = Scene("tcpudp").says(said)
+    assert [command for _, command in whole][1] == Drive(forward=1.0)
+    cuts = [[1, 1, 1, 8, 1, 1, 1, 8], [1] * 22, *([cut, 22 - cut] for cut in range(1, 22))]
+    for cut in cuts:
+        scene, start = Scene("tcpudp"), 0
+        commands: list[Telemetry] = []
+        for size in cut:
+            commands += scene.says(said[start : start + size])
+            start += size
+        assert commands == whole
+
+
+# The draft
+
+
+def test_controllers_of_the_draft_are_registered_nothing_and_told_what_they_enabled() -> None:
+    scene = draft(clients=2)
+    assert scene.told(0) == b""
+    assert scene.side.wanted() == ()
+    assert scene.says(bytes.fromhex("80 00 09")) == []
+    assert [topic.path for topic in scene.side.wanted()] == ["sensor/light1"]
+    scene.reads("light0", 0.5, 0, "light")
+    scene.reads("light1", 1.5, 9, "light")
+    assert scene.told(0) == bytes.fromhex("00 00 09 000000000000f83f")
+    assert scene.told(1) == b""
+
+
+def test_what_anybody_wants_is_wanted_until_nobody_does() -> None:
+    scene = draft(clients=2)
+    scene.says(bytes.fromhex("80 00 09"), client=0)
+    scene.says(bytes.fromhex("80 00 09 80 00 00"), client=1)
+    assert [topic.path for topic in scene.side.wanted()] == ["sensor/light0", "sensor/light1"]
+    scene.says(bytes.fromhex("81 00 09"), client=0)
+    assert [topic.path for topic in scene.side.wanted()] == ["sensor/light0", "sensor/light1"]
+    scene.clients[1].lost("EOF")
+    assert scene.side.wanted() == ()
+
+
+def test_a_sensor_that_was_disabled_sends_nothing_not_even_what_waited() -> None:
+    scene = draft()
+    scene.says(bytes.fromhex("80 00 09 80 00 00"))
+    scene.reads("light1", 1.0, 9, "light")
+    assert scene.says(bytes.fromhex("81 00 09")) == []
+    scene.reads("light1", 2.0, 9, "light")
+    scene.reads("light0", 3.0, 0, "light")
+    assert scene.told() == light(0, 3.0)
+
+
+def test_settings_of_sensors_are_passed_on() -> None:
+    scene = draft(values=3)
+    assert scene.says(bytes.fromhex("82 00 09 02 000000000000f83f")) == [
+        (topics.CMD_SENSOR("light1"), SensorSetting(index=2, value=1.5))
+    ]
+    said = bytes.fromhex("83 00 00") + struct.pack("<3d", 1.0, -2.0, 0.5)
+    assert scene.says(said) == [(topics.CMD_SENSOR("light0"), SensorSetting(values=(1.0, -2.0, 0.5)))]
+    for cut in range(1, len(said)):
+        split = draft(values=3)
+        assert len(split.says(said[:cut]) + split.says(said[cut:])) == 1
+
+
+@pytest.mark.parametrize("values", [0, 1, 255])
+def test_how_many_values_a_sensor_has_is_a_setting(values: int) -> None:
+    scene = draft(values=values)
+    said = bytes.fromhex("83 00 00") + struct.pack(f"<{values}d", *range(values))
+    expected = SensorSetting(values=tuple(map(float, range(values))))
+    assert scene.says(said + said) == [(topics.CMD_SENSOR("light0"), expected)] * 2
+
+
+@pytest.mark.parametrize("command", [0, 1, 127, 132, 255])
+def test_a_command_that_the_draft_does_not_have_ends_its_session(command: int) -> None:
+    scene = draft()
+    assert scene.says(bytes((command, 0, 0)) + bytes(8)) == []
+    assert scene.clients[0].state is State.CLOSED
+
+
+@pytest.mark.parametrize("command", ["80 00 05", "81 00 05", "82 00 05 00 0000000000000000"])
+def test_a_sensor_that_is_not_configured_is_refused(command: str) -> None:
+    scene = draft()
+    with pytest.raises(ProtocolError):
+        scene.says(bytes.fromhex(command))
+    assert scene.side.wanted() == ()
+
+
+def test_a_configured_sector_of_a_scan_is_sent_to_who_enabled_it() -> None:
+    scene = draft("alf")
+    scene.says(bytes.fromhex("80 00 03"))
+    scene.tell(topics.SCAN, around([4.0] * 360))
+    assert scene.told() == light(3, 4.0)
+    for number in {*range(256)} - {0, 3, 9}:
+        with pytest.raises(ProtocolError):
+            scene.says(bytes((0x80, 0, number)))
+
+
+def test_the_draft_must_have_its_devices_listed_each_once() -> None:
+    for options in (
+        {"dialect": "draft"},
+        {"devices": LIGHTS},
+        {"dialect": "draft", "devices": (DeviceOption("a", 0), DeviceOption("b", 0))},
+        {"dialect": "draft", "devices": (DeviceOption("a", 0), DeviceOption("a", 1))},
+    ):
+        with pytest.raises(ConfigError):
+            HqOptions(**options)
+
+
+# Many clients
+
+
+def test_a_message_is_encoded_once_however_many_clients_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    write, encoded = module.write, []
+
+    def counting(message: Wc2EcMessage, dialect: WireDialect) -> bytes:
+        encoded.append(message)
+        return write(message, dialect)
+
+    monkeypatch.setattr(module, "write", counting)
+    scene = Scene(devices=CAR, clients=250)
+    assert len(encoded) == len(CAR)
+    scene.tell(topics.DEVICES, Devices((*CAR, Device("rear", 9, "distance"))))
+    assert len(encoded) == len(CAR) + 1
+    for value in range(10):
+        scene.reads("front", float(value), 7)
+    assert len(encoded) == len(CAR) + 1 + 10
+    first = scene.told(0)
+    assert all(scene.told(client) == first for client in range(1, 250))
+
+    encoded.clear()
+    scene = Scene("tcpudp", clients=250, sectors=8)
+    for metres in range(1, 11):
+        scene.tell(topics.SCAN, around([float(metres)] * 360))
+    assert len(encoded) == 2 + 8 + 10 * 8
+
+
+# Nothing deployed controllers break on
+
+names = st.sampled_from(["a", "b", "left", "right", "sector0", "caf\udce9", "x" * 300, ""]) | st.text(
+    st.characters(codec="utf-8"), max_size=3
+)
+shown_names = names.map(lambda name: name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace"))
+kinds = st.sampled_from(["distance", "rotational", "linear", "light", "type7", "type999"])
+tables = st.lists(st.builds(Device, shown_names, st.integers(-1, 256), kinds), max_size=6)
+readings = st.builds(Reading, st.floats(), st.none() | kinds, st.none() | st.integers(-1, 300))
+sweeps = st.builds(
+    around, st.lists(st.floats(width=32), max_size=12), first_deg=st.floats(-400, 400), step_deg=st.floats(-90, 90)
+)
+published = st.one_of(
+    st.tuples(st.just(topics.DEVICES), tables.map(lambda table: Devices(tuple(table)))),
+    st.tuples(names.map(topics.SENSOR), readings),
+    st.tuples(st.just(topics.SCAN), sweeps),
+    st.tuples(
+        st.just(topics.STATUS),
+        st.sampled_from(["wc2ec", "tcpudp", "alf"]).map(lambda protocol: Status("established", protocol=protocol)),
+    ),
+)
+
+
+@given(history=st.lists(published | st.just(None), max_size=12))
+def test_whatever_is_on_the_bus_each_name_and_number_is_registered_once_and_before_its_data(
+    history: list[tuple[Topic, FleetMessage] | None],
+) -> None:
+    scene = Scene(None)
+    readers = [Reader("deployed")]
+    known: list[dict[int, tuple[int, str]]] = [{}]
+    for event in history:
+        if event is None:
+            scene.connect()
+            readers.append(Reader("deployed"))
+            known.append({})
+        else:
+            scene.tell(*event)
+        for at, reader in enumerate(readers):
+            for told in reader.take(scene.told(at)):
+                assert not told.deadly
+                if isinstance(told.value, str):
+                    name = told.raw[4:].decode("latin-1")
+                    assert name
+                    assert told.number not in known[at]
+                    assert told.number < 255
+                    assert name not in {seen for _, seen in known[at].values()}
+                    known[at][told.number] = (told.node_type, name)
+                else:
+                    assert known[at][told.number][0] == told.node_type
+                    assert math.isfinite(told.value or 0.0)
+            assert reader.rest == b""
+    assert all(devices == known[0] for devices in known) or None in history
+
+
+# The recording
+
+
+def test_the_recorded_robot_is_shown_byte_for_byte_as_it_showed_itself() -> None:
+    scene = Scene(devices=RECORDED)
+    written = scene.told()
+    assert written == stream(CAPTURE, source=PORT)[: len(written)]
+    assert len(written) == 4 * 10 + 108
+    names = [device.name for device in RECORDED[6:]]
+    for number in range(121):
+        scene.reads(names[number % 6], RECORDED_VALUES[number % 6], 6 + number % 6)
+        written += scene.told()
+    assert written == stream(CAPTURE, source=PORT)
+
+
+def test_the_recorded_controller_says_nothing_and_so_commands_nothing() -> None:
+    scene = Scene(devices=RECORDED, clients=0)
+    for name, value in zip((device.name for device in RECORDED[6:]), RECORDED_VALUES, strict=True):
+        scene.reads(name, value)
+    client = scene.connect()
+    assert payloads(CAPTURE, destination=PORT) == []
+    assert scene.says(b"") == []
+    assert scene.told() == stream(CAPTURE, source=PORT)[: 148 + 6 * 11]
+    client.lost("EOF")
+    assert (client.state, client.traffic.malformed) == (State.CLOSED, 0)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        stream(CAPTURE, source=PORT),
+        registration(ROTATIONAL, 3, b"r\xe4der") + registration(DISTANCE, 200, b"caf\xe9/\\") + data(200, 0.25),
+        registration(DISTANCE, 0, b"a") + registration(LINEAR, 1, b"a") + data(0, 5e-324) + data(0, 1.7e308),
+    ],
+    ids=["recorded", "not UTF-8", "a name twice"],
+)
+def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_was(sent: bytes) -> None:
+    robot, scene = Wc2EcRobot(Options()), Scene(None)
+    session = robot.session(0, "tcp://robot.test:1")
+    session.open(0.0)
+    written = b""
+    for message in session.receive(sent, 0.0):
+        for topic, telemetry in robot.telemetry(message, 0):
+            if isinstance(telemetry, Reading) and scene.view.protocol is None:
+                scene.established("wc2ec")
+            scene.tell(topic, payload.decode(topic.message, payload.encode(telemetry)))
+        written += scene.told()
+    assert written == sent.replace(b"\x00\x2e\x01\x01a", b"\x00\x2e\x01\x03a#1")
+    motor = next(one.number for one in Reader("deployed").take(sent) if one.node_type in (ROTATIONAL, LINEAR))
+    ((topic, command),) = scene.says(set_value(motor, 0.5))
+    robot.command(topic, command, 0.0)
+    assert (session.outgoing(0.0) or b"")[2:] == set_value(motor, 0.5)[2:]

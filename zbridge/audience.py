@@ -90,7 +90,7 @@ class Audience:
             log.debug("%s: %s", sample.key, error)
             return
         self.view.note(topic, message)
-        for follower in followers:
+        for follower in tuple(followers):
             follower(topic, message)
 
     def _topic(self, key: str) -> Topic | None:
@@ -101,5 +101,7 @@ class Audience:
 
     def _on_gateway(self, key: str, alive: bool) -> None:
         self.view.alive = alive
+        if not alive:
+            self.view.status = None  # what it said last is nothing its successor says
         for tell in self._gateway:
             tell(alive)

@@ -289,12 +289,14 @@ class Listener:
                 client.helm.gateway_lost()
 
     def _tell_of_robot(self) -> None:
-        """Say that the robot is gone, or there again."""
+        """Say that the robot is gone, or there again, however soon that comes again."""
         missing = self._audience.view.missing
-        if missing != self._missing:
-            self._missing = missing
+        if (missing is None) is not (self._missing is None):
+            text = missing or "the robot is there"
             for client in tuple(self.clients.values()):
-                self._tell(client, missing or "the robot is there")
+                client.told.pop(text, None)
+                self._tell(client, text)
+        self._missing = missing
 
     def _send(self, client: Client, send: Send) -> None:
         """Let a client have something, as far as its queue takes it."""

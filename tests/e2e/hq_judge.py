@@ -1,0 +1,389 @@
+"""HQ programs of every protocol and version at once at one robot, all of them strict judges, and so is the robot.
+
+    python -m tests.e2e.hq_judge --seconds 60                # every robot: each drives, then one for a minute
+    python -m tests.e2e.hq_judge --robot alf --driver ec --seconds 10
+
+Each program has its listener. All must see what the robot has; one after the other drives, while the others idle
+beside it as deployed programs do, sending neutral; then one drives to and fro for as long as is said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gateways.alf.strict_hq import StrictHq as AlfHq
+from gateways.alf.strict_parser import Dialect
+from gateways.tcpudp.strict_hq import StrictHq as TcpHq
+from gateways.tcpudp.strict_parser import Feature
+from gateways.wc2ec.strict_hq import StrictController
+from tests.e2e.conftest import Bench
+from tests.e2e.hq_robot import ROBOTS, strict_robot
+from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener, playing, ports, soon
+
+LEASE_S = 1.2
+"""Seconds of neutral after which a robot is given back: short, so that the next program may have it soon."""
+IDLE_S = 0.3
+"""Seconds between two neutrals of an external controller that idles."""
+EXCUSED = 2
+"""Violations at most that are put down to the judge's own process, which was late."""
+RANGES = tuple(120.0 + degree / 2 for degree in range(360))
+"""Simulated lidar data: centimetres, one a degree."""
+ALF_FULL = {"text": 255, "binary": 100}
+_BEARINGS = ", ".join(f"ds{number} = {45.0 * number}" for number in range(8))
+_TABLES = ", ".join(f"ds{number} = [[0.0, 0.0], [1000.0, 2.0]]" for number in range(8))
+WEBOTS = f"scan_range_m = [0.0, 2.0]\nbearings_deg = {{ {_BEARINGS} }}\ntables = {{ {_TABLES} }}\n{WHEELS}"
+
+
+class Tcp:
+    """A TCP/UDP program of one version, on a listener of its own."""
+
+    def __init__(self, version: str, *, udp: bool) -> None:
+        self.name = f"tcp{version}"
+        self.judge = TcpHq(version=version, udp=udp, lidar_sim=version != "1.1")
+        self.protocol = "tcpudp"
+        self.options = f'options = {{ versions = ["{version}"] }}' if version != "1.3" else ""
+
+    @property
+    def number(self) -> int:
+        return self.judge.client_id
+
+    @property
+    def ready(self) -> bool:
+        return self.judge.established.is_set()
+
+    async def drive(self, forward: float) -> None:
+        self.judge.mode(2)  # joystick
+        self.judge.move(0.0, 1.0 if forward > 0 else -1.0, abs(forward))
+
+    async def idle(self) -> None:
+        self.judge.idle()
+
+    async def release(self) -> None:
+        self.judge.mode(1)  # none
+
+    def sees(self, robot: str) -> bool:
+        """Position and map where the robot has them; of another robot, that it can be driven."""
+        judge = self.judge
+        if robot.startswith("tcpudp"):
+            return judge.position is not None and bool(judge.map)
+        return judge.settings is not None and judge.settings.features >= {Feature.JOYSTICK}
+
+    async def leave(self) -> None:
+        """Stay: the gateway ends first."""
+
+
+class Alf:
+    """A program of ALF in one dialect."""
+
+    protocol = "alf"
+    number = 1
+
+    def __init__(self, dialect: Dialect) -> None:
+        self.name = f"alf-{dialect}"
+        self.judge = AlfHq(dialect=dialect)
+        self.options = f'options = {{ dialect = "{dialect}" }}'
+        self._full = ALF_FULL[dialect]
+
+    @property
+    def ready(self) -> bool:
+        return self.judge.connected.is_set()
+
+    async def drive(self, forward: float) -> None:
+        self.judge.drive(round(abs(forward) * self._full), int(forward < 0))
+
+    async def idle(self) -> None:
+        self.judge.idle()
+
+    async def release(self) -> None:
+        """Do nothing: there is no word for it."""
+
+    def sees(self, robot: str) -> bool:
+        """Measurements where there is any scan, drive info of a vehicle."""
+        judge = self.judge
+        if robot == "tcpudp-1.1":  # has no scan, nor can be fed with one
+            return True
+        return judge.scanner is not None and judge.scans > 0 and (robot != "alf" or bool(judge.infos))
+
+    async def leave(self) -> None:
+        """Say END first in one dialect; in the other the gateway does."""
+        if self.judge.dialect == "binary":
+            await self.judge.end()
+
+
+class Ec:
+    """An external controller that drives the wheels, and sets them to 0 again and again while it idles."""
+
+    protocol = "wc2ec"
+    number = 1
+    name = "ec"
+    options = ""
+
+    def __init__(self) -> None:
+        self.judge = StrictController(split=True)
+        self._forward = 0.0
+
+    @property
+    def ready(self) -> bool:
+        return len(self._wheels) == 2
+
+    @property
+    def _wheels(self) -> list[str]:
+        return [name for name in self.judge.motors if "left" in name or "right" in name]
+
+    async def drive(self, forward: float) -> None:
+        """Set both wheels once, it holds: 10 rad/s are full scale of the robots here."""
+        self._forward = forward
+        for name in self._wheels:
+            await self.judge.set(name, 10.0 * forward)
+
+    async def idle(self) -> None:
+        await self.drive(0.0)
+
+    async def keep_idle(self) -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                if not self._forward:
+                    await self.drive(0.0)
+                await asyncio.sleep(IDLE_S)
+
+    async def release(self) -> None:
+        """Do nothing: there is no word for it."""
+
+    def sees(self, robot: str) -> bool:
+        """The robot's own devices, else sectors of whatever scan there is."""
+        names = {name: number for number, (_, name) in self.judge.devices.items()}
+        if robot == "wc2ec":
+            sensors = {f"ds{number}" for number in range(8)}
+            expected = sensors | {"left wheel motor", "right wheel motor", "lift"}
+        else:
+            sensors = {name for name in names if name.startswith("sector")}
+            expected = sensors | {"left", "right"}
+            if len(sensors) < (0 if robot == "tcpudp-1.1" else 6):
+                return False
+        return names.keys() == expected and all(names[sensor] in self.judge.values for sensor in sensors)
+
+    async def leave(self) -> None:
+        """Stay: the gateway ends first."""
+
+
+Program = Tcp | Alf | Ec
+DRIVES = {"tcp1.1": 0.4, "alf-text": -0.4, "tcp1.2": 0.6, "alf-binary": -0.6, "tcp1.3": 0.8, "ec": -0.8}
+"""Who drives, and at what fraction of full scale; each at its own, so that the robot can tell them apart."""
+
+
+@dataclass
+class Judgement:
+    """What came of one robot."""
+
+    robot: str
+    drove: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    faults: list[str] = field(default_factory=list)
+    excused: list[str] = field(default_factory=list)
+    received: dict[str, int] = field(default_factory=dict)
+    """Messages that each program got."""
+
+    @property
+    def clean(self) -> bool:
+        """Whether nobody has anything to complain of."""
+        return not self.faults and len(self.excused) <= EXCUSED
+
+    def __str__(self) -> str:
+        return (
+            f"{self.robot}: {', '.join(self.drove)} drove, {self.seconds:.0f} s, received {self.received}, "
+            f"{len(self.faults)} faults, {len(self.excused)} excused (the judge's process was late)"
+        )
+
+    def hold_against(self, who: str, violations: Iterable[str]) -> None:
+        """Take note of violations; of those by the judge's own lateness apart."""
+        for text in violations:
+            (self.excused if "(this process" in text else self.faults).append(f"{who}: {text}")
+
+
+class Stage:
+    """One robot, its gateway, and all programs connected."""
+
+    def __init__(self, robot: str, bench: Bench, gateway: Gateway, programs: list[Program]) -> None:
+        self.robot, self.bench, self.gateway, self.programs = robot, bench, gateway, programs
+        self._fed = 0
+
+    def program(self, name: str) -> Program:
+        return next(program for program in self.programs if program.name == name)
+
+    @property
+    def control(self) -> dict[str, Any]:
+        return self.bench.fleet.last("r1/control")
+
+    async def all_see(self) -> None:
+        """Wait until each sees what the robot has; feed the robot with lidar data where it asks."""
+
+        def blind() -> list[str]:
+            feeder = self.program("tcp1.3").judge
+            assert isinstance(feeder, TcpHq)
+            if feeder.counts[60] > self._fed:
+                self._fed = feeder.counts[60]
+                feeder.feed(RANGES)
+            return [program.name for program in self.programs if not program.sees(self.robot)]
+
+        try:
+            await soon(lambda: not blind(), "all see the robot")
+        except AssertionError as error:
+            raise AssertionError(f"{error}: {blind()} do not") from error
+
+    async def drive(self, name: str, forward: float) -> None:
+        """Let one program drive, once the robot is nobody's, until it has moved as commanded; then idle."""
+        program = self.program(name)
+        await self._free()
+        before = dict(self.bench.fleet.last("r1/pose")), self._readings()
+        await program.drive(forward)
+        await soon(lambda: self._moved(before, forward), f"{name} moves {self.robot}")
+        self._check_holder(program)
+        await program.idle()
+        await soon(lambda: self._idle(), f"{name} lets go of {self.robot}")
+        await program.release()
+
+    async def drive_on(self, name: str, seconds: float) -> None:
+        """Let one program drive to and fro, while the others idle beside it."""
+        await self._free()
+        program, until = self.program(name), time.monotonic() + seconds
+        forward = DRIVES[name]
+        while time.monotonic() < until:
+            before = dict(self.bench.fleet.last("r1/pose")), self._readings()
+            await program.drive(forward)
+            await soon(lambda before=before, forward=forward: self._moved(before, forward), "motion")  # type: ignore[misc]
+            await asyncio.sleep(0.3)
+            self._check_holder(program)
+            forward = -forward
+        await program.idle()
+
+    async def _free(self) -> None:
+        await soon(lambda: self.control.get("state") == "free", f"{self.robot} is given back")
+
+    def _check_holder(self, program: Program) -> None:
+        expected = f"hq.{program.name}.{program.number}"
+        assert (self.control["state"], self.control["holder"]) == ("held", expected), self.control
+
+    def _readings(self) -> list[float]:
+        return [self.bench.fleet.last(f"r1/sensor/ds{number}").get("value", 0.0) for number in range(8)]
+
+    def _moved(self, before: tuple[dict[str, Any], list[float]], forward: float) -> bool:
+        """Tell by what the robot says whether it moved in this direction, or with Webots at all."""
+        fleet = self.bench.fleet
+        if self.robot == "alf":
+            return bool((fleet.last("r1/motion").get("speed") or 0.0) * forward > 0.0)
+        if self.robot == "wc2ec":
+            return any(abs(now - then) > 0.03 for now, then in zip(self._readings(), before[1], strict=True))
+        pose = fleet.last("r1/pose")  # the strict robot looks along x
+        return bool((pose["x"] - before[0]["x"]) * forward > 0.03)
+
+    def _idle(self) -> bool:
+        """Whether the driver's neutral has had its effect, as far as the bus shows it."""
+        return self.robot != "alf" or self.bench.fleet.last("r1/motion").get("speed") == 0.0
+
+
+@contextlib.asynccontextmanager
+async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = "") -> AsyncIterator[Stage]:
+    """Start a gateway with a listener for each program, and connect them all; ``more``: of its configuration."""
+    assert robot_process.stdout is not None
+    programs: list[Program] = [
+        *(Tcp("1.1", udp=False), Tcp("1.2", udp=True), Tcp("1.3", udp=True)),
+        *(Alf("text"), Alf("binary"), Ec()),
+    ]
+    protocol = robot.partition("-")[0]
+    at = dict(zip((program.name for program in programs), ports(len(programs)), strict=True))
+    with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder), stack)
+        parts = [listener(one.name, one.protocol, at[one.name], one.options) for one in programs]
+        options = WEBOTS if protocol == "wc2ec" else ""
+        parts.append(device(protocol, int(robot_process.stdout.readline()), options))
+        process = gateway(bench, stack, *parts, more, lease_s=LEASE_S)
+        await soon(lambda: process.listens(len(programs)), "listeners")
+        await soon(lambda: bench.fleet.state("r1") == "established", "established")
+        async with playing(*(program.judge.run(HOST, at[program.name]) for program in programs)):
+            await soon(lambda: all(program.ready for program in programs), "all connected")
+            ec = programs[-1]
+            assert isinstance(ec, Ec)
+            async with playing(ec.keep_idle()):
+                yield Stage(robot, bench, process, programs)
+                for program in programs:
+                    await program.leave()
+            process.end()
+            await asyncio.sleep(0.1)  # what a gateway says last is heard
+
+
+async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds: float = 0.0) -> Judgement:
+    """Judge one robot: let each of ``drivers`` drive a moment, then ``driver`` for a time."""
+    judgement = Judgement(robot, [*drivers])
+    began = time.monotonic()
+    with strict_robot(robot) as process:
+        async with stage(robot, process) as on:
+            await on.all_see()
+            for name in judgement.drove:
+                await on.drive(name, DRIVES[name])
+            if seconds:
+                await on.drive_on(driver, seconds)
+                judgement.drove.append(f"{driver} for {seconds:g} s")
+        report = json.loads((await asyncio.to_thread(process.communicate, "end\n", 20))[0])
+    judgement.seconds = time.monotonic() - began
+    judgement.hold_against("robot", report["violations"])
+    if not report["alive"]:
+        judgement.faults.append("the robot died")
+    for program in on.programs:
+        judgement.hold_against(program.name, program.judge.violations)
+        judgement.received[program.name] = len(program.judge.received)
+        if not program.judge.alive:
+            judgement.faults.append(f"{program.name} died")
+    commanded = {round(forward, 3) for row in report["received"] if (forward := _forward(robot, row)) is not None}
+    judgement.faults += [
+        f"the robot was never told to drive at {DRIVES[name]:g}, as {name} wanted; it was at {sorted(commanded)}"
+        for name in drivers
+        if DRIVES[name] not in commanded
+    ]
+    return judgement
+
+
+def _forward(robot: str, row: list[Any]) -> float | None:
+    """Give the fraction of full scale that the robot was commanded to drive forward, None for other commands."""
+    if robot == "alf":  # 3: speed in percent, direction, steering, light
+        _, kind, fields = row
+        return (-1 if fields[1] else 1) * fields[0] / 100 if kind == 3 else None
+    if robot == "wc2ec":  # 130: the velocity of the left wheel
+        _, command, _, number, value = row
+        return float(value) / 10 if (command, number) == (130, 8) else None
+    _, _, kind, body = row  # 11: x, y, speed
+    if kind != 11:
+        return None
+    _, y, speed = struct.unpack("<3f", bytes.fromhex(body))
+    return float(y * speed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--robot", choices=ROBOTS)
+    parser.add_argument("--driver", choices=DRIVES, default="tcp1.3", help="who drives all the time")
+    wanted = parser.parse_args()
+    failed = False
+    for robot in [wanted.robot] if wanted.robot else ROBOTS:
+        judgement = asyncio.run(judge(robot, DRIVES, driver=wanted.driver, seconds=wanted.seconds))
+        print(judgement, flush=True)
+        for line in [*judgement.faults[:10], *judgement.excused[:10]]:
+            print("   ", line)
+        failed = failed or not judgement.clean
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    main()

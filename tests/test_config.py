@@ -4,8 +4,10 @@ import math
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
+from zbridge import config
 from zbridge.config import Plan, load, plan
 from zbridge.errors import ConfigError
 from zbridge.link import Address
@@ -30,6 +32,15 @@ def minimal(**tables: Any) -> dict[str, Any]:
 
 def device(**fields: Any) -> dict[str, Any]:
     return minimal(device={"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:11001"], **fields})
+
+
+def serving(*listeners: dict[str, Any], **tables: Any) -> dict[str, Any]:
+    """A process that only serves HQ programs."""
+    return {"robot": {"name": "r1"}, "hq": list(listeners), **tables}
+
+
+def hq(**fields: Any) -> dict[str, Any]:
+    return {"protocol": "tcpudp", "listen": "tcp://127.0.0.1:11002", **fields}
 
 
 def loaded(folder: Path, text: str, **environment: str) -> Plan:
@@ -97,6 +108,71 @@ listen = "127.0.0.1:9100"
     assert made.metrics == Address("127.0.0.1", 9100)
 
 
+def test_a_process_may_only_serve_hq_programs(tmp_path: Path) -> None:
+    made = loaded(
+        tmp_path,
+        """
+[robot]
+name = "r1"
+[[hq]]
+protocol = "alf"
+listen = "tcp://127.0.0.1:11002"
+""",
+    )
+    assert made.device is None
+    (listener,) = made.listeners
+    assert listener.protocol.name == "alf"
+    assert listener.address == Address("127.0.0.1", 11002)
+    assert listener.options == listener.protocol.hq_options()
+    assert listener.allow == ()
+    settings = listener.settings
+    assert (settings.name, settings.clients, settings.rate_hz) == (None, 256, 1000.0)
+    assert (settings.handshake_s, settings.idle_s) == (5.0, None)
+
+
+def test_every_key_of_a_listener_is_read(tmp_path: Path) -> None:
+    made = loaded(
+        tmp_path,
+        MINIMAL
+        + """
+[[hq]]
+protocol = "tcpudp"
+listen = "tcp://[::1]:0"
+name = "ground.1"
+clients = 3
+handshake_s = 1.5
+idle_s = 60
+rate_hz = 200
+allow = ["10.0.0.0/8", "192.168.1.7", "fd00::/8"]
+options = { versions = ["1.1"], quiet_s = 0 }
+[[hq]]
+protocol = "wc2ec"
+listen = "tcp://${HOST}:10020"
+""",
+        HOST="robot.test",
+    )
+    assert made.device is not None
+    first, second = made.listeners
+    assert first.address == Address("::1", 0)
+    assert first.settings.name == "ground.1"
+    assert (first.settings.clients, first.settings.handshake_s, first.settings.idle_s) == (3, 1.5, 60.0)
+    assert first.settings.rate_hz == 200.0
+    assert [str(network) for network in first.allow] == ["10.0.0.0/8", "192.168.1.7/32", "fd00::/8"]
+    assert (first.options.versions, first.options.quiet_s) == (("1.1",), 0.0)
+    assert (second.protocol.name, second.address) == ("wc2ec", Address("robot.test", 10020))
+
+
+def test_listeners_without_a_name_may_be_many_of_one_protocol() -> None:
+    made = plan(serving(hq(), hq(), hq(name="a"), hq(name="b")), {})
+    assert [listener.settings.name for listener in made.listeners] == [None, None, "a", "b"]
+
+
+@pytest.mark.parametrize(("field", "value"), [("clients", 1), ("clients", 10_000), ("rate_hz", 1), ("rate_hz", 1e6)])
+def test_the_bounds_of_a_listener_are_themselves_allowed(field: str, value: float) -> None:
+    (listener,) = plan(serving(hq(**{field: value})), {}).listeners
+    assert getattr(listener.settings, field) == value
+
+
 @pytest.mark.parametrize(
     ("bus", "mode"),
     [
@@ -132,7 +208,49 @@ def test_a_value_of_the_environment_is_not_substituted_again() -> None:
 ERRORS: list[tuple[dict[str, Any], str]] = [
     ({}, "robot: missing"),
     ({"robot": {}, "device": {}}, "robot.name: missing"),
-    ({"robot": {"name": "r1"}}, "device: missing"),
+    ({"robot": {"name": "r1"}}, "device: missing, it is required where there is no [[hq]]"),
+    (serving(), "device: missing, it is required where there is no [[hq]]"),
+    ({"robot": {"name": "r1"}, "hq": hq()}, "hq = {'protocol': 'tcpudp', "),
+    (serving({}), "hq[0].protocol: missing, it is required"),
+    (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
+    (serving(hq(colour="red")), "hq[0].colour = 'red': unknown key; expected one of protocol, listen, name, options"),
+    (serving(hq(protocol="nope")), "hq[0].protocol = 'nope': expected one of alf, tcpudp, wc2ec"),
+    (serving(hq(protocol=1)), "hq[0].protocol = 1: expected `str`"),
+    (serving(hq(), hq(listen="127.0.0.1:11002")), "hq[1].listen = '127.0.0.1:11002': expected tcp://host:port"),
+    (serving(hq(listen="tcp://a:99999")), "hq[0].listen = 'tcp://a:99999': "),
+    (serving(hq(listen="tcp://${NONE}:1")), "hq[0].listen = 'tcp://${NONE}:1': expected the environment variable NONE"),
+    (serving(hq(listen=["tcp://a:1"])), "hq[0].listen = ['tcp://a:1']: expected `str`"),
+    (serving(hq(name="a/b")), "hq[0].name = 'a/b': expected letters, digits, '_', '.' and '-' only"),
+    (serving(hq(name="")), "hq[0].name = '': expected letters"),
+    (serving(hq(name="a"), hq(name="a")), "hq[0].name = 'a': expected a name of its own"),
+    (serving(hq(name=5)), "hq[0].name = 5: expected `str"),
+    (serving(hq(clients=0)), "hq[0].clients = 0: expected `int` >= 1"),
+    (serving(hq(clients=10_001)), "hq[0].clients = 10001: expected `int` <= 10000"),
+    (serving(hq(clients=1.5)), "hq[0].clients = 1.5: expected `int`"),
+    (serving(hq(handshake_s=0)), "hq[0].handshake_s = 0: expected `float` > 0"),
+    (serving(hq(handshake_s=3601)), "hq[0].handshake_s = 3601: expected `float` <= 3600"),
+    (serving(hq(handshake_s=math.nan)), "hq[0].handshake_s = nan: expected"),
+    (serving(hq(idle_s=0)), "hq[0].idle_s = 0: expected `float` > 0"),
+    (serving(hq(idle_s=math.inf)), "hq[0].idle_s = inf: expected"),
+    (serving(hq(idle_s="long")), "hq[0].idle_s = 'long': expected `float"),
+    (serving(hq(rate_hz=0.5)), "hq[0].rate_hz = 0.5: expected `float` >= 1"),
+    (serving(hq(rate_hz=1e7)), "hq[0].rate_hz = 10000000.0: expected `float` <= 1000000"),
+    (serving(hq(rate_hz=math.nan)), "hq[0].rate_hz = nan: expected"),
+    (serving(hq(allow="10.0.0.0/8")), "hq[0].allow = '10.0.0.0/8': expected `array`"),
+    (serving(hq(allow=["10.0.0.0/8", 5])), "hq[0].allow[1] = 5: expected `str`"),
+    (
+        serving(hq(allow=["10.0.0.0/8", "home"])),
+        "hq[0].allow[1] = 'home': expected a network like '192.168.1.0/24': ",
+    ),
+    (serving(hq(allow=["10.0.0.1/8"])), "hq[0].allow[0] = '10.0.0.1/8': expected a network like '192.168.1.0/24': "),
+    (serving(hq(options=5)), "hq[0].options = 5: expected `object`"),
+    (serving(hq(options={"version": "1.1"})), "hq[0].options.version = '1.1': unknown key; expected one of versions, "),
+    (serving(hq(), hq(options={"gap_s": -1})), "hq[1].options.gap_s = -1: expected `float` >= 0"),
+    (serving(hq(options={"versions": []})), "hq[0].options.versions = []: expected `array` of length >= 1"),
+    (serving(hq(options={"versions": ["one"]})), "hq[0].options.versions[0] = 'one': "),
+    (serving(hq(protocol="wc2ec", options={"sectors": 0})), "hq[0].options.sectors = 0: expected `int` >= 1"),
+    (serving(hq(protocol="wc2ec", options={"dialect": "draft"})), "devices: must be listed for the draft"),
+    (serving(hq(protocol="alf", options={"serve": "nothing"})), "hq[0].options.serve = 'nothing': expected one of"),
     (minimal(robot={"name": 5}), "robot.name = 5: expected `str`"),
     (minimal(robot={"name": "a/b"}), "robot.name = 'a/b': expected letters"),
     (minimal(robot={"name": ""}), "robot.name = '': expected letters"),
@@ -199,6 +317,13 @@ def test_an_error_names_key_value_and_what_was_expected(raw: dict[str, Any], tex
     with pytest.raises(ConfigError) as caught:
         plan(raw, {})
     assert text in str(caught.value)
+
+
+def test_a_protocol_without_an_hq_side_serves_no_hq_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = msgspec.structs.replace(find_protocol("alf"), hq=None)
+    monkeypatch.setattr(config, "find_protocol", lambda name: own)
+    with pytest.raises(ConfigError, match=r"hq\[0\]\.protocol = 'alf': serves no HQ programs"):
+        plan(serving(hq(protocol="alf")), {})
 
 
 def test_an_unknown_key_is_answered_with_the_known_ones() -> None:

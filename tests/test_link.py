@@ -12,6 +12,7 @@ import pytest
 from zbridge import link as links
 from zbridge.errors import LinkError
 from zbridge.link import Address, DatagramHub, FakeLink, Link, Receiver, TcpLink, connect, listen
+from zbridge.metrics import Count
 
 SOON_S = 5.0
 LOCAL = Address("127.0.0.1", 0)
@@ -562,16 +563,18 @@ async def test_a_udp_port_that_is_taken_is_a_link_error_and_leaves_nothing_open(
 
 
 async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
-    hub, near, far = DatagramHub(), Recorder(b"a"), Recorder(b"a")
+    foreign = Count()
+    hub, near, far = DatagramHub(foreign), Recorder(b"a"), Recorder(b"a")
     hub.add(FakeLink(), "10.0.0.1", near)
     hub.add(FakeLink(), "10.0.0.2", far)
     hub._take(b"a5", ("10.0.0.2", 11000))
     hub._take(b"a5", ("10.0.0.3", 11000))
-    assert (near.datagrams, far.datagrams, hub.foreign) == ([], [b"a5"], 1)
+    assert (near.datagrams, far.datagrams, foreign.value) == ([], [b"a5"], 1)
 
 
 async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link() -> None:
-    hub, recorder, link = DatagramHub(), Recorder(b"a"), FakeLink()
+    foreign = Count()
+    hub, recorder, link = DatagramHub(foreign), Recorder(b"a"), FakeLink()
     hub.add(link, "10.0.0.1", recorder)
     hub._take(b"b5", ("10.0.0.1", 1))
     hub._take(b"a5", ("10.0.0.1", 1))
@@ -580,7 +583,7 @@ async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link() -
     hub.remove(link)
     hub._take(b"a5", ("10.0.0.1", 1))
     assert recorder.datagrams == [b"a5"]
-    assert hub.foreign == 3
+    assert foreign.value == 3
     hub.send(link, b"into the void")
     hub.close()
     hub.close()

@@ -116,7 +116,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     protocol: str
     listen: str
-    name: str | None = None
+    name: Annotated[str, msgspec.Meta(max_length=40)] | None = None
     options: dict[str, Any] = {}
     clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 256
     handshake_s: Seconds = 5.0
@@ -290,6 +290,8 @@ def _convert(raw: Any, kind: type[T], prefix: str) -> T:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(prefix + _explain(raw, kind, str(error))) from error
+    except ConfigError as error:  # what cannot go together
+        raise ConfigError(f"{prefix}{error}") from error
 
 
 def _explain(raw: Any, kind: type[Any], text: str) -> str:

@@ -38,7 +38,7 @@ ASK_S = 1.0
 REPEAT_S = 0.1
 """Seconds between repetitions of what a client set once."""
 WAITING = 64
-"""Commands of one client that may wait for the bus; one more is refused."""
+"""Commands of one client that may wait for the bus besides motion; one more is refused."""
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -116,9 +116,13 @@ class Helm:
         self._light = False
         self._set: dict[str, tuple[Topic, FleetMessage]] = {}
         """What is in motion, by path."""
+        self._pushed: dict[str, float] = {}
+        """When motion was last said of each path, whether it was carried out or not; neutral takes it out."""
         self._queue: list[tuple[Topic, FleetMessage]] = []
         self._writing = False
         self._doubting = False
+        self._returning = 0
+        """Questions under way that give the robot back."""
         self._closed = False
         self._due = 0.0
         self._seen: dict[tuple[str, str], int] = {}
@@ -145,7 +149,7 @@ class Helm:
             self._choose(message, now)
         elif isinstance(message, Raw):
             self._require_robot()
-            self._follow(self.intent.motion(now), topic, message)
+            self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
             self._bridge.put(topic, message)
 
@@ -155,7 +159,9 @@ class Helm:
         intent.expire(now)
         if not intent.held:
             return
-        if self._hold and intent.held_back is None:
+        if intent.held_back is not None:
+            self._set.clear()
+        elif self._hold:
             for topic, message in tuple(self._set.values()):
                 intent.motion(now)
                 self._send(topic, message)
@@ -171,7 +177,7 @@ class Helm:
             self._closed = True
             if self.intent.held:
                 self._release("disconnected")
-            elif not self.intent.asking:
+            elif not self.intent.asking and not self._returning:
                 self._forget_token()
 
     # What the robot's gateway says
@@ -206,52 +212,54 @@ class Helm:
         elif refusal.command != "acquire":
             if refusal.reason.endswith(NEUTRAL_FIRST):
                 self.intent.refused(refusal.reason.removesuffix(NEUTRAL_FIRST))
-                self._set.clear()
             self._tell(f"{refusal.command}: {refusal.reason}")
 
     # Motion
 
     def _move(self, topic: Topic, message: Drive | Motor, now: float) -> None:
         intent = self.intent
+        intent.expire(now)
+        if intent.held_back is not None:
+            self._set.clear()
         moves = message.moving
-        if isinstance(message, Drive):
-            if moves and self._steers and not (message.forward or message.left):
-                if not intent.may_steer:
-                    message = Drive(light=message.light)
-                moves = False
-            message = self._lit(message)
+        if moves and self._steers and isinstance(message, Drive) and not (message.forward or message.left):
+            if not intent.may_steer:
+                message = Drive(light=message.light)
+            moves = False
         if not moves:
             self._set.pop(topic.path, None)
-            self._follow(intent.neutral(now), topic, message)
+            self._pushed.pop(topic.path, None)
+            whole = all(now - said_at >= intent.deadman_s for said_at in self._pushed.values())
+            self._follow(intent.neutral(now, whole=whole), topic, message)
             return
-        try:
-            self._require_robot()
-            do = intent.motion(now)
-        except Refused:
-            self._set.clear()
-            raise
+        self._pushed[topic.path] = now
+        self._require_robot()
+        do = intent.motion(now)
         self._set[topic.path] = (topic, message)
         self._follow(do, topic, message)
 
     def _lit(self, message: Drive) -> Drive:
         """Say how the light should be only where that is new: programs repeat it with every command."""
-        if message.light is None or message.light == self._light:
-            return msgspec.structs.replace(message, light=None) if message.light is not None else message
-        if self.intent.held:
-            self._light = message.light
+        if message.light is None:
+            return message
+        if message.light == self._light:
+            return msgspec.structs.replace(message, light=None)
+        self._light = message.light
         return message
 
     def _choose(self, message: Mode, now: float) -> None:
         if message.mode == "autonomous":
             self._require_robot()
+            if self._bridge.view.protocol != self._modes:
+                raise Refused("the robot does not move by itself")
         do = self.intent.choose(message.mode, now)
         if do is Do.RELEASE:
-            self._mode_first()
+            self._tell_mode(self._put)  # what waits is given up, so it overtakes nothing
             self._release("control mode none")
         elif do is Do.ACQUIRE:
             self._bridge.spawn(self._acquire())
         elif do is Do.SEND:
-            self._mode_first()
+            self._tell_mode(self._send)
 
     def _follow(self, do: Do, topic: Topic, message: FleetMessage) -> None:
         match do:
@@ -269,10 +277,10 @@ class Helm:
             self.intent.refused(missing)
             raise Refused(missing)
 
-    def _mode_first(self) -> None:
+    def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
         """Tell the robot its control mode, if it is of a protocol that has any."""
         if self.intent.held and self._modes is not None and self._bridge.view.protocol == self._modes:
-            self._send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
+            send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
 
     # The lease
 
@@ -298,9 +306,9 @@ class Helm:
         intent.granted(lease_s or intent.lease_s)
         intent.expire(now)
         waiting, self._queue = self._queue, []
-        self._mode_first()
+        self._tell_mode(self._send)
         for topic, message in waiting:
-            if intent.held_back is None:
+            if not self._overdue(message):
                 self._send(topic, message)
         log.info("%s drives %s", self.who, self._bridge.keys.robot)
 
@@ -325,13 +333,15 @@ class Helm:
         token, self._token = self._token, None
         self._drop(why)
         self.intent.released()
-        self._bridge.spawn(self._give_back(token))
-
-    async def _give_back(self, token: bytes | None) -> None:
         if token is not None:
-            with contextlib.suppress(BusError):  # what was commanded before, goes before
-                await self._bridge.bus.flush()
-            await self._bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(token))
+            self._returning += 1
+            self._bridge.spawn(self._give_back(token))
+
+    async def _give_back(self, token: bytes) -> None:
+        with contextlib.suppress(BusError):  # what was commanded before, goes before
+            await self._bridge.bus.flush()
+        await self._bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(token))
+        self._returning -= 1
         if self._closed:
             self._forget_token()
 
@@ -352,7 +362,13 @@ class Helm:
         """Put a command on the bus, after those before it: they are numbered, and must not overtake each other."""
         if self._writing or self._token is None:
             self._wait(topic, message)
-            return
+        else:
+            self._put(topic, message)
+
+    def _put(self, topic: Topic, message: FleetMessage) -> None:
+        assert self._token is not None
+        if isinstance(message, Drive):
+            message = self._lit(message)
         self._seq += 1
         self._bridge.put(topic, message, _encode(Authorization(self._token, self._seq)))
         if topic is not topics.CMD_DRIVE:  # goes by way of a thread
@@ -363,7 +379,7 @@ class Helm:
         """Let a command wait; of motion the newest wins."""
         if isinstance(message, Drive | Motor):
             self._queue = [entry for entry in self._queue if entry[0].path != topic.path]
-        if len(self._queue) >= WAITING:
+        elif len(self._queue) >= WAITING:
             raise Refused(f"busy: {WAITING} commands wait for the bus")
         self._queue.append((topic, message))
 
@@ -373,5 +389,13 @@ class Helm:
         except BusError as error:
             log.warning("%s: %s", self.who, error)
         self._writing = False
+        self.intent.expire(self._clock())
         while self._queue and not self._writing and self._token is not None:
-            self._send(*self._queue.pop(0))
+            topic, message = self._queue.pop(0)
+            if not self._overdue(message):
+                self._send(topic, message)
+
+    def _overdue(self, message: FleetMessage) -> bool:
+        """Tell whether this is motion that waited until neutral had to come first."""
+        neutral = isinstance(message, Drive | Motor) and not message.moving
+        return self.intent.held_back is not None and not neutral and not isinstance(message, Mode)

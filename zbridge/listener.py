@@ -43,6 +43,7 @@ LEAVE_S = 0.7
 """Longest time clients are given to hear that the listener ends, and the robot's gateway to hear of it."""
 ATTEND_EVERY = 64
 """Clients that are written to between two looks at the stops and commands that wait."""
+_FULL = "as many clients as there can be"
 _FRAME_BYTES = 64 * 1024
 _ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
@@ -96,7 +97,8 @@ class Listener:
         self._tasks: set[asyncio.Task[None]] = set()
         self._bridge = Bridge(bus, keys, audience.view, self._spawn)
         self._bus = bus
-        self._ids = ClientIds(self._side.numbers[: plan.settings.clients], self._side.quiet_s)
+        numbers = self._side.numbers
+        self._ids = ClientIds(numbers if self._side.quiet_s else numbers[: plan.settings.clients], self._side.quiet_s)
         self._asked: dict[str, list[Client]] = {}
         self._active: set[Client] = set()
         self._closing = False
@@ -139,7 +141,7 @@ class Listener:
                 if not client.helm.active:
                     self._active.discard(client)
             if self._clock() >= sweep_at:
-                sweep_at += SWEEP_S
+                sweep_at = self._clock() + SWEEP_S  # not made up for after a process was frozen
                 self._sweep()
 
     async def _leave(self) -> None:
@@ -170,7 +172,7 @@ class Listener:
         reason = self._unwelcome(host)
         number = self._ids.take(self._clock()) if reason is None else None
         if number is None:
-            self._turn_away(link, reason or "as many clients as there can be")
+            self._turn_away(link, reason or _FULL)
             return None
         self._accepted.value += 1
         session = self._side.session(number, self._limits)
@@ -194,6 +196,8 @@ class Listener:
     def _unwelcome(self, host: str) -> str | None:
         if self._closing:
             return "the gateway stops"
+        if len(self.clients) >= self._settings.clients:
+            return _FULL
         if not self._plan.allow:
             return None
         address = ipaddress.ip_address(host.partition("%")[0])
@@ -305,7 +309,7 @@ class Listener:
         except Refused:
             client.session.traffic.dropped += 1
             self._dropped.value += 1
-        except EncodeError as error:
+        except (EncodeError, ProtocolError) as error:
             self._left_out.value += 1
             log.debug("%s: client %d not sent: %s", self.name, client.number, error)
         client.conversation.pump()
@@ -370,6 +374,8 @@ class Listener:
                     message = payloads.decode(shown.message, answer.payload)
         except (BusError, PayloadError) as error:
             log.debug("%s: %s: %s", self.name, topic.path, error)
-        for client in self._asked.pop(topic.path):
+        finally:
+            asking = self._asked.pop(topic.path)
+        for client in asking:
             if not client.session.over:
                 self._send(client, lambda session, now: self._side.answer(session, topic, message, now))

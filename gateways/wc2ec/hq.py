@@ -147,6 +147,8 @@ class Wc2EcHq(HqSide):
             self._put(session, self._by_name[name], value, now)
 
     def wanted(self) -> tuple[Topic, ...]:
+        if not self._draft:
+            return ()
         enabled = set().union(*(session.enabled for session in self._sessions if not session.over))
         return tuple(topics.SENSOR(self._by_number[number].name) for number in sorted(enabled))
 

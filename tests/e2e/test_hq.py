@@ -147,7 +147,7 @@ def _charges(violations: list[str]) -> list[str]:
 
 
 class _Feed(threading.Thread):
-    """A scripted robot that says fifty times a second where it is, and shows a map five times a second."""
+    """A scripted robot that says fifty times a second where it is, and shows a map a quarter as often."""
 
     MAP = struct.pack("<iBBi", 2 + 4 + 44 * 44, 1, 53, 44 * 44) + bytes(44 * 44)
 
@@ -166,7 +166,7 @@ class _Feed(threading.Thread):
             with contextlib.suppress(AssertionError, OSError):
                 self._robot.send(position(len(self.sent), 0.0, 0.0))
                 self.sent.append(time.monotonic())
-                if len(self.sent) % 10 == 0:
+                if len(self.sent) % 4 == 0:
                     self._robot.send(self.MAP)
 
     def close(self) -> None:

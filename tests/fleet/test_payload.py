@@ -38,6 +38,8 @@ from zbridge.fleet.messages import (
     Scan,
     Scanner,
     SensorSetting,
+    SessionEntry,
+    Sessions,
     Status,
     Stop,
     Switch,
@@ -127,6 +129,38 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
     (
         Lease(ok=True, token=b"0123456789abcdef", expires_in_s=3.0, holder="hq 1"),
         {"ok": True, "token": b"0123456789abcdef", "expires_in_s": 3.0, "holder": "hq 1", "reason": None},
+    ),
+    (
+        Sessions(
+            sessions=(
+                SessionEntry(
+                    name="ground.2",
+                    peer="tcp://10.0.0.7:50000",
+                    role="robot",
+                    state="established",
+                    version="1.1",
+                    features=("udp",),
+                    counters={"frames_in": 3},
+                    left_out={"servertSLAMMapPart (56)": 7},
+                ),
+            )
+        ),
+        {
+            "sessions": [
+                {
+                    "name": "ground.2",
+                    "peer": "tcp://10.0.0.7:50000",
+                    "role": "robot",
+                    "state": "established",
+                    "reason": None,
+                    "version": "1.1",
+                    "features": ["udp"],
+                    "transport": "tcp",
+                    "counters": {"frames_in": 3},
+                    "left_out": {"servertSLAMMapPart (56)": 7},
+                }
+            ]
+        },
     ),
 ]
 

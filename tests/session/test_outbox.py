@@ -297,6 +297,28 @@ def test_a_late_driver_does_not_cause_a_burst_of_repetitions() -> None:
     assert outbox.deadline() == 10.25
 
 
+def test_frames_that_go_first_are_bounded_too() -> None:
+    outbox = Outbox(0.0)
+    for number in range(LIMIT):
+        outbox.put_exempt(b"%d" % number)
+    with pytest.raises(Refused, match="64 packets of the handshake wait"):
+        outbox.put_exempt(b"one too many")
+    assert len(outbox) == LIMIT
+    assert outbox.take(0.0) == b"0"
+    outbox.put_exempt(b"there is room again")
+    assert [frame for _, frame in drained(outbox, 0.0, 1.0)][-1] == b"there is room again"
+
+
+def test_the_two_queues_are_bounded_each_for_itself() -> None:
+    outbox = Outbox(0.0)
+    for _ in range(LIMIT):
+        outbox.put(b"text")
+    outbox.put_exempt(b"first")
+    with pytest.raises(Refused, match="64 packets wait for the robot"):
+        outbox.put(b"text")
+    assert outbox.take(0.0) == b"first"
+
+
 def test_an_outbox_prints_what_waits() -> None:
     outbox = Outbox(0.0)
     outbox.put(b"a")

@@ -288,12 +288,114 @@ def test_sending_too_much_is_refused(established: Toy) -> None:
 
 
 def test_the_snapshot_does_not_change_with_the_session(established: Toy) -> None:
+    established.left_out["wings (7)"] += 2
     shown = established.snapshot()
     established.receive(b"\x01a", 1.0)
+    established.left_out["wings (7)"] += 1
+    established.traffic.dropped += 1
     established.lost("closed by peer")
-    assert (shown.name, shown.peer, shown.role, shown.transport) == ("robot", "tcp://toy.test:1", Role.HQ, "tcp")
-    assert (shown.state, shown.version, shown.features, shown.reason) == (State.ESTABLISHED, "2.0", ("wings",), None)
-    assert shown.traffic.frames_in == 1
+    assert (shown.name, shown.peer, shown.role, shown.transport) == ("robot", "tcp://toy.test:1", "hq", "tcp")
+    assert (shown.state, shown.version, shown.features, shown.reason) == ("established", "2.0", ("wings",), None)
+    assert shown.counters == {
+        "frames_in": 1,
+        "frames_out": 1,
+        "bytes_in": 8,
+        "bytes_out": 6,
+        "malformed": 0,
+        "foreign": 0,
+        "dropped": 0,
+        "refused": 0,
+    }
+    assert shown.left_out == {"wings (7)": 2}
+
+
+def test_a_snapshot_says_why_a_session_takes_no_commands_or_has_ended(session: Toy) -> None:
+    session.open(0.0)
+    session.establish("", ())
+    session.busy = "busy: map"
+    assert (session.snapshot().reason, session.snapshot().version) == ("busy: map", None)
+    session.lost("closed by peer")
+    assert (session.snapshot().state, session.snapshot().reason) == ("closed", "closed by peer")
+
+
+# The peer's rate
+
+
+def limited(rate_hz: float) -> Toy:
+    session = Toy(Limits(frame_bytes=100, handshake_s=5.0, rate_hz=rate_hz))
+    session.open(100.0)
+    session.receive(WELCOME, 100.0)
+    return session
+
+
+def test_a_peer_may_send_a_seconds_worth_at_once_and_one_more_ends_the_session() -> None:
+    session = limited(10.0)
+    assert len(session.receive(b"\x01a" * 9, 100.0)) == 9, "the welcome was the tenth"
+    assert session.state is State.ESTABLISHED
+    assert session.receive(b"\x01a\x01a", 100.0) == []
+    assert (session.state, session.reason) == (State.CLOSED, "flood: more than 10 messages a second")
+
+
+def test_messages_before_the_one_too_many_are_delivered() -> None:
+    session = limited(10.0)
+    assert len(session.receive(b"\x01a" * 100, 100.0)) == 9
+    assert session.state is State.CLOSED
+
+
+def test_a_peer_at_its_rate_is_served_for_ever() -> None:
+    session = limited(10.0)
+    for step in range(1, 1001):
+        assert session.receive(b"\x01a", 100.0 + step / 10) == [b"a"]
+    assert session.state is State.ESTABLISHED
+
+
+def test_a_peer_at_twice_its_rate_is_cut_within_its_second_of_grace() -> None:
+    session = limited(10.0)
+    step = 0
+    while session.state is State.ESTABLISHED:
+        step += 1
+        session.receive(b"\x01a", 100.0 + step / 20)
+    assert 18 <= step <= 20, "nine were left, and every second one comes back"
+
+
+def test_silence_saves_up_no_more_than_a_seconds_worth() -> None:
+    session = limited(10.0)
+    assert len(session.receive(b"\x01a" * 10, 1e6)) == 10
+    assert session.state is State.ESTABLISHED
+    session.receive(b"\x01a", 1e6)
+    assert session.state is State.CLOSED
+
+
+def test_what_is_malformed_or_of_the_handshake_counts_for_the_rate_too() -> None:
+    session = limited(5.0)
+    session.receive(b"\x01?" * 4, 100.0)
+    assert session.state is State.ESTABLISHED
+    session.receive(b"\x01?", 100.0)
+    assert session.state is State.CLOSED
+
+
+def test_half_frames_do_not_count_for_the_rate() -> None:
+    session = limited(5.0)
+    for _ in range(4):
+        for byte in b"\x05hello":
+            session.receive(bytes([byte]), 100.0)
+    assert session.state is State.ESTABLISHED
+
+
+def test_datagrams_share_the_rate_with_the_stream() -> None:
+    session = limited(5.0)
+    assert session.receive(b"\x01a" * 2, 100.0) == [b"a", b"a"]
+    assert session.receive_datagram(b"\x01b", 100.0) == [b"b"]
+    assert session.receive_datagram(b"no frame", 100.0) == []
+    assert session.state is State.ESTABLISHED
+    assert session.receive_datagram(b"\x01b", 100.0) == []
+    assert (session.state, session.reason) == (State.CLOSED, "flood: more than 5 messages a second")
+
+
+def test_a_session_without_a_rate_takes_all() -> None:
+    session = limited(math.inf)
+    assert len(session.receive(b"\x01a" * 10_000, 100.0)) == 10_000
+    assert len(session.receive(b"\x01a", 100.0)) == 1
 
 
 def test_a_session_prints_its_name_state_and_reason(session: Toy) -> None:

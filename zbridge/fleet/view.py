@@ -58,7 +58,7 @@ class RobotView:
         if not self.alive or self.status is None:
             return "no gateway serves the robot"
         if self.status.state != "established":
-            return f"robot {self.status.state}: {self.status.reason}" if self.status.reason else self.status.state
+            return f"robot {self.status.state}" + (f": {self.status.reason}" if self.status.reason else "")
         return None
 
     def note(self, topic: Topic, message: FleetMessage) -> None:

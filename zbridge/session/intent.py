@@ -41,6 +41,7 @@ class Intent:
         self.deadman_s = deadman_s
         self._moving = False
         self._moved_at = -math.inf
+        self._used_at = -math.inf
         self._heard_at = -math.inf
 
     def __repr__(self) -> str:
@@ -57,20 +58,27 @@ class Intent:
         """Take note that anything at all came."""
         self._heard_at = now
 
-    def motion(self, now: float) -> Do:
-        """Take motion; raise Refused where the program may not move the robot now."""
+    def motion(self, now: float, *, lasts: bool = True) -> Do:
+        """Take motion; raise Refused where the program may not move the robot now.
+
+        Motion that ``lasts`` is to be said again within the deadman.
+        """
         self.expire(now)
         if self.held_back is not None:
             raise Refused(f"{self.held_back}: let go of the stick first")
         if self.mode == "none":
-            raise Refused("control mode is none")
-        self._moved_at, self._moving = now, True
+            self.held_back = "control mode is none"
+            raise Refused(self.held_back)
+        self._used_at = now
+        if lasts:
+            self._moved_at, self._moving = now, True
         return self._act()
 
-    def neutral(self, now: float) -> Do:
-        """Take neutral."""
+    def neutral(self, now: float, *, whole: bool = True) -> Do:
+        """Take neutral; of a part only, where the program still says motion of another: that ends nothing."""
         self.expire(now)
-        self.held_back, self._moving = None, False
+        if whole:
+            self.held_back, self._moving = None, False
         return Do.SEND if self.held else Do.WAIT if self.asking else Do.NOTHING
 
     def choose(self, mode: str, now: float) -> Do:
@@ -78,12 +86,13 @@ class Intent:
         self.expire(now)
         if mode == "autonomous" and self.held_back is not None:
             raise Refused(f"{self.held_back}: let go of the stick first")
+        if "autonomous" in (mode, self.mode):  # a robot that moved by itself was in use until now
+            self._used_at = now
         self.mode = mode
         if mode == "none":
             self._moving = False
             return Do.RELEASE if self.held or self.asking else Do.NOTHING
         if mode == "autonomous":
-            self._moved_at = now
             return self._act()
         return Do.SEND if self.held else Do.WAIT if self.asking else Do.NOTHING
 
@@ -126,5 +135,5 @@ class Intent:
 
         A robot that moves by itself is used as long as anything at all is heard.
         """
-        used_at = max(self._moved_at, self._heard_at) if self.mode == "autonomous" else self._moved_at
+        used_at = max(self._used_at, self._heard_at) if self.mode == "autonomous" else self._used_at
         return self.held and now - used_at >= self.lease_s

@@ -1014,7 +1014,7 @@ def test_every_line_the_template_shows_as_left_out_can_be_put_in(dialect: str) -
     fitting = [line for line in lines if "draft only" not in line or dialect == "draft"]
     shown = "\n".join(line.removeprefix("# ") for line in fitting if "[[hq]]" not in line)
     shown = shown.replace('dialect = "deployed"', f'dialect = "{dialect}"')
-    options = config.plan(tomllib.loads(shown[: shown.index("[device.options.differential]")])).options
+    options = config.plan(tomllib.loads(shown[: shown.index("[device.options.differential]")])).device.options
     assert isinstance(options, Options)
     assert options.bearings_deg == {"front": 0.0, "left": 90.0}
     assert options.pinned == (("light0",) if dialect == "draft" else ())

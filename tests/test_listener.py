@@ -1,0 +1,1012 @@
+"""One listener with a toy protocol on a fake bus, its links played by hand, on a clock that jumps.
+
+A frame is a length byte and so many bytes. A client says ``hi`` first; ``go`` and ``stand`` drive, ``map?`` asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import ipaddress
+import weakref
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.clock import jumping
+from tests.test_helm import Gateway
+from zbridge import listener as listeners
+from zbridge.audience import Audience
+from zbridge.bus.fake import FakeBus
+from zbridge.bus.interface import Answer, Question
+from zbridge.config import HqSettings, ListenerPlan
+from zbridge.errors import BusError, EncodeError, ProtocolError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import (
+    Acquire,
+    Drive,
+    FleetMessage,
+    Map,
+    Pose,
+    Query,
+    Scan,
+    Status,
+    Stop,
+    Switch,
+    Text,
+)
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.view import RobotView
+from zbridge.link import Address, FakeLink, Receiver
+from zbridge.listener import STALL_S, SWEEP_S, TELL_S, Listener
+from zbridge.metrics import Metrics
+from zbridge.protocol import HqSide, Protocol, Send, Telemetry
+from zbridge.session.manager import SessionManager
+from zbridge.session.outbox import LIMIT
+from zbridge.session.session import Limits, Role, Session, State
+
+KEYS = KeySpace("fleet", "r1")
+STATUS = Status(state="established", protocol="toy")
+MAP = Map(rows=2, columns=3, cell=0.1, origin=(0.0, 0.0), cells=np.zeros((2, 3), np.uint8))
+
+
+def framed(body: bytes) -> bytes:
+    return bytes([len(body)]) + body
+
+
+def frame_end(data: bytes, start: int) -> int:
+    if data[start] == 255:
+        raise ProtocolError("length 255")
+    return start + 1 + data[start]
+
+
+class ToySession(Session[bytes]):
+    role = Role.ROBOT
+    frame_end = staticmethod(frame_end)
+    scans = False
+
+    def encode(self, message: bytes) -> bytes:
+        return framed(message)
+
+    def decode(self, frame: bytes) -> bytes:
+        if frame[1:] == b"?":
+            raise ProtocolError("what is ?")
+        return frame[1:]
+
+    def opened(self, now: float) -> None:
+        self.send_first(b"who are you")
+
+    def accept(self, message: bytes, now: float) -> bool:
+        if self.state is State.ESTABLISHED:
+            return True
+        if message != b"hi":
+            raise ProtocolError("hi was expected")
+        self.establish("2.0", ("wings",))
+        return False
+
+
+class ToySide(HqSide):
+    name = "toy"
+    deadman_s = 1.25
+    numbers = range(2, 256)
+    follows = ("pose", "text", "lidar")
+    quiet_s = 0.0
+
+    def __init__(self, options: Any, view: RobotView, metrics: Metrics) -> None:
+        self.view = view
+        self.encoded = 0
+        self.made: list[ToySession] = []
+
+    def session(self, number: int, bounds: Limits) -> ToySession:
+        self.made = [session for session in self.made if not session.over]
+        self.made.append(session := ToySession(bounds))
+        return session
+
+    def begin(self, session: ToySession, now: float) -> None:
+        session.send(b"welcome")
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        if isinstance(message, Switch):
+            raise EncodeError("no switch can be shown")
+        if not isinstance(message, Pose | Text | Scan):
+            return None
+        self.encoded += 1
+        if isinstance(message, Text):
+            text = framed(message.text.encode())
+            return lambda session, now: session.outbox.put(text)
+        frame = framed(b"scan" if isinstance(message, Scan) else b"at %g" % message.x)
+
+        def send(session: ToySession, now: float) -> None:
+            if isinstance(message, Pose) or session.scans:
+                session.outbox.stand(topic.path, (frame,), now)
+
+        return send
+
+    def take(self, session: ToySession, message: bytes) -> tuple[Telemetry, ...]:
+        if message in (b"scans on", b"scans off"):
+            session.scans = message == b"scans on"
+            return ()
+        taken = _TAKEN.get(message)
+        if taken is None:
+            raise ProtocolError(f"what is {message!r}")
+        return (taken,)
+
+    def answer(self, session: ToySession, topic: Topic, message: FleetMessage | None, now: float) -> None:
+        session.send(b"%s: %s" % (topic.path.encode(), type(message).__name__.encode()))
+
+    def tell(self, session: ToySession, text: str, now: float) -> None:
+        session.send(b"! " + text.encode())
+
+    def wanted(self) -> tuple[Topic, ...]:
+        return (topics.SCAN,) if any(session.scans for session in self.made if not session.over) else ()
+
+
+_TAKEN: dict[bytes, Telemetry] = {
+    b"go": (topics.CMD_DRIVE, Drive(forward=0.5)),
+    b"stand": (topics.CMD_DRIVE, Drive()),
+    b"stop": (topics.CMD_STOP, Stop()),
+    b"map?": (topics.RPC_MAP, Query()),
+    b"pose?": (topics.RPC_POSE, Query()),
+}
+
+
+class HandLink(FakeLink):
+    """A link that ends as a real one does: its receiver is told soon after it was closed."""
+
+    receiver: Receiver
+
+    def close(self) -> None:
+        if not self.closed:
+            super().close()
+            asyncio.get_running_loop().call_soon(self.receiver.lost, "closed by us")
+
+    def abort(self) -> None:
+        self.close()
+
+
+class Program:
+    """An HQ program at the other end of a link."""
+
+    def __init__(self, receiver: Receiver, peer: str) -> None:
+        self.receiver = receiver
+        self.link = HandLink(peer)
+        self.link.receiver = receiver
+        receiver.attached(self.link)
+
+    def say(self, *messages: bytes) -> None:
+        self.receiver.received(b"".join(map(framed, messages)))
+
+    def greeted(self) -> Program:
+        """Shake hands, and forget what was heard."""
+        self.say(b"hi")
+        self.heard()
+        return self
+
+    def heard(self) -> list[bytes]:
+        """What was heard since the last call."""
+        written, self.link.written = self.link.written, []
+        return [frame[1:] for frame in written]
+
+    def leave(self) -> None:
+        if not self.link.closed:
+            self.link.closed = True
+            self.receiver.lost("closed by peer")
+
+    def take_nothing(self) -> None:
+        self.link.ready = False
+
+    def take_all(self) -> None:
+        self.link.ready = True
+        self.receiver.writable()
+
+
+class Scene:
+    """A listener that runs, and the robot's gateway beside it."""
+
+    def __init__(self, *, allow: tuple[str, ...] = (), robot: bool = True, **settings: Any) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.skipped_s = 0.0
+        self.bus = FakeBus("hq")
+        self.gateway = Gateway(self.bus.join("gw"), self)  # type: ignore[arg-type]
+        self.status = self.gateway.bus.publisher(KEYS.key("status"), topics.STATUS)
+        self.token = None
+        if robot:
+            self.come()
+        self.metrics = Metrics()
+        self.manager = SessionManager()
+        self.audience = Audience(self.bus, KEYS, self.metrics)
+        self.audience.open()
+        protocol = Protocol(
+            name="toy",
+            summary="",
+            options=HqSettings,
+            links=1,
+            robot=None,  # type: ignore[arg-type]
+            simulate=None,  # type: ignore[arg-type]
+            hq=self._side,
+        )
+        plan = ListenerPlan(
+            protocol,
+            None,
+            Address("127.0.0.1", 0),
+            HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings),
+            tuple(map(ipaddress.ip_network, allow)),
+        )
+        self.accept: Callable[[], Receiver]
+        self.listener = Listener(
+            plan, "toy", self.audience, self.bus, KEYS, self.manager, self.metrics, lambda: self.now
+        )
+        self.hosts = 0
+
+    def _side(self, options: Any, view: RobotView, metrics: Metrics) -> ToySide:
+        self.side = ToySide(options, view, metrics)
+        return self.side
+
+    @property
+    def now(self) -> float:
+        return self.loop.time() + self.skipped_s
+
+    def come(self) -> None:
+        """Let the robot be there."""
+        self.status.put(payloads.encode(STATUS))
+        self.token = self.gateway.bus.announce(KEYS.alive("gateway"))
+
+    def go(self) -> None:
+        """Let the robot's gateway be gone."""
+        assert self.token is not None
+        self.token.close()
+
+    def say(self, topic: Topic, message: FleetMessage) -> None:
+        self.gateway.bus.publisher(KEYS.key(topic.path), topic).put(payloads.encode(message))
+
+    def report(self) -> None:
+        self.gateway.control.put(payloads.encode(self.gateway.report()))
+
+    def connect(self, host: str = "10.0.0.1") -> Program:
+        self.hosts += 1
+        return Program(self.accept(), f"tcp://{host}:{5000 + self.hosts}")
+
+    def count(self, name: str) -> int:
+        return self.metrics.total(name)
+
+    def reason(self, name: str) -> str | None:
+        """Why a session ended, or nothing while it lives."""
+        return next(shown.reason for shown in self.manager.snapshots() if shown.name == name)
+
+
+@pytest.fixture(autouse=True)
+def by_hand(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
+    """Let scenes accept links by hand."""
+    scenes: list[Scene] = []
+
+    @contextlib.asynccontextmanager
+    async def listen(address: Address, receiver: Callable[[], Receiver], **kwargs: Any) -> AsyncIterator[Address]:
+        scenes[-1].accept = receiver
+        yield Address(address.host, 11002)
+
+    monkeypatch.setattr(listeners, "listen", listen)
+    _SCENES.append(scenes)
+    return scenes
+
+
+_SCENES: list[list[Scene]] = []
+
+
+@contextlib.asynccontextmanager
+async def serving(**settings: Any) -> AsyncIterator[Scene]:
+    scene = Scene(**settings)
+    _SCENES[-1].append(scene)
+    task = scene.loop.create_task(scene.listener.run())
+    await asyncio.wait_for(scene.listener.ready.wait(), 1.0)
+    try:
+        yield scene
+        assert not task.done(), task
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def soon() -> None:
+    """Let what was begun be done."""
+    await asyncio.sleep(0.001)
+
+
+# Coming and going
+
+
+@jumping
+async def test_a_client_shakes_hands_and_is_shown_the_robot() -> None:
+    async with serving() as scene:
+        assert scene.listener.address == Address("127.0.0.1", 11002)
+        program = scene.connect()
+        assert program.heard() == [b"who are you"]
+        scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+        assert program.heard() == [], "nothing before the handshake"
+        program.say(b"hi")
+        assert program.heard() == [b"welcome"]
+        scene.say(topics.POSE, Pose(x=2.0, y=0.0, heading=0.0))
+        assert program.heard() == [b"at 2"]
+        (entry,) = scene.manager.snapshots()
+        assert (entry.name, entry.role, entry.state, entry.version) == ("toy.2", "robot", "established", "2.0")
+        assert entry.peer == program.link.peer
+
+
+@jumping
+async def test_clients_get_the_lowest_numbers_that_are_free() -> None:
+    async with serving() as scene:
+        programs = [scene.connect() for _ in range(4)]
+        assert sorted(scene.listener.clients) == [2, 3, 4, 5]
+        programs[1].leave()
+        await soon()
+        scene.connect()
+        assert sorted(scene.listener.clients) == [2, 3, 4, 5]
+        assert scene.reason("toy.3") is None
+        assert scene.count("hq_accepted") == 5
+
+
+@jumping
+async def test_254_clients_are_served_and_the_255th_is_turned_away() -> None:
+    async with serving() as scene:
+        programs = [scene.connect().greeted() for _ in range(254)]
+        assert sorted(scene.listener.clients) == list(range(2, 256))
+        late = scene.connect()
+        assert late.link.closed
+        assert late.heard() == []
+        late.say(b"hi", b"go")
+        assert late.heard() == []
+        assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (254, 1)
+        await soon()
+        scene.say(topics.POSE, Pose(x=3.0, y=0.0, heading=0.0))
+        assert all(program.heard() == [b"at 3"] for program in programs)
+        assert scene.side.encoded == 1
+        programs[76].leave()
+        await soon()
+        assert scene.connect().heard() == [b"who are you"]
+
+
+@jumping
+async def test_a_listener_may_be_told_to_serve_fewer() -> None:
+    async with serving(clients=2) as scene:
+        programs = [scene.connect() for _ in range(3)]
+        assert [program.link.closed for program in programs] == [False, False, True]
+        programs[0].leave()
+        await soon()
+        assert not scene.connect().link.closed
+
+
+@jumping
+async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
+    async with serving() as scene:
+        scene.connect().leave()
+        await soon()
+        scene.connect()
+        assert sorted(scene.listener.clients) == [3]
+        await asyncio.sleep(2.0)
+        scene.connect()
+        assert sorted(scene.listener.clients) == [2, 3]
+
+
+@jumping
+async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``clients`` is the most at a time: a program that is restarted at once finds its place free."""
+    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
+    async with serving(clients=1) as scene:
+        scene.connect().leave()
+        await soon()
+        assert not scene.connect().link.closed
+        assert scene.connect().link.closed
+
+
+@jumping
+async def test_many_clients_come_and_go_and_leave_nothing_behind() -> None:
+    async with serving() as scene:
+        await soon()
+        tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
+        subscribers, queryables = len(kept.subscribers), len(kept.queryables)
+        sessions: list[weakref.ref[ToySession]] = []
+        for cycle in range(500):
+            programs = [scene.connect() for _ in range(4)]
+            for program in programs[:3]:
+                program.say(b"hi")
+            sessions += [weakref.ref(session) for session in scene.side.made[-4:]]
+            programs[0].say(b"stand", b"go", b"scans on")
+            programs[1].say(b"map?", b"?")
+            if cycle % 2:
+                await soon()
+            for program in programs:
+                program.leave()
+            await soon()
+        await asyncio.sleep(5.0)
+        assert scene.listener.clients == {}
+        assert len(asyncio.all_tasks()) == tasks
+        assert (len(kept.subscribers), len(kept.queryables)) == (subscribers, queryables)
+        assert kept.tokens == [KEYS.alive("gateway")]
+        assert repr(scene.manager) == "<SessionManager 0 live, 32 ended>"
+        assert len(scene.listener._bridge._publishers) <= 2
+        assert (scene.listener._active, scene.listener._asked) == (set(), {})
+        assert "0 of 254 taken" in repr(scene.listener._ids)
+        assert scene.gateway.report().state == "free"
+        scene.side.made.clear()
+        del programs, program
+        gc.collect()
+        assert sum(session() is not None for session in sessions) <= 1, "the last one is a variable of a loop"
+
+
+@jumping
+async def test_the_table_says_why_a_client_went() -> None:
+    async with serving() as scene:
+        scene.connect().leave()
+        await soon()
+        assert scene.reason("toy.2") == "closed by peer"
+
+
+# Who may come
+
+
+@pytest.mark.parametrize(
+    ("host", "welcome"),
+    [
+        ("10.1.2.3", True),
+        ("192.168.1.7", True),
+        ("192.168.1.8", False),
+        ("127.0.0.1", False),
+        ("[fd00::1]", True),
+        ("[fe80::1%eth0]", False),
+        ("[::1]", False),
+        ("[::ffff:10.1.2.3]", True),
+        ("[::ffff:11.1.2.3]", False),
+    ],
+)
+@jumping
+async def test_only_allowed_networks_are_let_in(host: str, welcome: bool) -> None:
+    async with serving(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8")) as scene:
+        program = scene.connect(host)
+        assert program.link.closed is not welcome
+        assert scene.count("hq_turned_away") == (not welcome)
+        assert len(scene.listener.clients) == welcome
+
+
+@jumping
+async def test_without_a_list_everybody_is_let_in() -> None:
+    async with serving() as scene:
+        assert not any(scene.connect(host).link.closed for host in ("10.1.2.3", "127.0.0.1", "[fe80::1%eth0]"))
+
+
+@jumping
+async def test_a_client_that_is_turned_away_uses_up_no_number() -> None:
+    async with serving(allow=("10.0.0.0/8",)) as scene:
+        for _ in range(300):
+            scene.connect("11.0.0.1")
+        await soon()
+        scene.connect()
+        assert sorted(scene.listener.clients) == [2]
+
+
+# Limits
+
+
+@jumping
+async def test_a_client_that_does_not_shake_hands_is_closed() -> None:
+    async with serving(handshake_s=1.5) as scene:
+        silent, served = scene.connect(), scene.connect().greeted()
+        await asyncio.sleep(1.4)
+        assert not silent.link.closed
+        await asyncio.sleep(0.2)
+        assert silent.link.closed
+        assert scene.reason("toy.2") == "no handshake within 1.5 s"
+        assert not served.link.closed
+        assert sorted(scene.listener.clients) == [3]
+
+
+@jumping
+async def test_a_client_that_is_silent_for_too_long_is_closed() -> None:
+    async with serving(idle_s=3.0) as scene:
+        silent, talking = scene.connect().greeted(), scene.connect().greeted()
+        for _ in range(30):
+            talking.say(b"stand")
+            await asyncio.sleep(0.1)
+            assert not silent.link.closed or scene.loop.time() > 1002.9
+        await asyncio.sleep(0.7)
+        assert silent.link.closed
+        assert scene.reason("toy.2") == "silent for 3 s"
+        assert not talking.link.closed
+
+
+@jumping
+async def test_a_client_may_be_silent_for_ever_where_no_limit_is_set() -> None:
+    async with serving() as scene:
+        silent = scene.connect().greeted()
+        await asyncio.sleep(10_000)
+        assert not silent.link.closed
+
+
+@jumping
+async def test_what_is_sent_to_a_client_is_no_sign_of_its_life() -> None:
+    async with serving(idle_s=1.0) as scene:
+        silent = scene.connect().greeted()
+        for step in range(20):
+            scene.say(topics.POSE, Pose(x=float(step), y=0.0, heading=0.0))
+            await asyncio.sleep(0.1)
+        assert silent.link.closed
+
+
+@jumping
+async def test_a_client_that_takes_nothing_is_cut_and_costs_the_others_nothing() -> None:
+    async with serving() as scene:
+        stalled, served = scene.connect().greeted(), scene.connect().greeted()
+        await soon()
+        stalled.take_nothing()
+        start = scene.loop.time()
+        while not stalled.link.closed:
+            scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+            assert served.heard() == [b"at 1"]
+            await asyncio.sleep(0.02)
+            assert scene.loop.time() - start < 2 * STALL_S
+        assert STALL_S - SWEEP_S <= scene.loop.time() - start <= STALL_S + 2 * SWEEP_S
+        assert scene.reason("toy.2") == f"took nothing for {STALL_S:g} s"
+        assert stalled.heard() == []
+        await soon()
+        assert sorted(scene.listener.clients) == [3]
+
+
+@jumping
+async def test_a_client_that_stalls_now_and_then_stays() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        for _ in range(20):
+            program.take_nothing()
+            await asyncio.sleep(STALL_S - 2 * SWEEP_S)
+            program.take_all()
+            await asyncio.sleep(STALL_S)
+        assert not program.link.closed
+
+
+@jumping
+async def test_a_client_that_takes_a_byte_now_and_then_is_cut() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        for _ in range(12):
+            program.take_nothing()
+            await asyncio.sleep(0.95)
+            program.take_all()
+            await asyncio.sleep(0.05)
+        assert program.link.closed
+
+
+@jumping
+async def test_a_process_that_was_frozen_cuts_nobody_for_it() -> None:
+    """The time while it did not run is no time in which a client took nothing, or was silent."""
+    async with serving(idle_s=5.0) as scene:
+        stalled, silent = scene.connect().greeted(), scene.connect().greeted()
+        await soon()
+        scene.skipped_s += 60.0
+        for _ in range(20):
+            await asyncio.sleep(0.1)
+            silent.say(b"stand")
+            stalled.say(b"stand")
+            stalled.take_nothing()
+        assert not stalled.link.closed, "it has taken nothing for two seconds"
+        await asyncio.sleep(2.0)
+        assert not silent.link.closed, "it has been silent for two seconds"
+
+
+@jumping
+async def test_a_client_that_floods_is_closed_and_the_others_are_served() -> None:
+    async with serving(rate_hz=50.0) as scene:
+        wild, served = scene.connect().greeted(), scene.connect().greeted()
+        await soon()
+        wild.say(*[b"stop"] * 100)
+        await soon()
+        assert wild.link.closed
+        assert scene.reason("toy.2") == "flood: more than 50 messages a second"
+        assert len(scene.bus.values("fleet/r1/@cmd/stop")) == 49, "what it had the right to"
+        scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+        assert served.heard() == [b"at 1"]
+
+
+@jumping
+async def test_rubbish_ends_its_own_session_only() -> None:
+    async with serving() as scene:
+        broken, served = scene.connect().greeted(), scene.connect().greeted()
+        broken.receiver.received(framed(b"stop") + b"\xff rubbish")
+        await soon()
+        assert broken.link.closed
+        assert scene.reason("toy.2") == "broken stream: length 255"
+        assert len(scene.bus.values("fleet/r1/@cmd/stop")) == 1, "what came before it"
+        served.say(b"stop")
+        assert len(scene.bus.values("fleet/r1/@cmd/stop")) == 2
+
+
+@jumping
+async def test_messages_without_meaning_are_counted_and_the_next_ones_are_taken() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.say(b"?", b"sing", b"stop")
+        assert scene.count("hq_malformed") == 2
+        assert scene.manager.snapshots()[0].counters["malformed"] == 2
+        assert len(scene.bus.values("fleet/r1/@cmd/stop")) == 1
+        assert scene.count("hq_commands") == 1
+
+
+@jumping
+async def test_a_full_queue_drops_for_its_client_alone() -> None:
+    async with serving() as scene:
+        slow, served = scene.connect().greeted(), scene.connect().greeted()
+        await soon()
+        slow.take_nothing()
+        for number in range(LIMIT + 10):
+            scene.say(topics.TEXT, Text(text=str(number)))
+        assert len(served.heard()) == LIMIT + 10
+        assert scene.count("hq_dropped") == 10
+        counters = {shown.name: shown.counters["dropped"] for shown in scene.manager.snapshots()}
+        assert counters == {"toy.2": 10, "toy.3": 0}
+        slow.take_all()
+        await soon()
+        assert slow.heard() == [b"%d" % number for number in range(LIMIT)]
+
+
+@jumping
+async def test_of_a_stream_a_slow_client_gets_the_newest() -> None:
+    async with serving() as scene:
+        slow = scene.connect().greeted()
+        await soon()
+        slow.take_nothing()
+        for number in range(100):
+            scene.say(topics.POSE, Pose(x=float(number), y=0.0, heading=0.0))
+        slow.take_all()
+        await soon()
+        assert slow.heard() == [b"at 99"]
+        assert scene.count("hq_dropped") == 0
+
+
+@jumping
+async def test_what_cannot_be_shown_is_counted_and_hurts_nobody() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        scene.say(topics.LIDAR, Switch(on=True))
+        assert scene.count("hq_left_out") == 1
+        scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+        assert program.heard() == [b"at 1"]
+
+
+@jumping
+async def test_nothing_is_encoded_for_nobody() -> None:
+    async with serving() as scene:
+        scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+        assert scene.side.encoded == 0
+
+
+# Control
+
+
+@jumping
+async def test_a_client_drives_and_its_name_is_shown() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.taken() == [("drive", Drive(forward=0.5))]
+        assert scene.gateway.report().holder == "hq.toy.2"
+        assert KEYS.alive("hq.toy.2") in scene.bus._shared.tokens
+
+
+@jumping
+async def test_a_refused_client_is_told_why_and_not_all_the_time() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        for _ in range(10):
+            program.say(b"go")
+            await asyncio.sleep(0.02)
+        assert program.heard() == [b"! connected: let go of the stick first"]
+        assert (scene.count("hq_refused"), scene.manager.snapshots()[0].counters["refused"]) == (10, 10)
+        await asyncio.sleep(TELL_S)
+        program.say(b"go")
+        await soon()
+        assert program.heard() == [b"! connected: let go of the stick first"]
+
+
+@jumping
+async def test_one_drives_and_another_is_told_who() -> None:
+    async with serving() as scene:
+        first, second = scene.connect().greeted(), scene.connect().greeted()
+        first.say(b"stand", b"go")
+        await soon()
+        second.say(b"stand", b"go")
+        await soon()
+        assert second.heard() == [b"! not driving: held by hq.toy.2 (priority 0)"]
+        assert first.heard() == []
+
+
+@jumping
+async def test_a_client_that_lost_the_robot_is_told_and_the_idle_ones_are_not() -> None:
+    async with serving() as scene:
+        first, second = scene.connect().greeted(), scene.connect().greeted()
+        first.say(b"stand", b"go")
+        await soon()
+        scene.gateway.authority.takeover(Acquire(who="operator"), scene.now)
+        scene.report()
+        await soon()
+        assert first.heard() == [b"! not driving: the lease has ended (taken over by operator)"]
+        assert second.heard() == []
+
+
+@pytest.mark.parametrize("end", ["leaves", "floods", "rubbish", "stalls"])
+@jumping
+async def test_a_driver_that_is_lost_in_any_way_gives_the_robot_back(end: str) -> None:
+    async with serving(rate_hz=100.0) as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.report().holder == "hq.toy.2"
+        if end == "leaves":
+            program.leave()
+        elif end == "floods":
+            program.say(*[b"go"] * 200)
+        elif end == "rubbish":
+            program.receiver.received(b"\xff")
+        else:
+            program.take_nothing()
+            for _ in range(70):
+                program.say(b"go")
+                await asyncio.sleep(0.1)
+        await soon()
+        assert scene.gateway.report().state == "free"
+        assert KEYS.alive("hq.toy.2") not in scene.bus._shared.tokens
+        assert scene.listener.clients == {}
+
+
+@jumping
+async def test_a_driver_that_is_closed_gives_the_robot_back_before_its_last_words_are_out() -> None:
+    async with serving(idle_s=1.0) as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        program.take_nothing()
+        scene.say(topics.TEXT, Text(text="last words"))
+        for _ in range(40):
+            if not scene.listener.clients[2].session.over:
+                await asyncio.sleep(0.05)
+        assert scene.listener.clients[2].session.state is State.CLOSING
+        assert scene.gateway.report().state == "free"
+
+
+@jumping
+async def test_motion_that_is_not_repeated_ends_with_the_deadman_and_the_lease_follows() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await asyncio.sleep(1.3)
+        program.say(b"go")
+        await soon()
+        assert program.heard() == [b"! deadman: let go of the stick first"]
+        await asyncio.sleep(2.0)
+        assert scene.gateway.report().holder is None
+        assert scene.listener._active == set()
+
+
+@jumping
+async def test_what_a_robot_refuses_is_told_to_whom_it_was_refused() -> None:
+    async with serving() as scene:
+        first, second = scene.connect().greeted(), scene.connect().greeted()
+        first.say(b"stand", b"go")
+        await soon()
+        scene.gateway.authority.hold_back("busy: map")
+        first.say(b"go")
+        scene.report()
+        assert first.heard() == [b"! drive: busy: map: send a neutral drive first"]
+        assert second.heard() == []
+        first.say(b"stand", b"go")
+        assert [message for _, message in scene.gateway.taken()][-1] == Drive(forward=0.5)
+
+
+# The robot comes and goes
+
+
+@jumping
+async def test_clients_are_told_when_the_robot_goes_and_comes() -> None:
+    async with serving() as scene:
+        program, early = scene.connect().greeted(), scene.connect()
+        early.heard()
+        scene.go()
+        scene.go()
+        assert program.heard() == [b"! no gateway serves the robot"]
+        assert early.heard() == [], "not before the handshake"
+        await asyncio.sleep(TELL_S)
+        scene.come()
+        scene.say(topics.STATUS, STATUS)
+        assert program.heard() == [b"! the robot is there"]
+        scene.say(topics.STATUS, Status(state="offline", reason="no route", protocol="toy"))
+        assert program.heard() == [b"! robot offline: no route"]
+
+
+@jumping
+async def test_a_client_that_comes_while_the_robot_is_away_is_told_so() -> None:
+    async with serving(robot=False) as scene:
+        program = scene.connect()
+        program.say(b"hi")
+        assert program.heard() == [b"who are you", b"welcome", b"! no gateway serves the robot"]
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.asked == []
+        scene.come()
+        assert program.heard() == [b"! the robot is there"]
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.report().holder == "hq.toy.2"
+
+
+@jumping
+async def test_a_driver_whose_gateway_went_must_let_go_first() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        scene.go()
+        assert b"! not driving: the robot's gateway is gone" in program.heard()
+        scene.come()
+        scene.gateway.authority.stop("a new gateway knows of no lease")
+        scene.gateway.taken()
+        program.say(b"go")
+        await soon()
+        assert scene.gateway.taken() == []
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.report().holder == "hq.toy.2"
+
+
+# Questions
+
+
+def answering(scene: Scene, topic: Topic, answer: Callable[[Question], None]) -> list[Question]:
+    asked: list[Question] = []
+
+    def take(question: Question) -> None:
+        asked.append(question)
+        answer(question)
+
+    scene.gateway.bus.answer(KEYS.key(topic.path), take)
+    return asked
+
+
+@jumping
+async def test_a_question_of_many_is_asked_once_and_answered_to_each() -> None:
+    async with serving() as scene:
+        asked = answering(scene, topics.RPC_MAP, lambda question: question.answer(payloads.encode(MAP)))
+        programs = [scene.connect().greeted() for _ in range(5)]
+        for program in programs[:4]:
+            program.say(b"map?", b"map?")
+        await soon()
+        assert len(asked) == 1
+        assert [program.heard() for program in programs] == [[b"@rpc/map: Map"]] * 4 + [[]]
+        programs[0].say(b"map?")
+        await soon()
+        assert len(asked) == 2, "what is asked later is asked anew"
+        assert programs[0].heard() == [b"@rpc/map: Map"]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda question: None,
+        lambda question: question.refuse("robot: busy"),
+        lambda question: question.answer(b"\xc1"),
+        lambda question: question.answer(payloads.pack({"rows": 7})),
+    ],
+)
+@jumping
+async def test_a_question_without_an_answer_is_answered_with_what_is_known(answer: Callable[[Question], None]) -> None:
+    async with serving() as scene:
+        answering(scene, topics.RPC_POSE, answer)
+        program = scene.connect().greeted()
+        for _ in range(2):
+            program.say(b"pose?")
+            await soon()
+            assert program.heard() == [b"@rpc/pose: NoneType"]
+
+
+@jumping
+async def test_a_bus_that_cannot_be_asked_leaves_no_question_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving() as scene:
+
+        async def fails(*args: Any, **kwargs: Any) -> list[Answer]:
+            raise BusError("the bus is closed")
+
+        monkeypatch.setattr(scene.bus, "ask", fails)
+        program = scene.connect().greeted()
+        for _ in range(2):
+            program.say(b"map?")
+            await soon()
+            assert program.heard() == [b"@rpc/map: NoneType"]
+
+
+@jumping
+async def test_a_client_that_asked_and_left_is_not_answered_and_the_others_are() -> None:
+    async with serving() as scene:
+        answering(scene, topics.RPC_MAP, lambda question: question.answer(payloads.encode(MAP)))
+        first, second = scene.connect().greeted(), scene.connect().greeted()
+        first.say(b"map?")
+        second.say(b"map?")
+        first.leave()
+        await soon()
+        assert (first.heard(), second.heard()) == ([], [b"@rpc/map: Map"])
+
+
+@jumping
+async def test_different_questions_do_not_wait_for_each_other() -> None:
+    async with serving() as scene:
+        answering(scene, topics.RPC_MAP, lambda question: question.answer(payloads.encode(MAP)))
+        program = scene.connect().greeted()
+        program.say(b"map?", b"pose?")
+        await soon()
+        assert sorted(program.heard()) == [b"@rpc/map: Map", b"@rpc/pose: NoneType"]
+
+
+# What is followed only now and then
+
+
+@jumping
+async def test_what_a_client_wants_is_followed_while_one_wants_it() -> None:
+    async with serving() as scene:
+        first, second = scene.connect().greeted(), scene.connect().greeted()
+        scan = Scan(0.0, 0.1, 0.1, 10.0, np.ones(3, np.float32))
+        scene.say(topics.SCAN, scan)
+        assert scene.side.encoded == 0
+        first.say(b"scans on")
+        second.say(b"scans on")
+        scene.say(topics.SCAN, scan)
+        assert scene.side.encoded == 1
+        assert (first.heard(), second.heard()) == ([b"scan"], [b"scan"])
+        first.say(b"scans off")
+        scene.say(topics.SCAN, scan)
+        assert (first.heard(), second.heard()) == ([], [b"scan"])
+        second.leave()
+        await soon()
+        scene.say(topics.SCAN, scan)
+        assert scene.side.encoded == 2, "nobody wants it"
+
+
+# The end
+
+
+@jumping
+async def test_an_ending_listener_takes_leave_of_all_and_gives_the_robot_back() -> None:
+    async with serving() as scene:
+        driver, idle, early = scene.connect().greeted(), scene.connect().greeted(), scene.connect()
+        driver.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.report().holder == "hq.toy.2"
+        listener = scene.listener
+    assert all(program.link.closed for program in (driver, idle, early))
+    assert {shown.reason for shown in scene.manager.snapshots()} == {"gateway stopped"}
+    assert scene.gateway.report().state == "free"
+    assert scene.bus._shared.tokens == [KEYS.alive("gateway")]
+    await soon()
+    assert listener.clients == {}
+    assert len(asyncio.all_tasks()) == 1
+    late = Program(scene.accept(), "tcp://10.0.0.1:1")
+    assert late.link.closed
+
+
+@jumping
+async def test_an_ending_listener_does_not_wait_long_for_a_client_that_takes_nothing() -> None:
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.take_nothing()
+        scene.say(topics.TEXT, Text(text="last words"))
+        start = scene.loop.time()
+    assert scene.loop.time() - start <= 1.0
+    assert program.link.closed
+
+
+@jumping
+async def test_a_listener_and_its_clients_print_themselves() -> None:
+    async with serving() as scene:
+        scene.connect()
+        assert repr(scene.listener) == "<Listener toy tcp://127.0.0.1:11002, 1 clients>"
+        assert repr(scene.listener.clients[2]) == "<Client 2 <ToySession toy.2 handshaking>>"

@@ -800,7 +800,7 @@ async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_helm() -> 
 # Refusals
 
 
-def refusals(*entries: tuple[str, str, str, int]) -> Control:
+def refusals(*entries: tuple[str | None, str, str, int]) -> Control:
     return Control(
         state="held",
         holder="hq.toy.1",
@@ -822,6 +822,29 @@ async def test_what_was_refused_to_others_is_not_told() -> None:
     helm = await scene.driving()
     helm.look(refusals(("operator", "drive", "busy", 1), ("hq.toy.11", "drive", "busy", 1)))
     assert scene.told == []
+
+
+async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a_command() -> None:
+    scene = Scene()
+    asking, idle = scene.helm(), scene.helm("hq.toy.2")
+    asking.command(topics.CMD_LIDAR, Switch(True))
+    refused = (None, "lidar", "the robot has no such command", 1)
+    for helm in (idle, asking):
+        helm.look(refusals(refused, (None, "text", "no", 1)))
+    assert scene.told == ["lidar: the robot has no such command"]
+    scene.now += 1.0
+    asking.look(refusals((*refused[:3], 2)))
+    assert len(scene.told) == 1
+
+
+async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:
+    scene = Scene(protocol="other")
+    helm = scene.helm(needs_mode=True, modes="toy")
+    helm.command(topics.CMD_DRIVE, STAND)
+    with pytest.raises(Refused, match="does not move by itself"):
+        helm.command(topics.CMD_MODE, Mode("autonomous"))
+    await scene.settle()
+    assert (scene.gateway.asked, helm.intent.mode) == ([], "none")
 
 
 async def test_what_was_refused_to_a_program_of_this_name_before_is_not_told() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -39,6 +40,8 @@ REPEAT_S = 0.1
 """Seconds between repetitions of what a client set once."""
 WAITING = 64
 """Commands of one client that may wait for the bus besides motion; one more is refused."""
+OURS_S = 1.0
+"""Seconds within which a refusal that bears no name is taken for that of a client's command."""
 _encode = msgspec.msgpack.Encoder().encode
 
 
@@ -125,7 +128,9 @@ class Helm:
         """Questions under way that give the robot back."""
         self._closed = False
         self._due = 0.0
-        self._seen: dict[tuple[str, str], int] = {}
+        self._seen: dict[tuple[str | None, str, str], int] = {}
+        self._open: dict[str, float] = {}
+        """When commands were last given that need no lease, and so bear no name."""
         self._handle: Handle | None = None
         if bridge.view.control is not None:  # what was refused to a client of our name before us
             self._new_refusals(bridge.view.control)
@@ -151,6 +156,7 @@ class Helm:
             self._require_robot()
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
+            self._open[topic.path.removeprefix("@cmd/")] = now
             self._bridge.put(topic, message)
 
     def tick(self) -> None:
@@ -195,11 +201,12 @@ class Helm:
             self._lose("the robot's gateway is gone")
 
     def _new_refusals(self, control: Control) -> list[Refusal]:
-        news, seen = [], {}
+        news, seen, now = [], {}, self._clock()
         for refusal in control.refusals:
-            if refusal.who == self.who:
-                key = (refusal.command, refusal.reason)
-                if refusal.count != self._seen.get(key, 0):
+            lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
+            if refusal.who == self.who or refusal.who is None:
+                key = (refusal.who, refusal.command, refusal.reason)
+                if refusal.count != self._seen.get(key, 0) and (refusal.who is not None or lately):
                     news.append(refusal)
                 seen[key] = refusal.count
         self._seen = seen

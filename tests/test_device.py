@@ -31,7 +31,6 @@ from zbridge.metrics import Metrics
 from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
 from zbridge.session.motion import MotionLimits
-from zbridge.session.session import State
 
 ADDRESS = Address("robot.test", 11001)
 LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
@@ -421,7 +420,7 @@ async def test_a_malformed_packet_costs_nothing_but_itself() -> None:
 async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_one() -> None:
     async with established() as rig:
         (shown,) = rig.manager.snapshots()
-        assert (shown.name, shown.peer, shown.state) == ("robot", "tcp://robot.test:11001", State.ESTABLISHED)
+        assert (shown.name, shown.peer, shown.state) == ("robot", "tcp://robot.test:11001", "established")
         rig.goes()
         await rig.settle()
         assert [shown.reason for shown in rig.manager.snapshots()] == ["closed by peer"]

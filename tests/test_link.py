@@ -197,6 +197,14 @@ async def test_what_was_written_before_closing_arrives() -> None:
         assert pair.far.data == b"last words"
 
 
+async def test_a_peer_whose_machine_answers_is_not_silent_even_if_its_program_reads_nothing() -> None:
+    async with connected() as pair:
+        pair.here.pause()
+        pair.there.write(b"x" * 100)
+        await asyncio.sleep(0.1)
+        assert pair.there.silent_s == pair.here.silent_s == 0.0
+
+
 async def test_a_lost_link_takes_calls_without_effect() -> None:
     async with connected() as pair:
         pair.there.close()

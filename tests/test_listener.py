@@ -697,6 +697,28 @@ async def test_a_client_drives_and_its_name_is_shown() -> None:
 
 
 @jumping
+async def test_what_a_client_holds_is_repeated_until_its_machine_falls_silent() -> None:
+    async with serving() as scene:
+        scene.side.hold = True
+        program = scene.connect().greeted()
+        program.say(b"stand", b"go")
+        await asyncio.sleep(4.0)
+        assert scene.gateway.report().holder == "hq.toy.2"
+        assert scene.gateway.taken()[-1] == ("drive", Drive(forward=0.5))
+        program.link.silent_s = 1.2
+        await asyncio.sleep(0.3)
+        assert scene.gateway.report().holder is None
+        scene.gateway.taken()
+        program.link.silent_s = 0.0
+        program.say(b"go")
+        await soon()
+        assert scene.gateway.taken() == []
+        program.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.taken() == [("drive", Drive(forward=0.5))]
+
+
+@jumping
 async def test_a_refused_client_is_told_why_and_not_all_the_time() -> None:
     async with serving() as scene:
         program = scene.connect().greeted()

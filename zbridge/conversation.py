@@ -13,6 +13,8 @@ from zbridge.session.session import Datagram, Session, State
 
 log = logging.getLogger("zbridge.link")
 
+_ESTABLISHED = State.ESTABLISHED
+
 
 class Conversation:
     """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
@@ -101,6 +103,7 @@ class Conversation:
         """Write what may be written now, and set the timer for what may not."""
         self._before()
         session, link = self.session, self._link
+        outbox = session.outbox
         while link is not None and link.ready:
             frame = session.outgoing(self._clock())
             if frame is None:
@@ -109,7 +112,9 @@ class Conversation:
                 link.write_datagram(frame)
             else:
                 link.write(frame)
-            session.outbox.written(self._clock())
+            outbox.written(self._clock())
+            if session.state is _ESTABLISHED and (outbox.gap_s or outbox.idle):
+                break  # nothing more may be written now
         self._notify()
         if session.state is State.CLOSED:
             self._end()
@@ -125,6 +130,11 @@ class Conversation:
     def stalled(self) -> bool:
         """Whether the peer does not take what was written."""
         return self._link is not None and not self._link.ready
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the peer's machine has owed an answer."""
+        return self._link.silent_s if self._link is not None else 0.0
 
     def cut(self, reason: str) -> None:
         """End the conversation and its link at once, and say why; what was written is lost."""

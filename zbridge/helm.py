@@ -177,6 +177,12 @@ class Helm:
             self._due = now + intent.lease_s / 3
             self._doubt()
 
+    def let_go(self, why: str) -> None:
+        """Give the robot back: whether the client still means what it said, nobody can tell."""
+        if self.intent.held:
+            self._release(why)
+            self.intent.lost(why)
+
     def close(self) -> None:
         """Give the robot back: the client is gone; idempotent."""
         if not self._closed:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Protocol, cast
 from urllib.parse import urlsplit
@@ -23,6 +24,10 @@ CLIENT_READ_BYTES = 4096
 """The same for a peer that connected to us: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes the kernel keeps for a peer that connected to us and reads slowly: what is older than that helps nobody."""
+KEEPALIVE_S = 1
+"""Seconds of silence after which a peer that connected to us is asked whether it is there."""
+_TCP_INFO = struct.Struct("=24xI28xI")
+"""Of Linux's tcp_info: segments not acknowledged, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
 """Seconds a peer is given to take what was written before its connection was closed."""
 CONNECT_S = 5.0
@@ -94,6 +99,10 @@ class Link(Protocol):
     def write_datagram(self, data: bytes) -> None:
         """Send ``data`` as one datagram to the peer; lost where the network takes none."""
 
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the peer's machine has owed an answer: it was unplugged, or its network is in trouble."""
+
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
 
@@ -149,6 +158,19 @@ class TcpLink(asyncio.BufferedProtocol):
                 self._datagrams = DatagramSocket(self._transport, self._receiver)
             self._datagrams.send(data)
 
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the peer's machine has owed an answer: it was unplugged, or its network is in trouble."""
+        if self._transport is None or not hasattr(socket, "TCP_INFO"):
+            return 0.0
+        sock = self._transport.get_extra_info("socket")
+        info = sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+        if len(info) < _TCP_INFO.size:
+            return 0.0
+        unacknowledged, heard_ms = _TCP_INFO.unpack(info)
+        silent_s: float = heard_ms / 1000 - (0.0 if unacknowledged else KEEPALIVE_S)
+        return max(0.0, silent_s)
+
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
         if self._transport is not None and self._transport.is_reading():
@@ -185,6 +207,7 @@ class TcpLink(asyncio.BufferedProtocol):
         sock = transport.get_extra_info("socket")
         _tune(sock)
         if self._accepted:
+            _keep_alive(sock)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
@@ -224,6 +247,13 @@ def _tune(sock: socket.socket) -> None:
         ("TCP_KEEPCNT", 3),
         ("TCP_USER_TIMEOUT", 10_000),
     ):
+        if hasattr(socket, option):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def _keep_alive(sock: socket.socket) -> None:
+    """Ask a silent peer every second whether it is there; the connection is given up as late as any other."""
+    for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
         if hasattr(socket, option):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
@@ -392,6 +422,7 @@ class FakeLink:
     def __init__(self, peer: str = "tcp://robot.test:1") -> None:
         self.peer = peer
         self.ready = True
+        self.silent_s = 0.0
         self.written: list[bytes] = []
         self.datagrams: list[bytes] = []
         self.paused = False

@@ -137,6 +137,8 @@ class Listener:
         while True:
             await asyncio.sleep(REPEAT_S)
             for client in tuple(self._active):
+                if self._side.hold and client.conversation.silent_s > self._side.deadman_s - REPEAT_S:
+                    client.helm.let_go("the connection is silent")
                 client.helm.tick()
                 if not client.helm.active:
                     self._active.discard(client)

@@ -29,7 +29,7 @@ from typing import Any
 import msgpack
 import zenoh
 
-from tests.e2e.lost_driver import (
+from tests.e2e.loss import (
     SCALE,
     STOP,
     Frame,
@@ -193,7 +193,7 @@ def fight(seconds: float, seed: int = 1) -> Story:
     """Let two drivers fight for a robot, and gather what everybody saw."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         audit = Path(folder) / "audit"
-        scene = Scene(stack, control=f"audit = {json.dumps(str(audit))}\naudit_bytes = 1_000_000_000\n")
+        scene = Scene(stack, parts=f"[control]\naudit = {json.dumps(str(audit))}\naudit_bytes = 1_000_000_000\n")
         story = Story(frames=scene.robot.frames, clock_s=time.time() - time.monotonic())
         stack.enter_context(
             scene.session.declare_subscriber(

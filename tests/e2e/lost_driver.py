@@ -3,9 +3,8 @@
     python -m tests.e2e.lost_driver                              # killed, frozen, cut 100 times; other ways 10 times
     python -m tests.e2e.lost_driver --way cut --deadman 0.5 --repetitions 20
 
-A real gateway process, a router and a driver in processes of their own, and a robot on a real socket, played here.
-Every command of the driver has a value of its own; the time runs from the first arrival of the last value at the robot
-to the first stop that arrives there. A driver is cut off by unplugging the network namespace that it runs in.
+The driver is a program on the bus that holds the lease, in a process of its own. Every command has a value of its own.
+A driver is cut off by unplugging the network namespace that it runs in.
 """
 
 from __future__ import annotations
@@ -13,141 +12,46 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import json
-import math
 import os
 import random
 import select
-import shutil
-import signal
-import socket
-import struct
-import subprocess
 import sys
-import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgpack
 import zenoh
 
-from tests.e2e.conftest import free_port, until
-from tests.e2e.robots import SETTINGS
+from tests.e2e.conftest import until
+from tests.e2e.loss import (
+    LATE_S,
+    SCALE,
+    NotHereError,
+    Result,
+    Scene,
+    Way,
+    authorization,
+    be_measurement,
+    commander,
+    configuration,
+    cut_driver_off,
+    freeze_driver,
+    freeze_gateway,
+    heading,
+    kill_driver,
+    let_driver_end,
+    measured,
+    measured_apart,
+    mend_cable,
+    query,
+    thaw_driver,
+)
 
 DEADMAN_S = 0.2
-LATE_S = 0.05
-"""Seconds after the deadman in which the stop must be at the robot."""
 LEASE_S = 1.0
-FROZEN_S = 0.8
-"""Seconds for which a gateway is frozen after the deadman."""
-MOVE, ROTATE, STOP = 11, 12, 13
-SCALE = 1_000_000
-"""A driver's command number n is the speed n / SCALE."""
 FEW = 10
 """Repetitions of the ways that are measured for the documentation only."""
-
-
-# The robot
-
-
-class Frame(NamedTuple):
-    """One packet that the robot got, and when."""
-
-    at: float
-    packet_id: int
-    body: bytes
-
-    @property
-    def moves(self) -> bool:
-        """Whether the packet sets the robot moving."""
-        return self.packet_id in (MOVE, ROTATE)
-
-    @property
-    def number(self) -> int:
-        """The driver's number of the command that this packet carries; negative when driving backwards."""
-        _, forward, speed = struct.unpack("<fff", self.body)
-        return round(forward * speed * SCALE)
-
-
-class Robot:
-    """A robot of the TCP/UDP package protocol: takes one HQ after the other, and keeps every packet with its time."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-        self.ended: list[float] = []
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self._server.getsockname()[1])
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-
-    def _serve(self) -> None:
-        while True:
-            try:
-                peer, _ = self._server.accept()
-            except OSError:
-                return
-            with peer, contextlib.suppress(OSError):
-                peer.sendall(SETTINGS)
-                self._read(peer)
-            self.ended.append(time.monotonic())
-
-    def _read(self, peer: socket.socket) -> None:
-        waiting = b""
-        while data := peer.recv(65536):
-            at = time.monotonic()
-            waiting += data
-            while len(waiting) >= 4 and len(waiting) >= (end := 4 + int.from_bytes(waiting[:4], "little")):
-                self.frames.append(Frame(at, waiting[5], waiting[6:end]))
-                waiting = waiting[end:]
-
-
-# The bus
-
-
-def configuration(mode: str, endpoints: Iterable[str]) -> zenoh.Config:
-    """Configure a session without multicast: a router that listens, or a client that connects."""
-    config = zenoh.Config()
-    config.insert_json5("mode", json.dumps(mode))
-    config.insert_json5(f"{'listen' if mode == 'router' else 'connect'}/endpoints", json.dumps(list(endpoints)))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return config
-
-
-def query(session: zenoh.Session, path: str, **fields: Any) -> dict[str, Any]:
-    """Ask ``fleet/r1/<path>``; {} where nobody answers or the question was refused."""
-    replies = session.get(f"fleet/r1/{path}", payload=msgpack.packb(fields), timeout=1.0)
-    answers = [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok]
-    return answers[0] if answers else {}
-
-
-def commander(session: zenoh.Session, path: str) -> zenoh.Publisher:
-    """Declare a publisher for ``fleet/r1/@cmd/<path>``, of the class that the design gives a command."""
-    return session.declare_publisher(
-        f"fleet/r1/@cmd/{path}",
-        priority=zenoh.Priority.REAL_TIME,
-        congestion_control=zenoh.CongestionControl.DROP if path == "drive" else zenoh.CongestionControl.BLOCK,
-        express=True,
-    )
-
-
-def authorization(token: bytes, seq: int) -> bytes:
-    """Write what shows that a command is the holder's."""
-    return bytes(msgpack.packb({"token": token, "seq": seq}))
-
-
-def be_router(endpoint: str) -> None:
-    """Be a router until stdin ends."""
-    with zenoh.open(configuration("router", [endpoint])):
-        print("open", flush=True)
-        sys.stdin.read()
 
 
 def be_driver(endpoint: str, deadman_s: float, rate_hz: float, first: int) -> None:
@@ -170,241 +74,23 @@ def be_driver(endpoint: str, deadman_s: float, rate_hz: float, first: int) -> No
         announced.undeclare()
 
 
-# Processes
+class DriverScene(Scene):
+    """With a driver that is on the bus."""
 
-
-def start(*command: str) -> subprocess.Popen[str]:
-    """Start a part of the scene that ends when its stdin does."""
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-
-
-def kill(process: subprocess.Popen[str]) -> None:
-    """End a process by its id, whatever state it is in; idempotent."""
-    process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            stream.close()
-
-
-def part(name: str, *arguments: object) -> list[str]:
-    """Give the command that runs a part of this module."""
-    return [sys.executable, "-m", "tests.e2e.lost_driver", "--be", name, *map(str, arguments)]
-
-
-class Watch:
-    """A process on each processor that sleeps and wakes: late, that processor was late with everything."""
-
-    def __init__(self, stack: contextlib.ExitStack) -> None:
-        self._late: list[list[tuple[float, float]]] = []
-        for processor in sorted(os.sched_getaffinity(0))[:8]:
-            process = start(*part("watch", processor))
-            stack.callback(kill, process)
-            late: list[tuple[float, float]] = []
-            self._late.append(late)
-            reader = threading.Thread(target=self._read, args=(process, late), daemon=True)
-            reader.start()
-            stack.callback(reader.join, 5)
-            stack.callback(process.kill)
-
-    @property
-    def late_s(self) -> float:
-        """The longest time that one was late."""
-        return max((woke - due for late in self._late for due, woke in late), default=0.0)
-
-    def late_between(self, begin: float, end: float) -> float:
-        """Give how much of a stretch of time one was late for, seconds."""
-        return max(sum(max(0.0, min(woke, end) - max(due, begin)) for due, woke in late) for late in self._late)
-
-    @staticmethod
-    def _read(process: subprocess.Popen[str], late: list[tuple[float, float]]) -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            due, woke = map(float, line.split())
-            late.append((due, woke))
-
-
-def be_watch(processor: int) -> None:
-    """Tell when we should have woken and when we did, where that differs by more than 5 ms, until stdin ends."""
-    os.sched_setaffinity(0, {processor})
-    due = time.monotonic() + 0.005
-    while not select.select([sys.stdin], [], [], max(0.0, due - time.monotonic()))[0]:
-        woke = time.monotonic()
-        if woke - due > 0.005:
-            print(due, woke, flush=True)
-        due = time.monotonic() + 0.005
-
-
-class Cable:
-    """A network namespace for the driver, and a cable to it. To be used in a namespace of the test's own."""
-
-    HERE, THERE = "10.77.0.1", "10.77.0.2"
-
-    def __init__(self, stack: contextlib.ExitStack) -> None:
-        keeper = start("unshare", "--net", "cat")
-        stack.callback(kill, keeper)
-        assert keeper.stdin is not None
-        assert keeper.stdout is not None
-        keeper.stdin.write("there\n")
-        keeper.stdin.flush()
-        assert keeper.stdout.readline() == "there\n"
-        self.enter = ("nsenter", "--target", str(keeper.pid), "--net")
-        _run("ip", "link", "set", "lo", "up")
-        _run("ip", "link", "add", "here", "type", "veth", "peer", "name", "there", "netns", str(keeper.pid))
-        _run("ip", "address", "add", f"{self.HERE}/30", "dev", "here")
-        _run("ip", "link", "set", "here", "up")
-        _run(*self.enter, "ip", "address", "add", f"{self.THERE}/30", "dev", "there")
-        self.mend()
-
-    def cut(self) -> None:
-        """Take the cable away: nothing passes, and nobody is told."""
-        _run(*self.enter, "ip", "link", "set", "there", "down")
-
-    def mend(self) -> None:
-        """Plug the cable in again."""
-        _run(*self.enter, "ip", "link", "set", "there", "up")
-
-
-def _run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    if done.returncode:
-        raise OSError(f"{' '.join(command)}: {done.stderr.strip() or f'exit {done.returncode}'}")
-
-
-class NotHereError(Exception):
-    """This machine does not let us make network namespaces; says why."""
-
-
-_TRIAL = "ip link set lo up && ip link add here type veth peer name there && unshare --net true"
-_APART = (("unshare", "--net"), ("unshare", "--map-root-user", "--net"))
-
-
-def apart() -> tuple[str, ...]:
-    """Give the command that runs another one in a network namespace of its own; raise NotHereError."""
-    for tool in ("unshare", "nsenter", "ip"):
-        if shutil.which(tool) is None:
-            raise NotHereError(f"no {tool} on this machine")
-    reasons = []
-    for prefix in _APART:
-        try:
-            _run(*prefix, "sh", "-c", _TRIAL)
-        except OSError as error:
-            reasons.append(str(error))
-        else:
-            return prefix
-    raise NotHereError("; ".join(reasons))
-
-
-# The scene
-
-
-class Scene:
-    """A robot, its gateway, a router, an onlooker on the bus, and the driver of the moment."""
-
-    def __init__(self, stack: contextlib.ExitStack, *, cable: bool = False, control: str = "") -> None:
-        self.faults: list[str] = []
-        self.robot = Robot()
-        stack.callback(self.robot.close)
-        self.watch = Watch(stack)
-        self.cable = Cable(stack) if cable else None
-        port = free_port()
-        self.endpoint = f"tcp/127.0.0.1:{port}"
-        self._listen = f"tcp/0.0.0.0:{port}" if cable else self.endpoint
-        self._reach = f"tcp/{Cable.HERE}:{port}" if cable else self.endpoint
-        self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        self._file = self._folder / "r1.toml"
-        self._file.write_text(
-            f'[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{self.robot.port}"]\n'
-            f'[bus]\nconnect = ["{self.endpoint}"]\nmulticast = false\n[control]\n{control}'
-        )
-        self.log = stack.enter_context((self._folder / "log").open("w+"))
-        self.router = self._start_router()
-        stack.callback(lambda: kill(self.router))
-        self.gateway = self._start_gateway()
-        stack.callback(lambda: kill(self.gateway))
-        self.session = stack.enter_context(zenoh.open(configuration("client", [self.endpoint])))
-        self._stop = commander(self.session, "stop")
-        self.driver: subprocess.Popen[str] | None = None
-        self.deadman_s = DEADMAN_S
-        stack.callback(self.end_driver)
-        self.wait()
-
-    @property
-    def driving(self) -> subprocess.Popen[str]:
-        """The driver's process."""
-        assert self.driver is not None
-        return self.driver
-
-    def drive(self, deadman_s: float, rate_hz: float, first: int) -> int:
-        """Start a driver, wait until the robot moves, and tell which of its packets was the first motion."""
-        begun = len(self.robot.frames)
+    def __init__(self, stack: contextlib.ExitStack, *, cable: bool, deadman_s: float) -> None:
+        super().__init__(stack, cable=cable)
         self.deadman_s = deadman_s
-        enter = self.cable.enter if self.cable is not None else ()
-        self.driver = start(*enter, *part("driver", self._reach, deadman_s, rate_hz, first))
-        until(lambda: any(frame.moves for frame in self.robot.frames[begun:]), what="the robot moves")
-        return next(index for index in itertools.count(begun) if self.robot.frames[index].moves)
+        self._firsts = (SCALE // 10 + number * 500 % (SCALE * 8 // 10) for number in itertools.count())
 
-    def end_driver(self) -> None:
-        if self.driver is not None:
-            kill(self.driver)
-            self.driver = None
-
-    def stop(self) -> None:
-        """Stop the robot, as anybody may."""
-        self._stop.put(msgpack.packb({}))
-
-    def wait(self) -> None:
-        """Wait until the gateway is on the bus and the robot can be used."""
-        until(lambda: query(self.session, "status").get("state") == "established", what="established")
-
-    def restart_router(self) -> None:
-        kill(self.router)
-        self.router = self._start_router()
-        self.wait()
-
-    def restart_gateway(self) -> None:
-        kill(self.gateway)
-        self.gateway = self._start_gateway()
-        self.wait()
-
-    def _start_router(self) -> subprocess.Popen[str]:
-        router = start(*part("router", self._listen))
-        assert router.stdout is not None
-        assert router.stdout.readline() == "open\n"
-        return router
-
-    def _start_gateway(self) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "zbridge", "run", str(self._file)]
-        return subprocess.Popen(command, stdout=self.log, stderr=self.log, text=True)
-
-
-# The ways to be lost: each does it and tells when
-
-
-def _kill_driver(scene: Scene) -> float:
-    at = time.monotonic()
-    scene.driving.kill()
-    return at
-
-
-def _freeze_driver(scene: Scene) -> float:
-    at = time.monotonic()
-    scene.driving.send_signal(signal.SIGSTOP)
-    return at
-
-
-def _cut_driver_off(scene: Scene) -> float:
-    assert scene.cable is not None
-    at = time.monotonic()
-    scene.cable.cut()
-    return at
-
-
-def _let_driver_exit(scene: Scene) -> float:
-    assert scene.driving.stdin is not None
-    at = time.monotonic()
-    scene.driving.stdin.close()
-    return at
+    def drive(self, rng: random.Random) -> int:
+        begun = len(self.robot.frames)
+        driver = ["-m", "tests.e2e.lost_driver", "--be", "driver"]
+        wishes = map(str, (self.reach, self.deadman_s, rng.uniform(20, 50), next(self._firsts)))
+        self.start_driver(sys.executable, *driver, *wishes)
+        until(lambda: self.moved(begun) is not None, what="the robot moves")
+        first = self.moved(begun)
+        assert first is not None
+        return first
 
 
 def _take_over(scene: Scene) -> float:
@@ -439,36 +125,6 @@ def _end_gateway(scene: Scene) -> float:
     return at
 
 
-def _freeze_gateway(scene: Scene) -> float:
-    """Freeze the gateway while the driver drives on; the time runs from when it goes on."""
-    scene.gateway.send_signal(signal.SIGSTOP)
-    time.sleep(0.05)
-    quiet = len(scene.robot.frames)
-    time.sleep(scene.deadman_s + FROZEN_S)
-    if len(scene.robot.frames) > quiet:
-        scene.faults.append("a frozen gateway wrote to the robot")
-    at = time.monotonic()
-    scene.gateway.send_signal(signal.SIGCONT)
-    return at
-
-
-# What is done afterwards: the driver that comes back must not move the robot
-
-
-def _nothing(scene: Scene) -> None:
-    return
-
-
-def _thaw_driver(scene: Scene) -> None:
-    scene.driving.send_signal(signal.SIGCONT)
-
-
-def _mend_cable(scene: Scene) -> None:
-    assert scene.cable is not None
-    scene.cable.mend()
-    time.sleep(0.5)  # what waits in TCP's queues is sent again only now
-
-
 def _see_gateway_off(scene: Scene) -> None:
     code = scene.gateway.wait(timeout=5)
     if code != 0:
@@ -476,197 +132,35 @@ def _see_gateway_off(scene: Scene) -> None:
     scene.restart_gateway()
 
 
-@dataclass(frozen=True)
-class Way:
-    """One way to lose the driver, or what stands between it and the robot."""
-
-    lose: Callable[[Scene], float]
-    mend: Callable[[Scene], None] = _nothing
-    often: bool = False
-    connection_ends: bool = False
-    """The robot gets no stop: its connection ends."""
-    resumes: bool = False
-    """The time runs from when it goes on, and then the stop must come before everything else."""
-
-
-WAYS = {
-    "killed": Way(_kill_driver, often=True),
-    "frozen": Way(_freeze_driver, _thaw_driver, often=True),
-    "cut": Way(_cut_driver_off, _mend_cable, often=True),
-    "exited": Way(_let_driver_exit),
+WAYS: dict[str, Way[Scene]] = {
+    "killed": Way(kill_driver, often=True),
+    "frozen": Way(freeze_driver, thaw_driver, often=True),
+    "cut": Way(cut_driver_off, mend_cable, often=True),
+    "exited": Way(let_driver_end),
     "taken-over": Way(_take_over),
     "stopped": Way(_stop),
     "router-killed": Way(_kill_router, Scene.restart_router),
     "gateway-ended": Way(_end_gateway, _see_gateway_off),
     "gateway-killed": Way(_kill_gateway, Scene.restart_gateway, connection_ends=True),
-    "gateway-frozen": Way(_freeze_gateway, resumes=True),
+    "gateway-frozen": Way(freeze_gateway, resumes=True),
 }
-
-
-# Measuring
-
-
-@dataclass
-class Result:
-    """What was measured of one way, in seconds."""
-
-    way: str
-    deadman_s: float
-    since_motion_s: list[float] = field(default_factory=list)
-    since_loss_s: list[float] = field(default_factory=list)
-    disturbed: int = 0
-    """Repetitions that were done again: the driver was late and stopped before it was lost, or the machine was late."""
-    machine_late_s: float = 0.0
-    """How late a processor of this machine was at most, whatever it had to do."""
-    faults: list[str] = field(default_factory=list)
-
-    @property
-    def limit_s(self) -> float:
-        """The longest time from the last motion to the stop."""
-        return self.deadman_s + LATE_S
-
-    @property
-    def late_s(self) -> list[float]:
-        """The times that are too long."""
-        way = WAYS[self.way]
-        if way.resumes:
-            return [time_s for time_s in self.since_loss_s if time_s > LATE_S]
-        return [time_s for time_s in self.since_motion_s if time_s > self.limit_s]
-
-    @property
-    def clean(self) -> bool:
-        """Whether every stop came in time and nothing moved after it."""
-        return bool(self.since_loss_s) and not self.late_s and not self.faults
-
-    def __str__(self) -> str:
-        row = f"{self.way:15} {len(self.since_loss_s):4}  {_distribution(self.since_motion_s)}  "
-        row += f"{_distribution(self.since_loss_s)}  {len(self.late_s):4}  {self.disturbed:9}  {len(self.faults):6}  "
-        row += f"{self.machine_late_s * 1000:7.1f}"
-        return "\n".join([row, *(f"    {fault}" for fault in self.faults[:10])])
-
-
-def heading(deadman_s: float) -> str:
-    """Give the heading of the rows of results."""
-    four = f"{'least':>7} {'median':>7} {'p99':>7} {'most':>7}"
-    return (
-        f"Milliseconds to the first stop at the robot's socket, deadman {deadman_s * 1000:g} ms, "
-        f"limit {(deadman_s + LATE_S) * 1000:g} ms. gateway-killed: to the end of the connection, there is no stop;\n"
-        f"gateway-frozen: since it goes on. machine: how late this machine itself was, at most.\n"
-        f"{'':21} {'since the last motion':^31}  {'since the loss':^31}\n"
-        f"{'way':15} {'n':>4}  {four}  {four}  {'late':>4}  {'disturbed':>9}  {'faults':>6}  {'machine':>7}"
-    )
-
-
-def _distribution(times_s: list[float]) -> str:
-    if not times_s:
-        return " ".join(f"{'-':>7}" for _ in range(4))
-    ordered = sorted(times_s)
-    ranks = (0, (len(ordered) - 1) // 2, math.ceil(0.99 * len(ordered)) - 1, -1)
-    return " ".join(f"{ordered[rank] * 1000:7.1f}" for rank in ranks)
 
 
 def measure(way: str, *, repetitions: int, deadman_s: float = DEADMAN_S, seed: int = 1) -> Result:
     """Lose the driver in one way again and again; raise NotHereError where this machine does not allow it."""
-    if way == "cut":
-        return _measured_apart(way, repetitions=repetitions, deadman_s=deadman_s, seed=seed)
-    return _measured(way, repetitions=repetitions, deadman_s=deadman_s, seed=seed)
-
-
-def _measured_apart(way: str, *, repetitions: int, deadman_s: float, seed: int) -> Result:
-    """Measure in a network namespace of its own: nothing is changed in that of the caller."""
-    command = [*apart(), *part("measurement", way, repetitions, deadman_s, seed)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            output, _ = process.communicate(timeout=60 + 10 * repetitions)
-        except BaseException:
-            process.terminate()
-            raise
-    if process.returncode:
-        raise AssertionError(f"{' '.join(command)}: exit {process.returncode}")
-    return Result(**json.loads(output))
-
-
-def be_measurement(way: str, repetitions: int, deadman_s: float, seed: int) -> None:
-    """Measure here, and print the result for the process that asked."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    print(json.dumps(asdict(_measured(way, repetitions=repetitions, deadman_s=deadman_s, seed=seed))))
-
-
-def _measured(way: str, *, repetitions: int, deadman_s: float, seed: int) -> Result:
-    result, rng = Result(way, deadman_s), random.Random(f"{way} {seed}")
-    with contextlib.ExitStack() as stack:
-        scene = Scene(stack, cable=way == "cut")
-        result.faults = scene.faults
-        firsts = (SCALE // 10 + repetition * 500 % (SCALE * 8 // 10) for repetition in itertools.count())
-        while len(result.since_loss_s) < repetitions:
-            _lose(scene, WAYS[way], next(firsts), rng, result)
-            if result.disturbed > max(2, repetitions // 10):
-                scene.faults.append("disturbed again and again: this machine is too busy")
-                break
-        result.machine_late_s = scene.watch.late_s
+    if way != "cut":
+        return _measured(way, repetitions=repetitions, deadman_s=deadman_s, seed=seed)
+    wishes = (way, repetitions, deadman_s, seed)
+    (result,) = measured_apart("tests.e2e.lost_driver", *wishes, timeout_s=60 + 10 * repetitions)
     return result
 
 
-def _lose(scene: Scene, way: Way, first: int, rng: random.Random, result: Result) -> None:
-    """Let a driver drive, lose it, and note how long it took."""
-    robot = scene.robot
-    ends = len(robot.ended)
-    begun = scene.drive(result.deadman_s, rng.uniform(20, 50), first)
-    time.sleep(rng.uniform(0.2, 0.5))
-    if _stopped(robot.frames[begun:]):
-        scene.end_driver()
-        result.disturbed += 1
-        return
-    lost_at = way.lose(scene)
-    if way.connection_ends:
-        until(lambda: len(robot.ended) > ends, what="end of the connection")
-        stop_at, stop = robot.ended[ends], len(robot.frames)
-    else:
-        stop = until(lambda: _stop_since(robot.frames, begun, lost_at), what="stop")
-        stop_at = robot.frames[stop].at
-    way.mend(scene)
-    time.sleep(0.3)
-    scene.end_driver()
-    driven = robot.frames[begun:stop]
-    scene.faults += _motion_faults(way, driven, robot.frames[stop:], lost_at, stop_at)
-    since, limit_s = (lost_at, LATE_S) if way.resumes else (_last_motion(driven).at, result.limit_s)
-    too_long_s = stop_at - since - limit_s
-    machine_late_s = scene.watch.late_between(since, stop_at)
-    if _stopped(driven) or 0 < too_long_s <= machine_late_s:
-        result.disturbed += 1
-        return
-    if too_long_s > 0:
-        times = f"{(stop_at - since) * 1000:.0f} ms, {(stop_at - lost_at) * 1000:.0f} ms of it since the loss"
-        scene.faults.append(f"late: {times}; this machine was late for {machine_late_s * 1000:.0f} ms")
-    result.since_loss_s.append(stop_at - lost_at)
-    if not way.resumes:
-        result.since_motion_s.append(stop_at - since)
-
-
-def _motion_faults(way: Way, driven: list[Frame], after: list[Frame], lost_at: float, stop_at: float) -> list[str]:
-    """Tell of motions that should not have come, whoever was late."""
-    found = []
-    if way.resumes and (stale := [frame for frame in driven if frame.moves and frame.at >= lost_at]):
-        found.append(f"a gateway that went on sent {len(stale)} motions before its stop")
-    if moved := [frame for frame in after if frame.moves]:
-        found.append(f"{len(moved)} motions after the stop, the first {(moved[0].at - stop_at) * 1000:.0f} ms after it")
-    return found
-
-
-def _stopped(frames: Iterable[Frame]) -> bool:
-    return any(frame.packet_id == STOP for frame in frames)
-
-
-def _stop_since(frames: list[Frame], begun: int, lost_at: float) -> int | None:
-    """Find the first stop that came after the loss."""
-    found = (i for i in range(begun, len(frames)) if frames[i].packet_id == STOP and frames[i].at >= lost_at)
-    return next(found, None)
-
-
-def _last_motion(frames: list[Frame]) -> Frame:
-    """Find the first arrival of the last value: a motion is repeated while the robot moves."""
-    motions = [frame for frame in frames if frame.moves]
-    return next(frame for frame in motions if frame.body == motions[-1].body)
+def _measured(way: str, *, repetitions: int, deadman_s: float, seed: int) -> Result:
+    resumes = WAYS[way].resumes
+    result = Result(way, LATE_S if resumes else deadman_s + LATE_S, from_loss=resumes)
+    with contextlib.ExitStack() as stack:
+        scene = DriverScene(stack, cable=way == "cut", deadman_s=deadman_s)
+        return measured(scene, WAYS[way], result, repetitions=repetitions, rng=random.Random(f"{way} {seed}"))
 
 
 def results(ways: Iterable[str], *, repetitions: int, deadman_s: float, seed: int) -> Iterator[Result | str]:
@@ -679,11 +173,14 @@ def results(ways: Iterable[str], *, repetitions: int, deadman_s: float, seed: in
             yield f"{way:15} skipped: {error}"
 
 
+def _be_measurement(way: str, repetitions: str, deadman_s: str, seed: str) -> None:
+    wishes: dict[str, Any] = {"repetitions": int(repetitions), "deadman_s": float(deadman_s), "seed": int(seed)}
+    be_measurement(lambda: [_measured(way, **wishes)])
+
+
 _PARTS: dict[str, Callable[..., None]] = {
-    "router": be_router,
-    "watch": lambda processor: be_watch(int(processor)),
     "driver": lambda endpoint, *rest: be_driver(endpoint, float(rest[0]), float(rest[1]), int(rest[2])),
-    "measurement": lambda way, *rest: be_measurement(way, int(rest[0]), float(rest[1]), int(rest[2])),
+    "measurement": _be_measurement,
 }
 
 
@@ -697,7 +194,7 @@ def main() -> None:
     parser.add_argument("--way", choices=(*WAYS, "all"), default="all")
     parser.add_argument("--seed", type=int, default=os.getpid(), help="of the moments and rates")
     wanted = parser.parse_args()
-    print(heading(wanted.deadman), flush=True)
+    print(heading(), flush=True)
     ways = WAYS if wanted.way == "all" else (wanted.way,)
     failed = False
     for result in results(ways, repetitions=wanted.repetitions, deadman_s=wanted.deadman, seed=wanted.seed):

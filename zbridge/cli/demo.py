@@ -7,6 +7,7 @@ import contextlib
 import json
 import math
 import os
+import random
 import socket
 import sys
 import tempfile
@@ -134,10 +135,13 @@ async def _router() -> tuple[Bus, str]:
 
 
 def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """Find a port, for TCP and UDP, that nobody is given by chance before it is used."""
+    while True:
+        port = random.randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", port))
+            udp.bind(("127.0.0.1", port))
+            return port
 
 
 @contextlib.asynccontextmanager

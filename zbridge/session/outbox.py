@@ -66,6 +66,11 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._exempt) + len(self._urgent) + len(self._queue)
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits and nothing stands."""
+        return not (self._standing or self._queue or self._urgent or self._exempt)
+
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when too many wait."""
         if len(self._queue) >= self._limit:
@@ -142,6 +147,8 @@ class Outbox:
 
     def deadline(self) -> float | None:
         """Tell when :meth:`take` will have something, None when nothing waits or stands."""
+        if self.idle:
+            return None
         if self._exempt:
             return self._free_at
         free_at = max(self._free_at, self._quiet_until)
@@ -155,6 +162,9 @@ class Outbox:
         """Pick a due slot; slots take turns with the queue."""
         if not self._standing:
             return None
+        if len(self._standing) == 1 and not self._queue:  # of a robot that is shown to many, nearly always
+            slot, standing = next(iter(self._standing.items()))
+            return slot if standing.due <= now else None
         due = [slot for slot, standing in self._standing.items() if standing.due <= now]
         if not due or (self._queue and self._turn_of_queue and not self.held):
             return None

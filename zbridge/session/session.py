@@ -48,6 +48,10 @@ class State(Enum):
     CLOSED = "closed"
 
 
+_CLOSING, _CLOSED = State.CLOSING, State.CLOSED
+"""As plain names: every message asks several times, and looking a member up in its class is slow in Python 3.11."""
+
+
 class Limits(msgspec.Struct, frozen=True):
     """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes.
 
@@ -248,7 +252,7 @@ class Session(ABC, Generic[M]):
 
     def outgoing(self, now: float) -> bytes | None:
         """Take the next frame to write now; None when nothing may be written yet."""
-        if self.state is State.CLOSED:
+        if self.state is _CLOSED:
             return None
         frame = self.outbox.take(now)
         if frame is not None:
@@ -256,8 +260,8 @@ class Session(ABC, Generic[M]):
             self.traffic.bytes_out += len(frame)
             if self.tap is not None:
                 self.tap("out", frame)
-        elif self.state is State.CLOSING and not self.outbox:
-            self.state = State.CLOSED
+        elif self.state is _CLOSING and not self.outbox:
+            self.state = _CLOSED
         return frame
 
     def deadline(self, *, writing: bool = True) -> float | None:
@@ -265,7 +269,7 @@ class Session(ABC, Generic[M]):
 
         ``writing`` False leaves out what only waits to be written: the link takes nothing now.
         """
-        if self.state is State.CLOSED:
+        if self.state is _CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
         timers = math.inf if self.over else self.timers()
@@ -305,7 +309,7 @@ class Session(ABC, Generic[M]):
     @property
     def over(self) -> bool:
         """Whether nothing more is to be expected of this session."""
-        return self.state in (State.CLOSING, State.CLOSED)
+        return self.state is _CLOSED or self.state is _CLOSING
 
     def establish(self, version: str, features: tuple[str, ...]) -> None:
         """End the handshake with what was agreed."""

@@ -49,7 +49,7 @@ from tests.e2e.loss import (
 )
 
 KEPT_S = 1.6
-"""The longest time for which a listener believes in a controller that is not there and is sent nothing: keep-alive's second,
+"""The longest time for which a listener believes in a controller that is gone and is sent nothing: keep-alive's second,
 and most of a deadman."""
 SAID_AGAIN_S = 0.5
 """Seconds after which every program has said again what its stick says."""

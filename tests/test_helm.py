@@ -19,6 +19,7 @@ from zbridge.fleet.messages import (
     Control,
     Drive,
     FleetMessage,
+    Lease,
     LeaseToken,
     Mode,
     Motor,
@@ -835,6 +836,48 @@ async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a
     scene.now += 1.0
     asking.look(refusals((*refused[:3], 2)))
     assert len(scene.told) == 1
+
+
+async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene()
+    helm = scene.helm()
+    helm.command(topics.CMD_DRIVE, STAND)
+
+    async def ask_in_vain(topic: Any, question: Any) -> Lease:
+        await Bridge.ask_lease(scene.bridge, topic, question)
+        return Lease(ok=False, reason="no gateway answers")
+
+    monkeypatch.setattr(scene.bridge, "ask_lease", ask_in_vain)
+    helm.command(topics.CMD_DRIVE, GO)
+    await scene.settle()
+    assert scene.told == ["not driving: no gateway answers"]
+    assert scene.gateway.report().holder == helm.who
+    scene.look(helm)
+    assert scene.gateway.report().holder is None
+
+
+async def test_a_program_that_gave_the_robot_back_and_wants_it_again_is_not_in_its_own_way() -> None:
+    scene = Scene()
+    helm = await scene.driving(needs_mode=False)
+    helm.command(topics.CMD_MODE, Mode("none"))
+    helm.command(topics.CMD_MODE, Mode("manual"))
+    helm.command(topics.CMD_DRIVE, STAND)
+    helm.command(topics.CMD_DRIVE, GO)
+    await scene.settle()
+    assert scene.gateway.asked == ["acquire", "release", "acquire"]
+    assert scene.gateway.taken()[-1] == ("drive", GO)
+
+
+async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> None:
+    scene = Scene()
+    greedy, other = scene.helm(), scene.helm("hq.toy.2")
+    for _ in range(50):
+        greedy.command(topics.CMD_LIDAR, Switch(True))
+    with pytest.raises(Refused, match="more than 50 commands a second"):
+        greedy.command(topics.CMD_LIDAR, Switch(True))
+    other.command(topics.CMD_LIDAR, Switch(True))
+    scene.now += 0.1
+    greedy.command(topics.CMD_LIDAR, Switch(True))
 
 
 async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:

@@ -539,17 +539,43 @@ async def test_a_link_that_has_claimed_nothing_sends_datagrams_nowhere() -> None
 
 
 async def test_a_source_is_free_again_when_its_link_is_lost() -> None:
-    async with served(b"a", b"a") as serving:
+    async with served(b"a", b"b") as serving:
         with sources(1) as (source,):
             serving.send(source, b"a5")
             await serving.recorders[0].until("datagram", datagrams=1)
             serving.ends[0].abort()
             await serving.recorders[0].until("lost")
-            serving.send(source, b"a5")
+            serving.send(source, b"b5")
             await serving.recorders[1].until("datagram", datagrams=1)
             assert serving.recorders[0].datagrams == [b"a5"]
             serving.links(1).write_datagram(b"six")
             assert (await heard_by(source))[0] == b"six"
+
+
+async def test_a_datagram_that_two_links_claim_is_neithers() -> None:
+    async with served(b"a", b"a", b"b") as serving:
+        with sources(2) as (first, second):
+            serving.send(first, b"a5")
+            serving.send(second, b"b5")
+            await serving.recorders[2].until("datagram", datagrams=1)
+            assert [recorder.datagrams for recorder in serving.recorders] == [[], [], [b"b5"]]
+
+
+async def test_datagrams_that_wait_are_taken_before_the_stream_that_followed_them() -> None:
+    async with served(b"a") as serving:
+        with sources(1) as (source,):
+            serving.send(source, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            order: list[bytes] = []
+            serving.recorders[0].received = order.append  # type: ignore[method-assign]
+            serving.recorders[0].received_datagram = order.append  # type: ignore[method-assign]
+            for number in range(200):
+                serving.send(source, b"move %d" % number)
+            serving.ends[0].write(b"stop")
+            async with asyncio.timeout(SOON_S):
+                while b"stop" not in order:  # noqa: ASYNC110
+                    await asyncio.sleep(0)
+            assert order == [*(b"move %d" % number for number in range(200)), b"stop"]
 
 
 async def test_a_listener_without_datagrams_serves_no_udp() -> None:

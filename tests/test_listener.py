@@ -383,13 +383,23 @@ async def test_a_listener_may_be_told_to_serve_fewer() -> None:
 async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ToySide, "quiet_s", 2.0)
     async with serving() as scene:
-        scene.connect().leave()
+        scene.connect().greeted().leave()
         await soon()
         scene.connect()
         assert sorted(scene.listener.clients) == [3]
         await asyncio.sleep(2.0)
         scene.connect()
         assert sorted(scene.listener.clients) == [2, 3]
+
+
+@jumping
+async def test_a_number_that_was_never_used_need_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
+    async with serving() as scene:
+        scene.connect().leave()
+        await soon()
+        scene.connect()
+        assert sorted(scene.listener.clients) == [2]
 
 
 @jumping
@@ -694,6 +704,29 @@ async def test_a_client_drives_and_its_name_is_shown() -> None:
         assert scene.gateway.taken() == [("drive", Drive(forward=0.5))]
         assert scene.gateway.report().holder == "hq.toy.2"
         assert KEYS.alive("hq.toy.2") in scene.bus._shared.tokens
+
+
+@jumping
+async def test_what_was_said_while_the_process_stood_still_moves_nothing_and_neutral_must_come_anew() -> None:
+    async with serving() as scene:
+        driver, idle = scene.connect().greeted(), scene.connect().greeted()
+        driver.say(b"stand", b"go")
+        idle.say(b"stand")
+        await soon()
+        scene.gateway.taken()
+        scene.skipped_s += 0.7
+        idle.say(b"go")
+        driver.say(b"go", b"stand", b"go")
+        await soon()
+        assert [moved for moved in scene.gateway.taken() if moved[1] != Drive()] == []
+        assert scene.gateway.report().holder is None
+        await asyncio.sleep(0.4)
+        driver.say(b"go")
+        await soon()
+        assert scene.gateway.taken() == []
+        driver.say(b"stand", b"go")
+        await soon()
+        assert scene.gateway.taken() == [("drive", Drive(forward=0.5))]
 
 
 @jumping

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import math
@@ -29,6 +30,7 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.fleet.view import RobotView
+from zbridge.session.allowance import Allowance
 from zbridge.session.control import LEASE_ENDED, NEUTRAL_FIRST
 from zbridge.session.intent import Do, Intent
 
@@ -40,6 +42,8 @@ REPEAT_S = 0.1
 """Seconds between repetitions of what a client set once."""
 WAITING = 64
 """Commands of one client that may wait for the bus besides motion; one more is refused."""
+OPEN_HZ = 50.0
+"""Commands a second of one client that need no lease: they share the robot's queue with everybody's."""
 OURS_S = 1.0
 """Seconds within which a refusal that bears no name is taken for that of a client's command."""
 _encode = msgspec.msgpack.Encoder().encode
@@ -75,7 +79,7 @@ class Bridge:
             for answer in answers:
                 if answer.error is None:
                     return payloads.decode(Lease, answer.payload)
-                why = answer.error
+                why = why if answer.error == "Timeout" else answer.error
         except (BusError, PayloadError) as error:
             why = str(error)
         return Lease(ok=False, reason=why)
@@ -126,9 +130,12 @@ class Helm:
         self._doubting = False
         self._returning = 0
         """Questions under way that give the robot back."""
+        self._returned = asyncio.Event()
+        self._returned.set()
         self._closed = False
         self._due = 0.0
         self._seen: dict[tuple[str | None, str, str], int] = {}
+        self._allowance = Allowance(OPEN_HZ)
         self._open: dict[str, float] = {}
         """When commands were last given that need no lease, and so bear no name."""
         self._handle: Handle | None = None
@@ -156,6 +163,8 @@ class Helm:
             self._require_robot()
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
+            if not self._allowance.take(now):
+                raise Refused(f"more than {OPEN_HZ:g} commands a second that need no lease")
             self._open[topic.path.removeprefix("@cmd/")] = now
             self._bridge.put(topic, message)
 
@@ -198,6 +207,8 @@ class Helm:
         """Take news from ``control``: whether the robot is still ours, and what was refused."""
         if self.intent.held and (control.state != "held" or control.holder != self.who):
             self._doubt()
+        elif control.holder == self.who and not (self.active or self._returning):
+            self._forget_token()  # the answer that granted it was lost; so ends that lease
         for refusal in self._new_refusals(control):
             self._refused(refusal)
 
@@ -299,6 +310,7 @@ class Helm:
 
     async def _acquire(self) -> None:
         bridge = self._bridge
+        await self._returned.wait()  # or the robot would be held by ourselves
         if self._handle is None:
             self._handle = bridge.bus.announce(bridge.keys.alive(self._alive))
         request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self._alive)
@@ -348,6 +360,7 @@ class Helm:
         self.intent.released()
         if token is not None:
             self._returning += 1
+            self._returned.clear()
             self._bridge.spawn(self._give_back(token))
 
     async def _give_back(self, token: bytes) -> None:
@@ -355,11 +368,14 @@ class Helm:
             await self._bridge.bus.flush()
         await self._bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(token))
         self._returning -= 1
+        if not self._returning:
+            self._returned.set()
         if self._closed:
             self._forget_token()
 
     def _drop(self, why: str) -> None:
-        log.info("%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
+        level = logging.INFO if self.intent.held else logging.DEBUG
+        log.log(level, "%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
         self._token = None
         self._queue.clear()
         self._set.clear()

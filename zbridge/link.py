@@ -217,7 +217,10 @@ class TcpLink(asyncio.BufferedProtocol):
         return self._view
 
     def buffer_updated(self, nbytes: int) -> None:
-        self._receiver.received(bytes(self._view[:nbytes]))
+        data = bytes(self._view[:nbytes])
+        if self._hub is not None:
+            self._hub.drain()  # datagrams that wait are older: motion must not overtake the stop that followed it
+        self._receiver.received(data)
 
     def eof_received(self) -> bool:
         return False
@@ -299,6 +302,8 @@ async def listen(
 _DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
 """Most datagrams taken from a socket before the loop serves others."""
+_DRAINED = 1024
+"""Most datagrams taken before a stream is read: more than a socket's buffer holds by default."""
 
 
 class _DatagramReader:
@@ -320,8 +325,12 @@ class _DatagramReader:
         self._socket = sock
         self._loop.add_reader(sock.fileno(), self._read)
 
-    def _read(self) -> None:
-        for _ in range(_DATAGRAMS):
+    def drain(self) -> None:
+        """Take all datagrams that wait."""
+        self._read(_DRAINED)
+
+    def _read(self, most: int = _DATAGRAMS) -> None:
+        for _ in range(most):
             if self._socket is None:
                 return
             try:
@@ -408,12 +417,16 @@ class DatagramHub(_DatagramReader):
             owner[1].received_datagram(data)
 
     def _claim(self, data: bytes, source: tuple[str, int]) -> tuple[Link, Receiver] | None:
-        for link, receiver in self._hosts.get(source[0], {}).items():
-            if link not in self._sources and receiver.claims(data):
-                self._sources[link] = source
-                self._owners[source] = (link, receiver)
-                return self._owners[source]
-        return None
+        claiming = [
+            (link, receiver)
+            for link, receiver in self._hosts.get(source[0], {}).items()
+            if link not in self._sources and receiver.claims(data)
+        ]
+        if len(claiming) != 1:  # of two that might have sent it, neither is heard in the other's name
+            return None
+        self._sources[claiming[0][0]] = source
+        self._owners[source] = claiming[0]
+        return claiming[0]
 
 
 class FakeLink:

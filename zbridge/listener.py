@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import math
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -25,6 +26,7 @@ from zbridge.helm import REPEAT_S, Bridge, Helm
 from zbridge.link import Link, listen
 from zbridge.metrics import Metrics
 from zbridge.protocol import HqSide, Send
+from zbridge.session.allowance import Allowance
 from zbridge.session.intent import Intent
 from zbridge.session.manager import ClientIds, SessionManager
 from zbridge.session.session import Limits, Session, State
@@ -43,6 +45,13 @@ LEAVE_S = 0.7
 """Longest time clients are given to hear that the listener ends, and the robot's gateway to hear of it."""
 ATTEND_EVERY = 64
 """Clients that are written to between two looks at the stops and commands that wait."""
+FROZEN_S = 0.6
+"""Seconds without a beat after which a process is taken to have been frozen: what its clients said meanwhile is old."""
+CATCH_UP_S = 0.3
+"""Seconds for which old words may still come in after that."""
+LIFE_HZ = 20.0
+"""Lines of the log a second about clients that come and go; the rest is of level DEBUG."""
+_STOOD_STILL = "the gateway stood still"
 _FULL = "as many clients as there can be"
 _FRAME_BYTES = 64 * 1024
 _ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
@@ -102,6 +111,9 @@ class Listener:
         self._asked: dict[str, list[Client]] = {}
         self._active: set[Client] = set()
         self._closing = False
+        self._awake_at = self._clock()
+        self._stale_until = -math.inf
+        self._life = Allowance(LIFE_HZ)
         self._limits = Limits(
             frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
         )
@@ -133,9 +145,12 @@ class Listener:
                 await asyncio.shield(self._leave())
 
     async def _attend(self) -> None:
-        sweep_at = self._clock() + SWEEP_S
+        self._awake_at = self._clock()
+        sweep_at = self._awake_at + SWEEP_S
         while True:
             await asyncio.sleep(REPEAT_S)
+            self._stale()
+            self._awake_at = self._clock()
             for client in tuple(self._active):
                 if self._side.hold and client.conversation.silent_s > self._side.deadman_s - REPEAT_S:
                     client.helm.let_go("the connection is silent")
@@ -145,6 +160,16 @@ class Listener:
             if self._clock() >= sweep_at:
                 sweep_at = self._clock() + SWEEP_S  # not made up for after a process was frozen
                 self._sweep()
+
+    def _stale(self) -> bool:
+        """Tell whether what comes in now may have waited while this process stood still; then nothing moves by it."""
+        now = self._clock()
+        if now - self._awake_at >= FROZEN_S:
+            log.warning("%s: stood still for %.1f s: all sticks must be let go of", self.name, now - self._awake_at)
+            self._awake_at, self._stale_until = now, now + CATCH_UP_S
+            for client in tuple(self.clients.values()):
+                client.helm.let_go(_STOOD_STILL)
+        return now < self._stale_until
 
     async def _leave(self) -> None:
         self._closing = True
@@ -192,7 +217,7 @@ class Listener:
         )
         client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
         self._manager.add(session)
-        log.info("%s: %s connected as client %d", self.name, link.peer, number)
+        self._log_life("%s: %s connected as client %d", self.name, link.peer, number)
         return client.conversation
 
     def _unwelcome(self, host: str) -> str | None:
@@ -213,6 +238,9 @@ class Listener:
         if before.bit_length() != self._turned_away.value.bit_length():
             log.warning("%s: %s turned away (%d so far): %s", self.name, link.peer, before + 1, reason)
 
+    def _log_life(self, text: str, *values: object) -> None:
+        log.log(logging.INFO if self._life.take(self._clock()) else logging.DEBUG, text, *values)
+
     def _helm(self, client: Client) -> Helm:
         side, who = self._side, f"hq.{self.name}.{client.number}"
         return Helm(
@@ -231,7 +259,7 @@ class Listener:
         if client.session.state is State.ESTABLISHED and not client.begun:
             client.begun = True
             agreed = f", version {client.session.version}" if client.session.version else ""
-            log.info("%s: client %d established%s", self.name, client.number, agreed)
+            self._log_life("%s: client %d established%s", self.name, client.number, agreed)
             self._send(client, self._side.begin)
             missing = self._audience.view.missing
             if missing is not None:
@@ -244,10 +272,10 @@ class Listener:
         client.helm.close()
         self.clients.pop(client.number, None)
         self._active.discard(client)
-        self._ids.release(client.number, self._clock())
+        self._ids.release(client.number, self._clock(), rests=client.session.traffic.frames_in > 0)
         self._manager.remove(client.session)
         self._follow_wanted()
-        log.info("%s: client %d gone: %s", self.name, client.number, client.session.reason)
+        self._log_life("%s: client %d gone: %s", self.name, client.number, client.session.reason)
 
     def _sweep(self) -> None:
         """Give up clients that take nothing, and those that say nothing for too long."""
@@ -327,12 +355,17 @@ class Listener:
 
     def _deliver(self, client: Client, messages: list[Any]) -> None:
         client.helm.intent.heard(self._clock())
+        stale, intent = self._stale(), client.helm.intent
         for message in messages:
             try:
                 for topic, command in self._side.take(client.session, message):
+                    if stale:  # neutral that waited as well is no answer to that
+                        intent.refused(_STOOD_STILL)
                     self._carry_out(client, topic, command)
             except (ProtocolError, EncodeError) as error:
                 client.session.malformed(str(error))
+        if stale:
+            intent.refused(_STOOD_STILL)
         if client.helm.active:
             self._active.add(client)
         self._follow_wanted()

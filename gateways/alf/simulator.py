@@ -145,13 +145,17 @@ class Simulator:
         session = VehicleSession(self._dialect)
         session.name = f"hq {link.peer}"
         conversation = Conversation(session, self._loop, deliver=self._deliver)
-        for part in parts:
+        log.info("%s: connected for %s", link.peer, " and ".join(sorted(parts)))
+        self._loop.call_soon(self._greet, conversation, parts)
+        return conversation
+
+    def _greet(self, conversation: Conversation, parts: set[str]) -> None:
+        """Describe the scanner, and only then send what it measures."""
+        if "laser" in parts:
+            _send(conversation, SCANNER)
+        for part in () if conversation.ended.done() else parts:
             self._peers[part].add(conversation)
             conversation.ended.add_done_callback(lambda _, peers=self._peers[part]: peers.discard(conversation))  # type: ignore[misc]
-        log.info("%s: connected for %s", link.peer, " and ".join(sorted(parts)))
-        if "laser" in parts:
-            self._loop.call_soon(_send, conversation, SCANNER)
-        return conversation
 
     def _deliver(self, messages: list[AlfMessage]) -> None:
         for message in messages:

@@ -352,6 +352,8 @@ class RobotSession(_TcpUdpSession):
 
         Deployed HQ programs of version 1.3 send packets 11, 12 and 61 by UDP whatever was agreed.
         """
+        if self._probe.verdict is Verdict.UNKNOWN:
+            return False
         try:
             sender_id, packet_id = read_header(datagram)
         except ProtocolError:
@@ -359,8 +361,7 @@ class RobotSession(_TcpUdpSession):
         if self._probe.verdict is Verdict.WAITING:
             own = sender_id == self.client_id or sender_id in _NOBODYS_IDS
             return own and packet_id == ClientUDPConnection.spec.id
-        offered = self._probe.verdict is not Verdict.UNKNOWN
-        return offered and sender_id == self.client_id and packet_id in _FROM_HQ
+        return sender_id == self.client_id and packet_id in _FROM_HQ
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if not isinstance(message, ClientUDPConnection):

@@ -136,12 +136,17 @@ class Simulator:
         session = ControllerSession(self._dialect, values=VALUES)
         session.name = f"controller {link.peer}"
         conversation = Conversation(session, self._loop, deliver=self._deliver)
-        self._peers.add(conversation)
         conversation.ended.add_done_callback(lambda _: self._peers.discard(conversation))
         log.info("%s: connected", link.peer)
-        if self._dialect is Dialect.DEPLOYED:
-            self._loop.call_soon(_send, conversation, list(DEVICES))
+        self._loop.call_soon(self._greet, conversation)
         return conversation
+
+    def _greet(self, conversation: Conversation) -> None:
+        """Register the devices, and only then send their data."""
+        if self._dialect is Dialect.DEPLOYED:
+            _send(conversation, list(DEVICES))
+        if not conversation.ended.done():
+            self._peers.add(conversation)
 
     def _deliver(self, messages: list[Wc2EcMessage]) -> None:
         for message in messages:

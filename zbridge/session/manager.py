@@ -54,9 +54,9 @@ class ClientIds:
                 return client_id
         return None
 
-    def release(self, client_id: int, now: float) -> None:
-        """Take an id back."""
-        self._free_at[client_id] = now + self._quiet_s
+    def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
+        """Take an id back; one that was never used need not rest."""
+        self._free_at[client_id] = now + self._quiet_s if rests else -math.inf
 
 
 class SessionManager:

@@ -19,6 +19,7 @@ import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.messages import SessionEntry
+from zbridge.session.allowance import Allowance
 from zbridge.session.outbox import Outbox
 from zbridge.wire.frames import FrameBuffer, FrameEnd
 
@@ -110,8 +111,7 @@ class Session(ABC, Generic[M]):
         self.tap: Tap | None = None
         self._frames = FrameBuffer(self.frame_end, limits.frame_bytes)
         self._limit_at = math.inf
-        self._allowance = limits.rate_hz
-        self._counted_at = 0.0
+        self._allowance = Allowance(limits.rate_hz)
 
     def __repr__(self) -> str:
         reason = f" ({self.reason})" if self.reason else ""
@@ -171,7 +171,7 @@ class Session(ABC, Generic[M]):
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
         open_to_all = self.state is State.ESTABLISHED
         traffic.bytes_in += len(data)
-        frames, allowed = 0, self._frames_allowed(now)
+        frames, allowed = 0, self._allowance.fill(now)
         try:
             for frame in self._frames.feed(data):
                 frames += 1
@@ -199,7 +199,7 @@ class Session(ABC, Generic[M]):
             self.malformed(str(error))
             self.fail(f"broken stream: {error}")
         traffic.frames_in += frames
-        self._allowance -= frames
+        self._allowance.left -= frames
         return messages
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
@@ -209,10 +209,9 @@ class Session(ABC, Generic[M]):
         """
         if self.over:
             return []
-        if self._frames_allowed(now) < 1:
+        if not self._allowance.take(now):
             self._flooded()
             return []
-        self._allowance -= 1
         self.traffic.frames_in += 1
         self.traffic.bytes_in += len(datagram)
         if self.tap is not None:
@@ -233,14 +232,6 @@ class Session(ABC, Generic[M]):
     def accept_datagram(self, message: M, now: float) -> bool:
         """Take a message that came by datagram; False keeps it for the session itself."""
         return self.accept(message, now)
-
-    def _frames_allowed(self, now: float) -> float:
-        """Give the frames that the peer may send now."""
-        rate_hz = self.limits.rate_hz
-        if rate_hz < math.inf:
-            self._allowance = min(rate_hz, self._allowance + (now - self._counted_at) * rate_hz)
-            self._counted_at = now
-        return self._allowance
 
     def _flooded(self) -> None:
         self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")

@@ -163,8 +163,16 @@ listen = "tcp://${HOST}:10020"
 
 
 def test_listeners_without_a_name_may_be_many_of_one_protocol() -> None:
-    made = plan(serving(hq(), hq(), hq(name="a"), hq(name="b")), {})
-    assert [listener.settings.name for listener in made.listeners] == [None, None, "a", "b"]
+    given = (None, None, "a", "b")
+    ports = [{"listen": f"tcp://127.0.0.1:{11002 + number}"} for number in range(4)]
+    entries = [hq(**port, **({"name": name} if name else {})) for port, name in zip(ports, given, strict=True)]
+    assert [listener.settings.name for listener in plan(serving(*entries), {}).listeners] == list(given)
+
+
+def test_two_listeners_need_two_addresses_unless_they_take_any_port() -> None:
+    with pytest.raises(ConfigError, match=r"hq\[0\].listen = 'tcp://127.0.0.1:11002': expected an address of its own"):
+        plan(serving(hq(), hq()), {})
+    assert len(plan(serving(hq(listen="tcp://127.0.0.1:0"), hq(listen="tcp://127.0.0.1:0")), {}).listeners) == 2
 
 
 @pytest.mark.parametrize(("field", "value"), [("clients", 1), ("clients", 10_000), ("rate_hz", 1), ("rate_hz", 1e6)])

@@ -214,6 +214,10 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     for number, settings in enumerate(config.hq):
         if settings.name is not None and named[settings.name] > 1:
             raise ConfigError(f"hq[{number}].name = {settings.name!r}: expected a name of its own")
+    taken = Counter(listener.address for listener in listeners if listener.address.port)
+    for number, listener in enumerate(listeners):
+        if taken[listener.address] > 1:
+            raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
     metrics = _metrics_address(config.metrics.listen) if config.metrics else None
     return Plan(config, device, listeners, metrics)
 

@@ -161,6 +161,8 @@ class Helm:
             self._choose(message, now)
         elif isinstance(message, Raw):
             self._require_robot()
+            if topics.unescape(topic.path.rpartition("/")[2]) != self._bridge.view.protocol:
+                raise Refused("the robot has no such packets")
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
             if not self._allowance.take(now):
@@ -275,7 +277,8 @@ class Helm:
         if message.mode == "autonomous":
             self._require_robot()
             if self._bridge.view.protocol != self._modes:
-                raise Refused("the robot does not move by itself")
+                self._choose(Mode("manual"), now)
+                raise Refused("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
         if do is Do.RELEASE:
             self._tell_mode(self._put)  # what waits is given up, so it overtakes nothing

@@ -35,6 +35,8 @@ log = logging.getLogger("zbridge.hq")
 
 STALL_S = 5.0
 """Seconds of not taking what is written after which a client is given up; seconds of taking it make up for them."""
+RUBBISH = 20
+"""Malformed messages between two looks, with no other among them, after which a client is given up."""
 SWEEP_S = 0.5
 """Seconds between two looks at all clients."""
 TELL_S = 5.0
@@ -70,6 +72,8 @@ class Client:
         self.heard = 0
         self.silent_s = 0.0
         self.stalled_s = 0.0
+        self.seen = (0, 0)
+        """Messages that were malformed, and all, at the last look."""
         self.told: dict[str, float] = {}
 
     def __repr__(self) -> str:
@@ -278,7 +282,7 @@ class Listener:
         self._log_life("%s: client %d gone: %s", self.name, client.number, client.session.reason)
 
     def _sweep(self) -> None:
-        """Give up clients that take nothing, and those that say nothing for too long."""
+        """Give up clients that take nothing, say nothing for too long, or say nothing but rubbish."""
         idle_s = self._settings.idle_s
         for client in tuple(self.clients.values()):
             stalled = client.conversation.stalled
@@ -286,7 +290,12 @@ class Listener:
             heard = client.session.traffic.bytes_in
             client.silent_s = client.silent_s + SWEEP_S if heard == client.heard else 0.0
             client.heard = heard
-            if client.stalled_s >= STALL_S:
+            malformed, frames = client.session.traffic.malformed, client.session.traffic.frames_in
+            rubbish, frames = malformed - client.seen[0], frames - client.seen[1]
+            client.seen = (malformed, client.session.traffic.frames_in)
+            if rubbish >= RUBBISH and rubbish >= frames:
+                client.conversation.close("nothing but rubbish")
+            elif client.stalled_s >= STALL_S:
                 client.conversation.cut(f"took nothing for {STALL_S:g} s")
             elif idle_s is not None and client.silent_s >= idle_s:
                 client.conversation.close(f"silent for {idle_s:g} s")

@@ -97,7 +97,8 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
         raise ConfigError("TCP/UDP HQ programs have no dialects")
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
-    await simulate_strict_hq(simulation.address.host, simulation.address.port, version=version, udp=simulation.udp)
+    udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
+    await simulate_strict_hq(simulation.address.host, simulation.address.port, version=version, udp=udp)
 
 
 PROTOCOL = Protocol(

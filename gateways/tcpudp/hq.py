@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -39,7 +39,6 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, PacketId, Scale
-from gateways.tcpudp.versions import LISTED
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, Raw, Scan, Switch, Text
@@ -60,13 +59,13 @@ _MODES = {1: "none", 2: "manual", 3: "autonomous"}
 _SIZES = ("1.3", "1.4")
 """Versions whose clients were told the size of the map."""
 
-VersionName = Annotated[str, msgspec.Meta(pattern=r"^\d{1,9}(\.\d{1,9})*$")]
+VersionName = Literal["1.1", "1.2", "1.3", "1.4"]
 
 
 class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
-    versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = LISTED
+    versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = ("1.1", "1.2", "1.3")
     udp: bool = True
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
     quiet_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 2.0
@@ -360,6 +359,8 @@ def _request(session: HqClient, now: float) -> None:
     """Ask those for simulated lidar data that announced it."""
     if Feature.LIDAR_SIM in (session.client.features if session.client is not None else ()):
         session.show("request", ServerGetSimulatedLidarData.spec.id, _REQUEST, now)
+    else:
+        session.leave_out(ServerGetSimulatedLidarData.spec.id)
 
 
 def _ascii(text: str) -> str:

@@ -64,7 +64,8 @@ async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> 
             for entry in sessions:
                 console.print(json.dumps({"robot": robot, "who": who, **msgspec.to_builtins(entry)}), markup=False)
     elif tables:
-        console.print(_session_table(tables), width=max(console.width, _TABLE), crop=False)
+        console.width = max(console.width, _TABLE)
+        console.print(_session_table(tables), crop=False)
     else:
         errors.print(f"no gateways on {realm}/")
 
@@ -86,7 +87,7 @@ def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> T
     )
     table = Table(box=None)
     for title in titles:
-        table.add_column(title, no_wrap=True)
+        table.add_column(title, no_wrap=title not in ("left out", "reason"), overflow="fold")
     for (robot, who), sessions in tables.items():
         for entry in sessions:
             counters = entry.counters

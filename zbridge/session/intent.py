@@ -16,6 +16,10 @@ LEASE_S = 3.0
 """Seconds of neutral or silence after which a robot is given back, until a lease says otherwise."""
 
 
+EARLY_S = 0.3
+"""Seconds by which a robot is given back before its lease expires: an expiry would count as a loss."""
+
+
 class Do(Enum):
     """What is to be done with what a program said."""
 
@@ -85,6 +89,7 @@ class Intent:
         """Take a control mode, which stands; autonomous is motion, none gives the robot back."""
         self.expire(now)
         if mode == "autonomous" and self.held_back is not None:
+            self.mode = mode  # it stands all the same: programs say it once
             raise Refused(f"{self.held_back}: let go of the stick first")
         if "autonomous" in (mode, self.mode):  # a robot that moved by itself was in use until now
             self._used_at = now
@@ -136,4 +141,4 @@ class Intent:
         A robot that moves by itself is used as long as anything at all is heard.
         """
         used_at = max(self._used_at, self._heard_at) if self.mode == "autonomous" else self._used_at
-        return self.held and now - used_at >= self.lease_s
+        return self.held and now - used_at >= self.lease_s - min(EARLY_S, self.lease_s / 4)

@@ -728,8 +728,8 @@ def test_the_recorded_hq_acquires_with_its_first_motion_and_keeps_the_robot_to_i
     asked = done[25:].count(Do.WAIT)
     assert done[25:] == [Do.ACQUIRE] + [Do.WAIT] * asked + [Do.SEND] * (89 - asked)
     assert 3 <= asked <= 6, "what came in a tenth of a second, every 20 ms"
-    assert not intent.wants_release(2.3017 + 2.9)
-    assert intent.wants_release(2.3017 + 3.0)
+    assert not intent.wants_release(2.3017 + 2.6)
+    assert intent.wants_release(2.3017 + 2.71)
 
 
 def test_the_recorded_drive_session_is_shown_byte_for_byte_and_ended_by_the_vehicle() -> None:

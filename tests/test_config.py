@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from zbridge import config
-from zbridge.config import Plan, load, plan
+from zbridge.config import HqSettings, Plan, listener_template, load, plan
 from zbridge.errors import ConfigError
 from zbridge.link import Address
 from zbridge.protocol import find_protocol, protocol_names
@@ -70,6 +70,17 @@ def test_the_template_of_every_protocol_is_a_configuration(tmp_path: Path, name:
     made = loaded(tmp_path, find_protocol(name).template.replace("{name}", "r7"))
     assert made.config.robot.name == "r7"
     assert made.device.options == made.device.protocol.options()
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_the_template_of_every_listener_is_a_configuration_with_all_defaults(tmp_path: Path, name: str) -> None:
+    protocol = find_protocol(name)
+    made = loaded(tmp_path, listener_template(protocol.hq_template).replace("{name}", "r7"))
+    (listener,) = made.listeners
+    assert (made.config.robot.name, made.device) == ("r7", None)
+    assert listener.options == protocol.hq_options()
+    settings = listener.settings
+    assert settings == HqSettings(protocol=name, listen=settings.listen, options=settings.options)
 
 
 def test_every_table_is_read(tmp_path: Path) -> None:

@@ -63,6 +63,8 @@ speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale
 length_unit_m = 0.01                    # the programs' unit of length in metres
 heading_offset = 1.5707963267948966     # what is subtracted from the robot's heading, radians
+# map_origin = [0.0, 0.0]               # x, y of map cell (0, 0) in metres, as the programs take it; left out: centred,
+                                        # and a robot of this protocol as its own programs see it
 """
 )
 

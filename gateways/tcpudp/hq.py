@@ -13,7 +13,17 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from gateways.tcpudp.maps import TCP_BYTES, UDP_BYTES, Geometry, announceable, most_side, resampled, squared
+from gateways.tcpudp.maps import (
+    TCP_BYTES,
+    UDP_BYTES,
+    Frame,
+    Geometry,
+    announceable,
+    check,
+    most_side,
+    resampled,
+    squared,
+)
 from gateways.tcpudp.messages import (
     PACKETS,
     ChatMessage,
@@ -38,7 +48,7 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.session import RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
-from gateways.tcpudp.translate import NAME, OFF, ON, Angle, PacketId, Scale
+from gateways.tcpudp.translate import NAME, OFF, ON, Angle, Length, PacketId, Scale
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, Raw, Scan, Switch, Text
@@ -55,6 +65,7 @@ CLIENTS = range(2, 256)
 """Client ids; 1 is the server's."""
 TEXT_CHARACTERS = 1000
 MOST_SIDE = most_side(UDP_BYTES)
+_NEARLY = 1 + 1e-9
 _MODES = {1: "none", 2: "manual", 3: "autonomous"}
 _SIZES = ("1.3", "1.4")
 """Versions whose clients were told the size of the map."""
@@ -77,6 +88,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     turn_full: Scale = 1.0
     length_unit_m: Scale = 0.01
     heading_offset: Angle = math.pi / 2
+    map_origin: tuple[Length, Length] | None = None
 
     def __post_init__(self) -> None:
         if self.slam_map_size < self.slam_map_interval:
@@ -156,7 +168,7 @@ class TcpUdpHq(HqSide):
     def _geometry(self) -> Geometry:
         if self.view.map is not None and self.view.map.cells.size:
             with contextlib.suppress(EncodeError):
-                return announceable(self.view.map, self._unit_m, self._most_side)
+                return announceable(self.view.map, self._unit_m, self._most_side, self._frame)
         size, interval = self.options.slam_map_size, self.options.slam_map_interval
         return Geometry(min(size, self._most_side * interval), interval)
 
@@ -204,25 +216,44 @@ class TcpUdpHq(HqSide):
     def _map(self, message: Map) -> Send:
         """Show a map as each client takes it: as large as it was announced, or as what carries it allows."""
         frames: dict[tuple[Geometry | None, int], tuple[bytes, Datagram]] = {}
+        larger: set[tuple[Geometry | None, int]] = set()
 
         def send(session: HqClient, now: float) -> None:
             most = most_side(UDP_BYTES if session.by_udp else TCP_BYTES)
             announced = session.version in _SIZES and session.geometry.side <= most
             key = (session.geometry if announced else None, most)
             if key not in frames:
-                cells = self._cells(message, *key)
+                cells, to_scale = self._cells(message, *key)
                 frame = encode_packet(ServerSLAMMap(cells or None), session.sender_id)
                 frames[key] = (frame, Datagram(frame))
+                larger.update(() if to_scale else (key,))
+            if key in larger:
+                session.left_out["map to scale"] += 1
             session.show("map", ServerSLAMMap.spec.id, frames[key][session.by_udp], now)
 
         return send
 
-    def _cells(self, grid: Map, geometry: Geometry | None, most: int) -> bytes:
+    def _cells(self, grid: Map, geometry: Geometry | None, most: int) -> tuple[bytes, bool]:
+        """Give a map's cells, and whether they are as large as was announced: the whole map is shown in any case."""
         if not grid.cells.size:
-            return b""
+            return b"", True
+        check(grid)
+        frame = self._frame
+        size_m = frame.size_m(grid)
         if geometry is None:
-            return squared(grid, most)
-        return resampled(grid, geometry.side, geometry.interval * self._unit_m)
+            if frame.own and frame.origin is None:
+                return squared(grid, most), True
+            side = max(1, min(most, math.ceil(round(size_m / grid.cell, 6))))
+            cell_m = max(grid.cell, size_m / side)
+            return resampled(grid, side, cell_m, frame.begin(grid, side * cell_m)), True
+        side, cell_m = geometry.side, geometry.interval * self._unit_m
+        to_scale = size_m <= side * cell_m * _NEARLY
+        cell_m = cell_m if to_scale else size_m / side
+        return resampled(grid, side, cell_m, frame.begin(grid, side * cell_m)), to_scale
+
+    @property
+    def _frame(self) -> Frame:
+        return Frame(own=self.view.protocol in (NAME, None), origin=self.options.map_origin)
 
     def _lidar(self, message: Switch) -> Send:
         return _to_all("lidar", ServerLidarStatus(ON if message.on else OFF))

@@ -22,6 +22,7 @@ _AROUND = 10
 _CELL_M = (1e-6, 1e6)
 """Sides of a cell, metres, that can be calculated with; whatever is on the bus."""
 _MOST_UNITS = 2**31 - 1
+_MOST_M = 1e9
 _OCCUPIED = 2
 
 
@@ -42,13 +43,48 @@ def most_side(packet_bytes: int) -> int:
     return math.isqrt(packet_bytes - _AROUND)
 
 
-def announceable(grid: Map, unit_m: float, most: int) -> Geometry:
+class Frame(msgspec.Struct, frozen=True):
+    """Where HQ programs take a square grid to lie, which nothing in the protocol tells.
+
+    own: the map is of a robot of this protocol, so its programs see it as they always did: the robot's zero stays at
+    the same fraction of the grid. Else the grid is centred on zero. origin: x, y of its first cell, metres, instead.
+    """
+
+    own: bool = False
+    origin: tuple[float, float] | None = None
+
+    def size_m(self, grid: Map) -> float:
+        """Give the side of the smallest grid that has the whole map in it, as far as it can."""
+        (x, y), width, height = grid.origin, grid.columns * grid.cell, grid.rows * grid.cell
+        if self.origin is not None:
+            return max(x + width - self.origin[0], y + height - self.origin[1], grid.cell)
+        if self.own:
+            return max(width, height)
+        return 2 * max(abs(x), abs(x + width), abs(y), abs(y + height))
+
+    def begin(self, grid: Map, size_m: float) -> tuple[float, float]:
+        """Give where a grid begins, x and y in metres from the map's first cell."""
+        extents = (grid.columns * grid.cell, grid.rows * grid.cell)
+        if self.origin is not None:
+            x, y = self.origin
+        elif self.own:
+            fractions = (min(1.0, max(0.0, -at / extent)) for at, extent in zip(grid.origin, extents, strict=True))
+            return tuple(fraction * (extent - size_m) for fraction, extent in zip(fractions, extents, strict=True))  # type: ignore[return-value]
+        else:
+            x = y = -size_m / 2
+        return (x - grid.origin[0], y - grid.origin[1])
+
+
+_OWN = Frame(own=True)
+
+
+def announceable(grid: Map, unit_m: float, most: int, frame: Frame = _OWN) -> Geometry:
     """Choose what to announce for a map: its own cells where they are whole units and few enough, else larger ones.
 
     Raises EncodeError where its cells are of no size that can be announced.
     """
-    _check(grid)
-    extent = max(grid.rows, grid.columns) * grid.cell / unit_m
+    check(grid)
+    extent = frame.size_m(grid) / unit_m
     interval = max(1, math.ceil(round(grid.cell / unit_m, 6)))
     while math.ceil(round(extent / interval, 6)) > most:
         interval = max(interval + 1, math.ceil(extent / most))
@@ -65,33 +101,44 @@ def squared(grid: Map, most: int) -> bytes:
     return resampled(grid, fitting, grid.cell * side / fitting)
 
 
-def resampled(grid: Map, side: int, cell_m: float) -> bytes:
-    """Give a map's cells, x-major, on a square grid of other cells that begins where the map does.
+def resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float] = (0.0, 0.0)) -> bytes:
+    """Give a map's cells, x-major, on a square grid of other cells that begins at ``begin`` from the map's first.
 
     A cell is an obstacle where any it covers is, else free where any is, else unknown; so is what lies outside.
     One that lies across a border counts where it ends. Raises EncodeError where the map's cells are of no size.
     """
     cells: Cells = np.zeros((side, side), np.uint8)
     if grid.cells.size:
-        _check(grid)
+        check(grid)
         ratio = cell_m / grid.cell
-        rows, row_starts = _starts(grid.rows, side, ratio)
-        columns, column_starts = _starts(grid.columns, side, ratio)
+        x, y = begin
+        rows, row_starts, row = _starts(grid.rows, side, ratio, y / grid.cell)
+        columns, column_starts, column = _starts(grid.columns, side, ratio, x / grid.cell)
         covered = grid.cells[:rows, :columns]
         if covered.size and covered.max() > _OCCUPIED:
             covered = np.where(covered > _OCCUPIED, np.uint8(0), covered)
-        pooled = np.maximum.reduceat(np.maximum.reduceat(covered, row_starts, axis=0), column_starts, axis=1)
-        cells[: len(row_starts), : len(column_starts)] = pooled
+        if len(row_starts) and len(column_starts):
+            pooled = np.maximum.reduceat(np.maximum.reduceat(covered, row_starts, axis=0), column_starts, axis=1)
+            cells[row : row + len(row_starts), column : column + len(column_starts)] = pooled
     return np.ascontiguousarray(cells.T).tobytes()
 
 
-def _check(grid: Map) -> None:
-    if not _CELL_M[0] <= grid.cell <= _CELL_M[1]:
-        raise EncodeError(f"map with cells of {grid.cell:g} m")
+def check(grid: Map) -> None:
+    """Raise EncodeError for a map that cannot be calculated with, whatever is on the bus."""
+    if not _CELL_M[0] <= grid.cell <= _CELL_M[1] or not all(abs(at) <= _MOST_M for at in grid.origin):
+        raise EncodeError(f"map with cells of {grid.cell:g} m at {grid.origin}")
 
 
-def _starts(count: int, side: int, ratio: float) -> tuple[int, np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """Say how many of ``count`` cells ``side`` larger (or smaller) ones cover, and where each of those begins."""
-    starts = np.floor(np.round(np.arange(side) * ratio, 6)).astype(np.intp)
-    covered = min(count, math.ceil(round(side * ratio, 6)))
-    return covered, starts[starts < covered]
+def _starts(
+    count: int, side: int, ratio: float, begin: float
+) -> tuple[int, np.ndarray[tuple[int], np.dtype[np.intp]], int]:
+    """Say how many of ``count`` cells ``side`` other ones cover, where each begins, and which is the first.
+
+    ``begin``: where the first of them begins, in cells of the map.
+    """
+    edges = np.round(begin + np.arange(side + 1) * ratio, 6)
+    starts = np.floor(edges[:-1]).astype(np.intp)
+    inside = (edges[1:] > 0) & (starts < count)
+    covered = min(count, max(0, math.ceil(edges[-1])))
+    first = int(np.argmax(inside)) if inside.any() else 0
+    return covered, np.maximum(starts[inside & (starts < covered)], 0), first

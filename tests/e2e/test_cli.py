@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,8 +35,10 @@ def test_init_prints_a_configuration_that_check_takes(tmp_path: Path) -> None:
     assert "fleet/arm-7, tcpudp at tcp://127.0.0.1:11001, bus as peer" in checked.stdout
 
 
-def test_the_deployed_configuration_is_what_init_prints() -> None:
-    assert (ROOT / "deploy/config/tcpudp.toml").read_text() == zbridge("init", "tcpudp").stdout
+@pytest.mark.parametrize("protocol", protocol_names())
+def test_the_deployed_configurations_are_what_init_prints(protocol: str) -> None:
+    assert (ROOT / f"deploy/config/{protocol}.toml").read_text() == zbridge("init", protocol).stdout
+    assert (ROOT / f"deploy/config/hq-{protocol}.toml").read_text() == zbridge("init", protocol, "--hq").stdout
 
 
 def test_a_bad_file_ends_run_with_2_and_names_file_key_and_value(tmp_path: Path) -> None:
@@ -85,6 +88,40 @@ def test_ls_lists_the_robot_and_stop_confirms(bench: Bench) -> None:
     assert "no gateway confirmed" in missing.stderr
 
 
+def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it_on_a_narrow_screen_too(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, listener = free_port(), free_port()
+    bench.simulator(port)
+    address = f"tcp://127.0.0.1:{listener}"
+    bench.gateway("r1", port, f'[[hq]]\nname = "desk"\nprotocol = "tcpudp"\nlisten = "{address}"\n')
+    until(lambda: bench.fleet.state("r1") == "established")
+    program = bench.zbridge("simulate", "tcpudp", "--hq", address)
+    at = ("--sessions", "--connect", bench.endpoint)
+
+    def listed() -> list[dict[str, Any]]:
+        return [json.loads(line) for line in zbridge("ls", "--json", *at).stdout.splitlines()]
+
+    entries = until(lambda: [entry for entry in listed() if entry["name"] == "desk.2" and entry["version"]])
+    assert (entries[0]["who"], entries[0]["role"], entries[0]["transport"]) == ("gateway", "robot", "udp")
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = zbridge("ls", *at).stdout
+    assert "desk.2" in shown
+    assert entries[0]["peer"] in shown
+    assert end(program) == "", "it complained of nothing"
+    assert program.returncode == 0
+    gone = until(lambda: [entry for entry in listed() if entry["state"] == "closed"])
+    assert gone[0]["reason"] == "closed by peer"
+
+
+def test_simulate_is_either_a_robot_or_an_hq_program() -> None:
+    assert "give either --listen" in zbridge("simulate", "tcpudp").stderr
+    address = f"tcp://127.0.0.1:{free_port()}"
+    nobody = zbridge("simulate", "alf", "--hq", address)
+    assert (nobody.returncode, nobody.stderr.count("\n")) == (1, 1)
+    assert address in nobody.stderr
+
+
 def test_a_stop_typed_by_anybody_takes_the_robot_from_its_driver(bench: Bench) -> None:
     port = free_port()
     bench.simulator(port)
@@ -120,8 +157,9 @@ def test_the_demo_shows_data_and_ends_by_itself() -> None:
     shown = zbridge("demo", "--seconds", "4")
     assert shown.returncode == 0, shown.stdout + shown.stderr
     assert "established" in shown.stdout
-    for robot in ("alf1", "tcpudp1", "wc2ec1"):
+    for robot, protocol in (("alf1", "alf"), ("tcpudp1", "tcpudp"), ("wc2ec1", "wc2ec")):
         assert robot in shown.stdout
+        assert f"zbridge simulate {protocol} --hq tcp://127.0.0.1:" in shown.stdout
 
 
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:

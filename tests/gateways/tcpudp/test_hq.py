@@ -634,9 +634,46 @@ def test_a_client_of_1_3_gets_every_later_map_in_the_cells_it_was_announced() ->
     finer = np.zeros((8, 8), np.uint8)
     finer[0, 1] = 2  # at x 5 to 10 cm, y 0 to 5 cm: in the cell (0, 0)
     finer[5, 2] = 1  # at x 10 to 15 cm, y 25 to 30 cm: in the cell x 1, y 2
-    finer[7, 7] = 2  # beyond what was announced
-    show(listener, topics.MAP, Map(8, 8, 0.05, (0.0, 0.0), finer), client)
+    show(listener, topics.MAP, Map(6, 6, 0.05, (0.0, 0.0), finer[:6, :6]), client)
     assert [cells_of(frame).hex() for frame in client.frames("udp")] == ["020000000001000000"]
+    assert client.session.left_out == {}
+
+
+def test_a_map_larger_than_a_client_was_told_is_shown_whole_in_larger_cells_and_that_is_counted() -> None:
+    view = RobotView()
+    view.note(topics.MAP, CORNER)
+    listener = side(view)
+    client = joined(listener, udp=True)
+    cells = np.zeros((6, 6), np.uint8)
+    cells[0, 0], cells[5, 5], cells[3, 4] = 2, 2, 1
+    show(listener, topics.MAP, Map(6, 6, 0.1, (0.0, 0.0), cells), client)
+    assert [cells_of(frame).hex() for frame in client.frames("udp")] == ["020000000000000102"]
+    assert client.session.left_out == {"map to scale": 1}
+
+
+def test_the_zero_of_a_robot_of_the_same_protocol_stays_where_its_programs_see_it() -> None:
+    centred = np.zeros((40, 40), np.uint8)
+    centred[20, 20] = 2  # at (0, 0) of a map of 4 m around it
+    for origin, cell in (((-2.0, -2.0), (50, 50)), ((0.0, 0.0), (20, 20))):
+        listener = side(robot("1.3", "joystick"))
+        client = joined(listener, udp=True)
+        show(listener, topics.MAP, Map(40, 40, 0.1, origin, centred), client)
+        (frame,) = client.frames("udp")
+        shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
+        assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
+
+
+def test_a_map_of_another_robot_is_centred_on_zero_or_placed_as_the_option_says() -> None:
+    cells = np.zeros((20, 10), np.uint8)
+    cells[5, 10 - 1] = 2  # x -0.1 to 0, y -1 to -0.9
+    grid = Map(20, 10, 0.1, (-1.0, -1.5), cells)
+    for options, cell in (({}, (49, 40)), ({"map_origin": (-2.0, -3.0)}, (19, 20))):
+        listener = side(robot(None, protocol="alf"), **options)
+        client = joined(listener, udp=True)
+        show(listener, topics.MAP, grid, client)
+        (frame,) = client.frames("udp")
+        shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
+        assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
 
 
 def test_clients_that_came_at_different_times_each_get_what_they_were_announced() -> None:
@@ -646,7 +683,7 @@ def test_clients_that_came_at_different_times_each_get_what_they_were_announced(
     view.note(topics.MAP, CORNER)
     late = joined(listener, udp=True, number=3)
     show(listener, topics.MAP, CORNER, early, late)
-    assert [cells_of(frame).hex() for frame in early.frames("udp")] == ["01000200"]
+    assert [cells_of(frame).hex() for frame in early.frames("udp")] == ["01000202"]
     assert [cells_of(frame).hex() for frame in late.frames("udp")] == [CORNER_CELLS.replace(" ", "")]
 
 
@@ -921,9 +958,9 @@ class Counts:
             self.packets.append(type(message).__name__)
             return encode_packet(message, sender_id)
 
-        def count_resampled(grid: Map, side: int, cell_m: float) -> bytes:
+        def count_resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float]) -> bytes:
             self.maps += 1
-            return resampled(grid, side, cell_m)
+            return resampled(grid, side, cell_m, begin)
 
         def count_squared(grid: Map, most: int) -> bytes:
             self.maps += 1

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from zbridge.errors import Refused
-from zbridge.session.intent import EARLY_S, LEASE_S, Do, Intent
+from zbridge.session.intent import EARLY_S, LEASE_S, TOGETHER_S, Do, Intent
 
 DEADMAN_S = 1.25
 
@@ -176,7 +176,7 @@ def test_after_motion_in_mode_none_neutral_must_come_although_the_mode_has() -> 
     intent = ready(modes=True)
     with pytest.raises(Refused):
         intent.motion(0.5)
-    assert intent.choose("manual", 0.6) is Do.NOTHING
+    assert intent.choose("manual", 0.61) is Do.NOTHING
     with pytest.raises(Refused, match="let go of the stick first"):
         intent.motion(0.7)
     intent.neutral(0.8)
@@ -221,6 +221,23 @@ def test_a_mode_while_the_robot_is_held_is_sent_and_while_it_is_asked_for_waits(
     intent.granted(3.0)
     assert intent.choose("autonomous", 0.4) is Do.SEND
     assert intent.choose("manual", 0.5) is Do.SEND
+
+
+def test_a_mode_that_motion_has_overtaken_is_no_mode_that_came_too_late() -> None:
+    intent = Intent(DEADMAN_S, modes=True)
+    intent.neutral(0.0)
+    with pytest.raises(Refused, match="control mode is none"):
+        intent.motion(1.0)
+    intent.choose("manual", 1.05)
+    assert intent.motion(1.5) is Do.ACQUIRE
+    late = Intent(DEADMAN_S, modes=True)
+    late.neutral(0.0)
+    for now in (1.0, 1.5):
+        with pytest.raises(Refused, match="control mode is none"):
+            late.motion(now)
+    late.choose("manual", 1.55)
+    with pytest.raises(Refused, match="control mode is none: let go"):
+        late.motion(2.0)
 
 
 def test_mode_autonomous_is_motion() -> None:
@@ -357,8 +374,9 @@ class Program(RuleBasedStateMachine):
     def begin(self, modes: bool) -> None:
         self.intent = Intent(DEADMAN_S, modes=modes)
         self.mode = "none" if modes else "manual"
+        self.overtaken_until = -math.inf
 
-    @rule(seconds=st.sampled_from([0.0, 0.125, 1.0, 1.25, 3.0, 64.0]))
+    @rule(seconds=st.sampled_from([0.0, 0.0625, 0.125, 1.0, 1.25, 3.0, 64.0]))
     def wait(self, seconds: float) -> None:
         self.now += seconds
 
@@ -368,6 +386,7 @@ class Program(RuleBasedStateMachine):
 
     def _owe(self) -> None:
         self.owed, self.moving_until = True, math.inf
+        self.overtaken_until = -math.inf
 
     @rule()
     def push(self) -> None:
@@ -377,7 +396,9 @@ class Program(RuleBasedStateMachine):
             do = self.intent.motion(self.now)
         except Refused:
             assert self.owed or self.mode == "none"
-            self._owe()
+            if not self.owed:
+                self._owe()
+                self.overtaken_until = self.now + TOGETHER_S
             return
         assert not self.owed, "motion although neutral is owed"
         assert self.mode != "none", "motion in mode none"
@@ -397,6 +418,8 @@ class Program(RuleBasedStateMachine):
     def choose(self, mode: str) -> None:
         self._age()
         held, asking = self.intent.held, self.intent.asking
+        if mode != "none" and self.now < self.overtaken_until:
+            self.owed = False
         try:
             do = self.intent.choose(mode, self.now)
         except Refused:

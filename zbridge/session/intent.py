@@ -20,6 +20,12 @@ EARLY_S = 0.3
 """Seconds by which a robot is given back before its lease expires: an expiry would count as a loss."""
 
 
+TOGETHER_S = 0.1
+"""Seconds within which a mode and motion were sent one after the other, by stream and by datagram, in whatever order
+they came."""
+_MODE_NONE = "control mode is none"
+
+
 class Do(Enum):
     """What is to be done with what a program said."""
 
@@ -47,6 +53,7 @@ class Intent:
         self._moved_at = -math.inf
         self._used_at = -math.inf
         self._heard_at = -math.inf
+        self._modeless_at = -math.inf
 
     def __repr__(self) -> str:
         return f"<Intent {self.mode} {'held' if self.held else 'asking' if self.asking else 'idle'} {self.held_back}>"
@@ -71,8 +78,8 @@ class Intent:
         if self.held_back is not None:
             raise Refused(f"{self.held_back}: let go of the stick first")
         if self.mode == "none":
-            self.held_back = "control mode is none"
-            raise Refused(self.held_back)
+            self.held_back, self._modeless_at = _MODE_NONE, now
+            raise Refused(_MODE_NONE)
         self._used_at = now
         if lasts:
             self._moved_at, self._moving = now, True
@@ -88,6 +95,8 @@ class Intent:
     def choose(self, mode: str, now: float) -> Do:
         """Take a control mode, which stands; autonomous is motion, none gives the robot back."""
         self.expire(now)
+        if mode != "none" and self.held_back == _MODE_NONE and now - self._modeless_at < TOGETHER_S:
+            self.held_back = None  # the motion was sent after this, and came first
         if mode == "autonomous" and self.held_back is not None:
             self.mode = mode  # it stands all the same: programs say it once
             raise Refused(f"{self.held_back}: let go of the stick first")

@@ -17,10 +17,10 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from typing import NoReturn
 
 from gateways.alf import strict_parser as wire
 from gateways.alf.strict_parser import Dialect, Heard, Machine, Repeats, Scale, Times, show
+from zbridge.judge import Judge
 
 _READ_BYTES = 65536
 _READS = 16
@@ -44,8 +44,10 @@ _DEPLOYED = Times()
 _COUNTS = Scale()
 
 
-class StrictVehicle:
+class StrictVehicle(Judge):
     """One server of a vehicle, that serves one connection, notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Crash
 
     def __init__(
         self,
@@ -70,17 +72,14 @@ class StrictVehicle:
         """
         if not (laser or drive) or dialect not in ("text", "binary"):
             raise ValueError(f"no such server: dialect {dialect!r}, laser {laser}, drive {drive}")
+        super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
         self.laser, self.drive = laser, drive
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, int, tuple[int, ...]]] = []
-        self.alive = True
-        self.death = ""
         full = speed_full if dialect == "text" else wire.FULL_PERCENT
         self.machine = machine or Machine(random.Random(f"{seed} machine"), points, full)
         self.repeats = Repeats(times)
-        self._scale, self._times, self._keep, self._note = scale, times, keep, note
+        self._scale, self._times = scale, times
         self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, full)
         self._phase = _Phase.LISTENING
         self._over = asyncio.Event()
@@ -134,23 +133,6 @@ class StrictVehicle:
                 self._conn.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self._conn.close()
                 self._finish("the vehicle cut the connection")
-
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Crash(text)
 
     # The connection
 

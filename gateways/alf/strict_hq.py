@@ -18,12 +18,13 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NamedTuple
 
 import msgspec
 
 from gateways.alf import strict_parser as wire
 from gateways.alf.strict_parser import DRIVE, END, INFO, INIT, NO_ID, SCAN, Dialect, show
+from zbridge.judge import Judge
 
 Serves = Literal["drive", "laser", "both"]
 """What the gateway's listener is configured to serve ("The gateway as vehicle")."""
@@ -179,8 +180,10 @@ class _Crash(Exception):
     """The HQ's process has died."""
 
 
-class StrictHq:
+class StrictHq(Judge):
     """One connection of an operator program, that notes every violation and dies of what breaks it."""
+
+    _DEATH = _Crash
 
     def __init__(
         self,
@@ -203,12 +206,10 @@ class StrictHq:
         """
         if dialect not in _FULL or serves not in _SERVED:
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
+        super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, int, Fields]] = []
         """Monotonic seconds, id, fields; of a measurement of the right length without its points."""
-        self.alive, self.death = True, ""
         self.connected = asyncio.Event()
         self.scanner: Fields | None = None
         """The last message 2."""
@@ -217,7 +218,7 @@ class StrictHq:
         self.infos: list[Fields] = []
         """Every message 4."""
         self._served, self._repeat_s, self._stops_after = _SERVED[serves], repeat_s, stops_reading_after
-        self._answer_s, self._keep, self._note = answer_s, keep, note
+        self._answer_s = answer_s
         self._reader = Reader(dialect, points)
         self._phase, self._stopped, self._midway = _Phase.CONNECTING, False, False
         self._conn: socket.socket | None = None
@@ -278,23 +279,6 @@ class StrictHq:
         if self._phase is not _Phase.CONNECTING:
             await self._over.wait()
 
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Crash(text)
-
     # The connection
 
     async def _live(self, conn: socket.socket) -> None:
@@ -307,7 +291,7 @@ class StrictHq:
                             self._hear(conn, told)
                 self._part()
         except _Crash as crash:
-            self._event(f"died: {crash}")
+            self._event(str(crash))
         except TimeoutError:
             self._late()
 

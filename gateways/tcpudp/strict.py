@@ -17,10 +17,11 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Collection
-from typing import Literal, NoReturn
+from typing import Literal
 
 from gateways.tcpudp import strict_parser as wire
 from gateways.tcpudp.strict_parser import Feature, Loss, Packet, Times, show
+from zbridge.judge import Judge
 
 Channel = Literal["tcp", "udp"]
 
@@ -53,8 +54,10 @@ _EXPECTED = {
 }
 
 
-class StrictRobot:
+class StrictRobot(Judge):
     """A robot of one version that serves one connection, notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Crash
 
     def __init__(
         self,
@@ -82,18 +85,14 @@ class StrictRobot:
         others = known if features is None else frozenset(features)
         if not others <= known:
             raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
+        super().__init__(keep=keep, note=note)
         self.version = version
         self.features = (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
         self.client_id = client_id or random.Random(seed).randint(1, 255)
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, Channel, int, bytes]] = []
-        self.alive = True
-        self.death = ""
         self.machine = wire.Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
-        self._keep, self._note = keep, note
         self._sleeps, self._answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
         self._pauses = random.Random(f"{seed} pause")
         self._phase = _Phase.LISTENING
@@ -132,23 +131,6 @@ class StrictRobot:
                     self._tasks.create_task(self._move())
             except* _Crash:
                 self._event(f"died: {self.death}")
-
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Crash(text)
 
     # TCP
 

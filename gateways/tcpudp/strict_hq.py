@@ -18,10 +18,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Literal, NamedTuple, NoReturn
+from typing import Literal, NamedTuple
 
 from gateways.tcpudp import strict_parser as wire
 from gateways.tcpudp.strict_parser import Feature, HqTimes, Packet, show
+from zbridge.judge import Judge
 
 Channel = Literal["tcp", "udp"]
 
@@ -59,8 +60,10 @@ class _Read(NamedTuple):
 _DEPLOYED = HqTimes()
 
 
-class StrictHq:
+class StrictHq(Judge):
     """An HQ program of one version, for one connection, that notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Over
 
     def __init__(
         self,
@@ -83,12 +86,9 @@ class StrictHq:
         """
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
+        super().__init__(keep=keep, note=note)
         self.version = version
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, Channel, int, bytes]] = []
-        self.alive = True
-        self.death = ""
         self.established = asyncio.Event()
         self.settings: wire.Announced | None = None
         self.position: tuple[float, float, float] | None = None
@@ -98,7 +98,6 @@ class StrictHq:
         self.counts: Counter[int] = Counter()
         self._offers_udp, self._lidar_sim, self._skips = udp, lidar_sim, skips_map_flag
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
-        self._keep, self._note = keep, note
         self._phase = _Phase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
         self._stick = (wire.STOP, b"")
@@ -236,23 +235,6 @@ class StrictHq:
         with contextlib.suppress(OSError):
             self._udp.sendto(wire.packet(kind, body, self.client_id), self._robot)
         return None
-
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Over(text)
 
     # What arrives
 

@@ -20,6 +20,7 @@ from typing import NoReturn
 
 from gateways.wc2ec import strict_parser as wire
 from gateways.wc2ec.strict_parser import DEFAULT, Device, Dialect, Heard, Motor, Reader, Robot, Times, Value, show
+from zbridge.judge import Judge
 
 _READ_BYTES = 65536
 _READS = 16
@@ -36,8 +37,10 @@ class _Gone(Exception):
 _DEPLOYED = Times()
 
 
-class StrictController:
+class StrictController(Judge):
     """One start of a simulation: serves one external controller, notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Gone
 
     def __init__(
         self,
@@ -57,15 +60,12 @@ class StrictController:
         """
         if dialect not in DEFAULT:
             raise ValueError(f"no such controller: dialect {dialect!r}")
+        super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
         self.devices = tuple(DEFAULT[dialect] if devices is None else devices)
         wire.check(dialect, self.devices)
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, int, int, int, Value]] = []
         """Monotonic seconds, command, sensor type, sensor number, value; good or bad, if the controller took it."""
-        self.alive = True
-        self.death = ""
         self.ending = ""
         """Why it ended by itself."""
         self.robot = Robot(self.devices, random.Random(f"{seed} robot"), values)
@@ -73,7 +73,7 @@ class StrictController:
         """Whether the last registration was sent."""
         self._reader = Reader(dialect, self.devices, values)
         self._cuts = random.Random(f"{seed} cuts")
-        self._times, self._keep, self._note = times, keep, note
+        self._times = times
         self._conn: socket.socket | None = None
         self._broken: OSError | None = None
         self._work: asyncio.Task[None] | None = None
@@ -121,23 +121,6 @@ class StrictController:
         self._event("the controller cut the connection")
         self._work.cancel()
         await self._over.wait()
-
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Gone(f"died: {text}")
 
     # The connection
 

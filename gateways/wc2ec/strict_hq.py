@@ -15,12 +15,12 @@ import struct
 import sys
 import time
 from collections.abc import Callable
-from typing import NoReturn
 
 import msgspec
 
 from gateways.wc2ec import strict_parser as wire
 from gateways.wc2ec.strict_parser import CHANGE, DISABLE, ENABLE, LIGHT_TYPE, NO_FIELD, SET, SET_VALUE, Dialect, show
+from zbridge.judge import Judge
 
 REGISTER, ERROR = 0, 127
 MOTOR_TYPES = (53, 46)
@@ -106,8 +106,10 @@ class _Gone(Exception):
     """The controller's task has ended, and why."""
 
 
-class StrictController:
+class StrictController(Judge):
     """One start of an external controller, that notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Gone
 
     def __init__(
         self,
@@ -125,12 +127,10 @@ class StrictController:
         """
         if dialect not in _DATA:
             raise ValueError(f"no such controller: dialect {dialect!r}")
+        super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
-        self.violations: list[str] = []
-        self.events: list[str] = []
         self.received: list[tuple[float, int, int, int, str | float | None]] = []
         """Monotonic seconds, command, sensor type, sensor number, name or value; good or bad."""
-        self.alive, self.death = True, ""
         self.connected = asyncio.Event()
         self.devices: dict[int, tuple[int, str]] = {}
         """Type and name of what was registered, by number."""
@@ -142,7 +142,7 @@ class StrictController:
         """Numbers of the sensors that are enabled, in the draft."""
         self._names: set[str] = set()
         self._disabled: dict[int, float] = {}
-        self._split, self._flight_s, self._keep, self._note = split, flight_s, keep, note
+        self._split, self._flight_s = split, flight_s
         self._reader = Reader(dialect)
         self._conn: socket.socket | None = None
         self._sending, self._over = asyncio.Lock(), asyncio.Event()
@@ -229,23 +229,6 @@ class StrictController:
                 if self._conn is None:
                     raise ConnectionError("the external controller is not connected")
                 await asyncio.get_running_loop().sock_sendall(self._conn, part)
-
-    # What is noted
-
-    def _violate(self, text: str) -> None:
-        if len(self.violations) < self._keep:
-            self.violations.append(text)
-        if self._note:
-            self._note(text)
-
-    def _event(self, text: str) -> None:
-        if len(self.events) < self._keep:
-            self.events.append(text)
-
-    def _die(self, text: str) -> NoReturn:
-        self.alive, self.death = False, text
-        self._violate(text)
-        raise _Gone(f"died: {text}")
 
     # The connection
 

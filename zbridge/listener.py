@@ -62,10 +62,9 @@ _ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 class Client:
     """One HQ program: its session, its conversation, and its hand on the robot."""
 
-    def __init__(self, number: int, session: Session[Any], host: str) -> None:
+    def __init__(self, number: int, session: Session[Any]) -> None:
         self.number = number
         self.session = session
-        self.host = host
         self.helm: Helm
         self.conversation: Conversation
         self.begun = False
@@ -208,7 +207,7 @@ class Listener:
         self._accepted.value += 1
         session = self._side.session(number, self._limits)
         session.name = f"{self.name}.{number}"
-        client = self.clients[number] = Client(number, session, host)
+        client = self.clients[number] = Client(number, session)
         client.helm = self._helm(client)
         client.conversation = Conversation(
             session,

@@ -156,7 +156,6 @@ class Scene:
             Intent(DEADMAN_S, modes=needs_mode),
             self.bridge,
             who=who,
-            alive=who,
             modes=modes,
             steers=steers,
             hold=hold,

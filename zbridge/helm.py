@@ -91,7 +91,7 @@ class Bridge:
 
 
 class Helm:
-    """What one client commands. ``tell`` says something to its people; who, alive: its names on the bus.
+    """What one client commands. ``tell`` says something to its people; who: its name on the bus, and its token's.
 
     modes: the protocol whose robots are told the control mode. steers, hold: see :class:`zbridge.protocol.HqSide`.
     """
@@ -102,7 +102,6 @@ class Helm:
         bridge: Bridge,
         *,
         who: str,
-        alive: str,
         modes: str | None,
         steers: bool,
         hold: bool,
@@ -112,7 +111,6 @@ class Helm:
         self.intent = intent
         self.who = who
         self._bridge = bridge
-        self._alive = alive
         self._modes = modes
         self._steers = steers
         self._hold = hold
@@ -315,8 +313,8 @@ class Helm:
         bridge = self._bridge
         await self._returned.wait()  # or the robot would be held by ourselves
         if self._handle is None:
-            self._handle = bridge.bus.announce(bridge.keys.alive(self._alive))
-        request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self._alive)
+            self._handle = bridge.bus.announce(bridge.keys.alive(self.who))
+        request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self.who)
         lease = await bridge.ask_lease(topics.RPC_ACQUIRE, request)
         if not lease.ok or lease.token is None:
             if self.intent.asking:
@@ -358,7 +356,7 @@ class Helm:
         self._tell(f"not driving: {why}")
 
     def _release(self, why: str) -> None:
-        token, self._token = self._token, None
+        token = self._token
         self._drop(why)
         self.intent.released()
         if token is not None:

@@ -250,7 +250,6 @@ class Listener:
             Intent(side.deadman_s, modes=side.modes),
             self._bridge,
             who=who,
-            alive=who,
             modes=side.name if side.modes else None,
             steers=side.steers,
             hold=side.hold,
@@ -289,9 +288,8 @@ class Listener:
             heard = client.session.traffic.bytes_in
             client.silent_s = client.silent_s + SWEEP_S if heard == client.heard else 0.0
             client.heard = heard
-            malformed, frames = client.session.traffic.malformed, client.session.traffic.frames_in
-            rubbish, frames = malformed - client.seen[0], frames - client.seen[1]
-            client.seen = (malformed, client.session.traffic.frames_in)
+            before, client.seen = client.seen, (client.session.traffic.malformed, client.session.traffic.frames_in)
+            rubbish, frames = (now - then for now, then in zip(client.seen, before, strict=True))
             if rubbish >= RUBBISH and rubbish >= frames:
                 client.conversation.close("nothing but rubbish")
             elif client.stalled_s >= STALL_S:

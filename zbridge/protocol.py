@@ -106,7 +106,6 @@ class HqSide(ABC):
 
     name: ClassVar[str]
     """The protocol's name: a robot of the same one is passed on whole."""
-    dialect: str | None = None
     deadman_s: ClassVar[float]
     """Seconds after which motion of a silent client ends."""
     modes: ClassVar[bool] = False

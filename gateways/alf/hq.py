@@ -136,7 +136,6 @@ class AlfHq(HqSide):
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self.dialect = options.dialect
         self._dialect = Dialect(options.dialect)
         self._write = write_text if self._dialect is Dialect.TEXT else write_binary
         self._laser, self._drive = options.serve != "drive", options.serve != "laser"

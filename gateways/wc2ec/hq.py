@@ -113,7 +113,6 @@ class Wc2EcHq(HqSide):
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self.dialect = options.dialect
         self.hold = options.hold
         self._dialect = Dialect(options.dialect)
         self._draft = self._dialect is Dialect.DRAFT

@@ -14,12 +14,8 @@ from zbridge.errors import Refused
 
 LEASE_S = 3.0
 """Seconds of neutral or silence after which a robot is given back, until a lease says otherwise."""
-
-
 EARLY_S = 0.3
 """Seconds by which a robot is given back before its lease expires: an expiry would count as a loss."""
-
-
 TOGETHER_S = 0.1
 """Seconds within which a mode and motion were sent one after the other, by stream and by datagram, in whatever order
 they came."""

@@ -11,7 +11,7 @@ import pytest
 
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Handle, Question, Sample
-from zbridge.errors import BusError, Refused
+from zbridge.errors import BusError, Code, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -33,7 +33,7 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import KeySpace
 from zbridge.fleet.view import RobotView
 from zbridge.helm import REPEAT_S, WAITING, Bridge, Helm
-from zbridge.session.control import NEUTRAL_FIRST, Authority
+from zbridge.session.control import Authority
 from zbridge.session.intent import LEASE_S, Intent
 
 KEYS = KeySpace("fleet", "r1")
@@ -97,7 +97,7 @@ class Gateway:
             except Refused as refusal:
                 self.refused.append(str(refusal))
                 command = topic.path.removeprefix("@cmd/")
-                self.authority.refuse(command, str(refusal), self.authority.owner(sample.attachment))
+                self.authority.refuse(command, refusal, self.authority.owner(sample.attachment))
                 return
         else:
             assert sample.attachment is None
@@ -398,7 +398,7 @@ async def test_what_waits_for_the_bus_is_bounded_and_motion_finds_a_place() -> N
     helm = await scene.driving()
     for number in range(WAITING + 1):
         helm.command(RAW, Raw(id=number))
-    with pytest.raises(Refused, match="busy: 64 commands wait for the bus"):
+    with pytest.raises(Refused, match="64 commands wait for the bus"):
         helm.command(RAW, Raw(id=200))
     helm.command(topics.CMD_DRIVE, STAND)
     await scene.settle()
@@ -448,7 +448,7 @@ async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(
     if late:
         scene.now += DEADMAN_S
     else:
-        helm.look(refusals(("hq.toy.1", "drive", f"busy: map{NEUTRAL_FIRST}", 1)))
+        helm.look(refusals(("hq.toy.1", "drive", "busy: map", 1), code=Code.NEUTRAL_FIRST))
     taken.set()
     await scene.settle()
     assert scene.gateway.taken() == [("raw/toy", Raw(id=40))]
@@ -800,11 +800,11 @@ async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_helm() -> 
 # Refusals
 
 
-def refusals(*entries: tuple[str | None, str, str, int]) -> Control:
+def refusals(*entries: tuple[str | None, str, str, int], code: Code = Code.BUSY) -> Control:
     return Control(
         state="held",
         holder="hq.toy.1",
-        refusals=tuple(Refusal(who=who, command=what, reason=why, count=n) for who, what, why, n in entries),
+        refusals=tuple(Refusal(who=who, command=what, code=code, reason=why, count=n) for who, what, why, n in entries),
     )
 
 
@@ -905,8 +905,8 @@ async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -
     scene.gateway.authority.hold_back("busy: map")
     helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
-    assert scene.told == [f"drive: busy: map{NEUTRAL_FIRST}"]
-    with pytest.raises(Refused, match="busy: map: let go of the stick first"):
+    assert scene.told == ["drive: busy: map: send a neutral drive first"]
+    with pytest.raises(Refused, match="motion was refused: let go of the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_DRIVE, GO)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from zbridge.bus import Sample
-from zbridge.errors import EncodeError, PayloadError, Refused
+from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
@@ -63,17 +63,18 @@ class Commands:
         try:
             self._carry_out(topic, sample)
         except (Refused, PayloadError, EncodeError) as error:
+            refused = error if isinstance(error, Refused) else Malformed(str(error))
             command = self._keys.path(sample.key).removeprefix("@cmd/")
-            self._authority.refuse(command, str(error), self._authority.owner(sample.attachment))
+            self._authority.refuse(command, refused, self._authority.owner(sample.attachment))
         self._leases.settle()
 
     def require_ready(self) -> None:
         """Raise Refused where the robot takes no commands now."""
         session = self._robot.driving
         if session is None or session.over:
-            raise Refused("offline")
+            raise NotReady("offline")
         if not self._robot.ready:
-            raise Refused(session.busy or session.state.value)
+            raise NotReady(session.busy or session.state.value)
 
     def refuse_all(self, reason: str) -> None:
         """Take nothing but stops from now on."""
@@ -81,9 +82,9 @@ class Commands:
 
     def _carry_out(self, topic: Topic | None, sample: Sample) -> None:
         if topic is None or topic.delivery is not Delivery.COMMAND:
-            raise Refused("no such command")
+            raise Unsupported("no such command")
         if self._closing is not None:
-            raise Refused(self._closing)
+            raise NotReady(self._closing, Code.CLOSING)
         now, who = self._clock(), None
         if topic.message in _OF_THE_HOLDER:
             who = self._authority.admit(sample.attachment, now)
@@ -125,7 +126,7 @@ class Commands:
         for shown, message in outcome.telemetry:
             self._publish(shown, message)
         if outcome.left_out:
-            self._authority.refuse(topic.path.removeprefix("@cmd/"), outcome.left_out, who)
+            self._authority.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
 
 
 def _moves_by_itself(command: FleetMessage) -> bool:

@@ -16,6 +16,7 @@ from typing import Any
 from zbridge.audit import Audit
 from zbridge.bus import Bus, Handle, Lane, Publisher, Question
 from zbridge.commands import Commands
+from zbridge.conditions import Conditions
 from zbridge.endpoint import Connect, Endpoint, Hooks
 from zbridge.errors import BusError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads
@@ -62,6 +63,7 @@ class Device:
         metrics: Metrics,
         audit: Audit,
         limits: MotionLimits | None = None,
+        conditions: Conditions | None = None,
         connect: Connect = connect,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
@@ -72,6 +74,8 @@ class Device:
         self._keys = keys
         self._bus = bus
         self._clock_ns = clock_ns
+        self._conditions = conditions or Conditions()
+        self._conditions.changed = self._publish_status
         self._publishers: dict[str, Publisher] = {}
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
@@ -271,7 +275,7 @@ class Device:
             Status(
                 stamp_ns=self._clock_ns(),
                 state=first.state,
-                reason=first.reason,
+                reason="; ".join(filter(None, (first.reason, *self._conditions.texts))) or None,
                 protocol=self._protocol,
                 dialect=self._robot.dialect,
                 version=(agreed.version or None) if agreed is not None else None,

@@ -18,6 +18,7 @@ from zbridge.audience import Audience
 from zbridge.audit import Audit, AuditFile
 from zbridge.bus import Bus, Handle, Question, open_bus
 from zbridge.claim import Claim
+from zbridge.conditions import Conditions
 from zbridge.config import DevicePlan, Plan
 from zbridge.device import Device
 from zbridge.errors import BusError
@@ -50,6 +51,7 @@ class Gateway:
         """Whether the bus was left in order; if not, its threads may hang."""
         self.metrics = Metrics()
         self.sessions = SessionManager()
+        self.conditions = Conditions()
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
@@ -140,6 +142,7 @@ class Gateway:
             manager=self.sessions,
             metrics=self.metrics,
             audit=audit,
+            conditions=self.conditions,
             clock=time.monotonic,  # the time line of every event loop on Linux, without its rounding
         )
 

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Handle, Publisher
-from zbridge.errors import BusError, PayloadError, Refused
+from zbridge.errors import BusError, Code, NotReady, PayloadError, TooFast, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -31,7 +31,6 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.fleet.view import RobotView
 from zbridge.session.allowance import Allowance
-from zbridge.session.control import LEASE_ENDED, NEUTRAL_FIRST
 from zbridge.session.intent import Do, Intent
 
 log = logging.getLogger("zbridge.hq")
@@ -160,11 +159,11 @@ class Helm:
         elif isinstance(message, Raw):
             self._require_robot()
             if topics.unescape(topic.path.rpartition("/")[2]) != self._bridge.view.protocol:
-                raise Refused("the robot has no such packets")
+                raise Unsupported("the robot has no such packets")
             self._follow(self.intent.motion(now, lasts=False), topic, message)
         else:
             if not self._allowance.take(now):
-                raise Refused(f"more than {OPEN_HZ:g} commands a second that need no lease")
+                raise TooFast(f"more than {OPEN_HZ:g} commands a second that need no lease")
             self._open[topic.path.removeprefix("@cmd/")] = now
             self._bridge.put(topic, message)
 
@@ -230,12 +229,12 @@ class Helm:
         return news
 
     def _refused(self, refusal: Refusal) -> None:
-        if refusal.reason.startswith(LEASE_ENDED):
+        if refusal.code == Code.LEASE_ENDED:
             if self.intent.held:
                 self._doubt()
         elif refusal.command != "acquire":
-            if refusal.reason.endswith(NEUTRAL_FIRST):
-                self.intent.refused(refusal.reason.removesuffix(NEUTRAL_FIRST))
+            if refusal.code == Code.NEUTRAL_FIRST:
+                self.intent.refused("motion was refused")
             self._tell(f"{refusal.command}: {refusal.reason}")
 
     # Motion
@@ -276,7 +275,7 @@ class Helm:
             self._require_robot()
             if self._bridge.view.protocol != self._modes:
                 self._choose(Mode("manual"), now)
-                raise Refused("the robot does not move by itself, only by the stick")
+                raise Unsupported("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
         if do is Do.RELEASE:
             self._tell_mode(self._put)  # what waits is given up, so it overtakes nothing
@@ -300,7 +299,7 @@ class Helm:
         missing = self._bridge.view.missing
         if missing is not None:
             self.intent.refused(missing)
-            raise Refused(missing)
+            raise NotReady(missing)
 
     def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
         """Tell the robot its control mode, if it is of a protocol that has any."""
@@ -410,7 +409,7 @@ class Helm:
         if isinstance(message, Drive | Motor):
             self._queue = [entry for entry in self._queue if entry[0].path != topic.path]
         elif len(self._queue) >= WAITING:
-            raise Refused(f"busy: {WAITING} commands wait for the bus")
+            raise NotReady(f"{WAITING} commands wait for the bus", Code.BUSY)
         self._queue.append((topic, message))
 
     async def _written(self) -> None:

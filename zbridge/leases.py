@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from zbridge.audit import Audit
 from zbridge.bus import Bus, Handle, Lane, Question
-from zbridge.errors import PayloadError, Refused
+from zbridge.errors import Code, NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, FleetMessage, Lease, LeaseToken
@@ -166,7 +166,7 @@ class Leases:
         try:
             self.stand_still()
         except Refused as refusal:
-            self.authority.refuse("stop", str(refusal))
+            self.authority.refuse("stop", refusal)
 
     def look_at_time(self) -> None:
         """Do what is due, before anything else is done: the loop may come back late, from a process that was frozen."""
@@ -203,7 +203,7 @@ class Leases:
 
     def _decide(self, path: str, payload: bytes) -> Lease:
         if self._closing is not None:
-            raise Refused(self._closing)
+            raise NotReady(self._closing, Code.CLOSING)
         authority, now = self.authority, self._clock()
         if path == topics.RPC_RENEW.path:
             return authority.renew(payloads.decode(LeaseToken, payload).token, now)

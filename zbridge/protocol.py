@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from zbridge.errors import ConfigError, Refused
+from zbridge.errors import ConfigError, Unsupported
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
@@ -80,7 +80,7 @@ class Robot(ABC):
 
     def listened(self, topic: Topic, on: bool) -> None:
         """Take note that the first listener of an on-demand topic came, or the last one went; raise Refused."""
-        raise Refused(f"{topic.path} needs no listener")
+        raise Unsupported(f"{topic.path} needs no listener")
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Begin with a connection that was just established; give what there is to show at once."""
@@ -141,7 +141,7 @@ class HqSide(ABC):
 
     def answer(self, session: Any, topic: Topic, message: FleetMessage | None, now: float) -> None:
         """Answer a client's question; None where the robot gave no answer. Raises Refused, EncodeError."""
-        raise Refused(f"nothing can be asked for {topic.path}")
+        raise Unsupported(f"nothing can be asked for {topic.path}")
 
     def tell(self, session: Any, text: str, now: float) -> None:
         """Say something to the people at a client, where the protocol can."""

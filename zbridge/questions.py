@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from zbridge.bus import Question
-from zbridge.errors import Refused
+from zbridge.errors import Code, NotReady
 from zbridge.fleet.topics import Topic
 
 ANSWER_S = 2.0
@@ -40,7 +40,7 @@ class Questions:
         """Let a question wait; tell whether it is the first, so that the robot must be asked."""
         waiting = self.waiting.setdefault(topic.path, [])
         if len(waiting) >= WAITING:
-            raise Refused(f"busy: {WAITING} queries wait for the robot's answer")
+            raise NotReady(f"{WAITING} queries wait for the robot's answer", Code.BUSY)
         timer = self._loop.call_later(self._answer_s, self._expire, topic, question)
         waiting.append((question, timer))
         return len(waiting) == 1

@@ -28,7 +28,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from zbridge.errors import ProtocolError, Refused
+from zbridge.errors import Code, NotReady, ProtocolError
 from zbridge.session.session import Limits, Role, Session, State
 
 REPEAT_S = 0.02
@@ -74,7 +74,7 @@ class AlfSession(Session[AlfMessage]):
 
     def send(self, message: AlfMessage) -> None:
         if self.over:
-            raise Refused("closing")
+            raise NotReady("closing", Code.CLOSING)
         super().send(message)
 
     def encode(self, message: AlfMessage) -> bytes:
@@ -135,7 +135,7 @@ class HqSession(AlfSession):
     def drive(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
         """Send a command at once, and again every 20 ms until the next one."""
         if self.over:
-            raise Refused("closing")
+            raise NotReady("closing", Code.CLOSING)
         self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 

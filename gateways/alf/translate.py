@@ -25,7 +25,7 @@ from gateways.alf.messages import (
     ScannerInit,
 )
 from gateways.alf.session import HqSession, points_of
-from zbridge.errors import ProtocolError, Refused
+from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
@@ -173,17 +173,17 @@ class AlfRobot(Robot):
             self._light = command.on
             self._send(msgspec.structs.replace(self._command, light=command.on), now)
             return Outcome()
-        raise Refused("an ALF vehicle has no such command")
+        raise Unsupported("an ALF vehicle has no such command")
 
     def stop(self, now: float, until: float) -> None:
         self._send(self._neutral(), now, urgent=True)
 
     def ask(self, topic: Topic) -> None:
-        raise Refused(f"an ALF vehicle cannot be asked for its {topic.path}")
+        raise Unsupported(f"an ALF vehicle cannot be asked for its {topic.path}")
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         if command.left and not (command.forward or command.turn):
-            raise Refused("left: an ALF vehicle steers, it does not move sideways")
+            raise Unsupported("left: an ALF vehicle steers, it does not move sideways")
         if command.light is not None:
             self._light = command.light
         backward = command.forward < 0 or (self._backward and not command.forward)
@@ -204,7 +204,7 @@ class AlfRobot(Robot):
     def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
         session = self._sessions[0]
         if session is None:
-            raise Refused("offline")
+            raise NotReady("offline")
         session.drive(command, now, urgent=urgent)
         self._command = command
         self._backward = command.direction == _BACKWARD

@@ -32,7 +32,7 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.versions import LISTED, VERSIONS, announced
-from zbridge.errors import EncodeError, ProtocolError, Refused
+from zbridge.errors import EncodeError, Malformed, ProtocolError, Unsupported
 from zbridge.session.negotiation import agree, newest, parse_versions
 from zbridge.session.probe import Probe, Verdict
 from zbridge.session.session import Datagram, Limits, Role, Session, State
@@ -168,7 +168,7 @@ class HqSession(_TcpUdpSession):
         if packet_id in self._force:
             return
         if isinstance(message, OpaquePacket):
-            raise Refused(f"packet {packet_id} may crash the robot; list it in options.force if it knows it")
+            raise Unsupported(f"packet {packet_id} may crash the robot; list it in options.force if it knows it")
         needed = message.spec.features
         if not needed or not self._force.isdisjoint(needed):
             return
@@ -176,16 +176,16 @@ class HqSession(_TcpUdpSession):
         feature = next((feature for feature in needed if hasattr(self.settings, feature.value)), None)
         if feature is None:
             names = " or ".join(feature.value for feature in needed)
-            raise Refused(f"{message.spec.name}: version {self._agreed} has no {names}")
+            raise Unsupported(f"{message.spec.name}: version {self._agreed} has no {names}")
         if not getattr(self.settings, feature.value):
-            raise Refused(f"{message.spec.name}: the robot does not announce {feature.value}")
+            raise Unsupported(f"{message.spec.name}: the robot does not announce {feature.value}")
         self._allowed.add(type(message))
 
     def encode(self, message: Packet) -> bytes:
         """Write a packet the robot can take whole; raise Refused for one it may not know."""
         self.may_send(message)
         if isinstance(message, DebugMessage) and not message.text:
-            raise Refused("an empty text crashes the robot")
+            raise Malformed("an empty text crashes the robot")
         frame = super().encode(message)
         if len(frame) > MAX_WRITE:
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
@@ -376,7 +376,7 @@ class RobotSession(_TcpUdpSession):
         """Raise Refused for a packet that this HQ does not know."""
         packet_id = message.id if isinstance(message, OpaquePacket) else message.spec.id
         if packet_id not in self.known:
-            raise Refused(f"an HQ of version {self._agreed} does not know packet {packet_id}")
+            raise Unsupported(f"an HQ of version {self._agreed} does not know packet {packet_id}")
 
     def _take_settings(self, message: ClientSettings, now: float) -> None:
         if self.client is not None:

@@ -38,7 +38,7 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
-from zbridge.errors import ProtocolError, Refused
+from zbridge.errors import Malformed, NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
@@ -177,7 +177,7 @@ class TcpUdpRobot(Robot):
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         carry_out = _COMMANDS.get(topic.path)
         if carry_out is None:
-            raise Refused("a TCP/UDP robot has no such command")
+            raise Unsupported("a TCP/UDP robot has no such command")
         return carry_out(self, command, now) or _NOTHING
 
     def stop(self, now: float, until: float) -> None:
@@ -212,11 +212,11 @@ class TcpUdpRobot(Robot):
         self._send(ClientLidarMode(ON if command.on else OFF))
 
     def _switch_camera(self, command: Switch, now: float) -> None:
-        raise Refused("no packet turns a camera on or off")
+        raise Unsupported("no packet turns a camera on or off")
 
     def _say(self, command: Text, now: float) -> None:
         if command.kind != "debug":
-            raise Refused(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
+            raise Unsupported(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
         self._send(DebugMessage(command.text))
 
     def _feed_scan(self, command: Scan, now: float) -> Outcome:
@@ -236,7 +236,7 @@ class TcpUdpRobot(Robot):
 
     def _connected(self) -> HqSession:
         if self._session is None:
-            raise Refused("offline")
+            raise NotReady("offline")
         return self._session
 
 
@@ -302,13 +302,13 @@ def _raw_packet(command: Raw) -> Packet:
     spec = PACKETS.get(command.id)
     if spec is None:
         if not 0 <= command.id <= 255:
-            raise Refused(f"packet id {command.id}, expected 0 to 255")
+            raise Malformed(f"packet id {command.id}, expected 0 to 255")
         return OpaquePacket(command.id, command.body)
     if spec.packet is ClientMoveAI:
         return ClientMoveAI(command.body)
     if spec.packet is ChatMessage:
         return ChatMessage(command.body)
-    raise Refused(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
+    raise Unsupported(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
 
 
 _TELEMETRY: dict[type[Packet], Callable[[TcpUdpRobot, Any, int], tuple[Telemetry, ...]]] = {

@@ -37,7 +37,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ExternalSession
-from zbridge.errors import ConfigError, ProtocolError, Refused
+from zbridge.errors import ConfigError, Malformed, NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Text
 from zbridge.fleet.topics import Topic
@@ -249,7 +249,7 @@ class Wc2EcRobot(Robot):
         elif isinstance(command, SensorSetting):
             self._configure(topics.unescape(chunk), command)
         else:
-            raise Refused("a Webots robot has no such command")
+            raise Unsupported("a Webots robot has no such command")
         return Outcome()
 
     def stop(self, now: float, until: float) -> None:
@@ -259,13 +259,13 @@ class Wc2EcRobot(Robot):
                 self._stand(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def ask(self, topic: Topic) -> None:
-        raise Refused(f"a Webots robot cannot be asked for its {topic.path}")
+        raise Unsupported(f"a Webots robot cannot be asked for its {topic.path}")
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         velocities = self._velocities(command)
         missing = sorted(set(velocities) - {device.name for device in self._table.motors(ROTATIONAL)})
         if missing:
-            raise Refused(f"no rotational motor is registered as {', '.join(missing)}")
+            raise Unsupported(f"no rotational motor is registered as {', '.join(missing)}")
         for name, velocity in velocities.items():
             device = self._table.named(name)
             assert device is not None
@@ -279,13 +279,13 @@ class Wc2EcRobot(Robot):
         wheels = self.options.differential
         if wheels is not None:
             if command.left and not (command.forward or command.turn):
-                raise Refused("left: a robot with two sides of wheels does not move sideways")
+                raise Unsupported("left: a robot with two sides of wheels does not move sideways")
             along = command.forward * wheels.speed_full_m_s
             across = command.turn * wheels.turn_full_rad_s * wheels.track_m / 2
             left, right = (along - across) / wheels.wheel_radius_m, (along + across) / wheels.wheel_radius_m
             return {**dict.fromkeys(wheels.left, left), **dict.fromkeys(wheels.right, right)}
         if not self.options.factors:
-            raise Refused("no kinematics in the configuration (differential or factors)")
+            raise Unsupported("no kinematics in the configuration (differential or factors)")
         return {
             name: command.forward * factor.forward + command.left * factor.left + command.turn * factor.turn
             for name, factor in self.options.factors.items()
@@ -303,9 +303,9 @@ class Wc2EcRobot(Robot):
     ) -> None:
         """Let a value stand for a motor: the newest wins, whoever gave it."""
         if self._dialect is not Dialect.DEPLOYED:
-            raise Refused("the draft dialect has no motors")
+            raise Unsupported("the draft dialect has no motors")
         if not math.isfinite(value):
-            raise Refused(f"{device.shown}: {value} is no value of a motor")
+            raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
         frame = session.encode(SetValue(device.type, device.number, value))
         slot = f"motor {device.number}"
@@ -314,33 +314,33 @@ class Wc2EcRobot(Robot):
     def _motor(self, name: str, value: float, now: float) -> None:
         device = self._table.named(name)
         if device is None or not device.motor:
-            raise Refused(f"no motor is registered as {name!r}")
+            raise Unsupported(f"no motor is registered as {name!r}")
         self._stand(device, value, now)
 
     def _configure(self, name: str, setting: SensorSetting) -> None:
         device = self._table.named(name)
         if device is None:
-            raise Refused(f"no sensor is named {name!r}")
+            raise Unsupported(f"no sensor is named {name!r}")
         if self._dialect is not Dialect.DRAFT:
-            raise Refused("only the draft dialect has settings of sensors")
+            raise Unsupported("only the draft dialect has settings of sensors")
         header = device.type, device.number
         messages: list[Wc2EcMessage] = []
         if setting.enable is not None:
             messages.append((EnableSensor if setting.enable else DisableSensor)(*header))
         if (setting.index is None) is not (setting.value is None):
-            raise Refused("index and value: one without the other")
+            raise Malformed("index and value: one without the other")
         if setting.index is not None and setting.value is not None:
             if not 0 <= setting.index < self.options.values:
-                raise Refused(f"index {setting.index}: expected 0 to {self.options.values - 1}")
+                raise Malformed(f"index {setting.index}: expected 0 to {self.options.values - 1}")
             messages.append(ChangeSensor(*header, setting.index, setting.value))
         if setting.values is not None:
             if len(setting.values) != self.options.values:
-                raise Refused(f"{len(setting.values)} values: expected {self.options.values}")
+                raise Malformed(f"{len(setting.values)} values: expected {self.options.values}")
             messages.append(SetSensor(*header, np.array(setting.values)))
         if not messages:
-            raise Refused("a setting without any field")
+            raise Malformed("a setting without any field")
         if not all(map(math.isfinite, (setting.value or 0.0, *(setting.values or ())))):
-            raise Refused("a value that is no number")
+            raise Malformed("a value that is no number")
         for message in messages:
             self._send(message)
 
@@ -349,7 +349,7 @@ class Wc2EcRobot(Robot):
 
     def _connected(self) -> ExternalSession:
         if self._session is None:
-            raise Refused("offline")
+            raise NotReady("offline")
         return self._session
 
 

@@ -13,7 +13,7 @@ from zbridge.audit import Audit
 from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.commands import Commands
-from zbridge.errors import Refused
+from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Authorization, Control, FleetMessage, Status
@@ -52,13 +52,13 @@ class Machine(Robot):
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         if self.refusal is not None:
-            raise Refused(self.refusal)
+            raise NotReady(self.refusal)
         self.commands.append((topic.path.removeprefix("@cmd/"), command))
         return Outcome(left_out=self.left_out)
 
     def stop(self, now: float, until: float) -> None:
         if self.unstoppable is not None:
-            raise Refused(self.unstoppable)
+            raise Unsupported(self.unstoppable)
         self.stops += 1
 
     def ask(self, topic: Topic) -> None:
@@ -135,7 +135,7 @@ class Gateway:
 
     def refuse(self, command: str, reason: str, who: str | None) -> None:
         """Show a refusal on ``control``."""
-        self.authority.refuse(command, reason, who)
+        self.authority.refuse(command, NotReady(reason), who)
         self.leases.settle()
 
     @property

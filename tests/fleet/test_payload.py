@@ -100,7 +100,9 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
         },
     ),
     (
-        Control(state="stopped", refusals=(Refusal(who=None, command="drive", reason="offline", count=2),)),
+        Control(
+            state="stopped", refusals=(Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2),)
+        ),
         {
             "state": "stopped",
             "holder": None,

@@ -9,7 +9,7 @@ import msgpack
 import msgspec
 import pytest
 
-from zbridge.errors import Refused
+from zbridge.errors import Code, NotReady, Refused
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.session.control import ENDED, LEAST_S, REFUSALS, TOKEN_BYTES, Authority, Event, What
 
@@ -144,8 +144,10 @@ def test_a_robot_that_is_held_is_not_given_for_the_same_or_a_lower_priority(stat
     reason = "held by ann (priority 5)"
     lease = authority.acquire(Acquire(who="bob", priority=priority), NOW)
     assert lease == Lease(ok=False, expires_in_s=LEASE_S, holder="ann", reason=reason)
-    assert authority.events() == [Event(What.REFUSED, "bob", reason, command="acquire")]
-    assert authority.report(NOW).refusals == (Refusal("bob", "acquire", reason, 1),)
+    assert authority.events() == [Event(What.REFUSED, "bob", reason, command="acquire", code=Code.HELD)]
+    assert authority.report(NOW).refusals == (
+        Refusal(who="bob", command="acquire", code="held", reason=reason, count=1),
+    )
     assert (repr(authority), authority.moving, authority.deadline()) == before
     assert authority.admit(attach(ANN, SEQ + 1), NOW) == "ann"
 
@@ -787,10 +789,10 @@ def test_control_says_who_drives_and_for_how_long() -> None:
 def test_equal_refusals_are_counted_together_and_the_newest_stands_last() -> None:
     authority = new()
     for command in ("drive", "lidar", "drive"):
-        authority.refuse(command, "offline")
+        authority.refuse(command, NotReady("offline"))
     assert authority.report(NOW).refusals == (
-        Refusal(who=None, command="lidar", reason="offline", count=1),
-        Refusal(who=None, command="drive", reason="offline", count=2),
+        Refusal(who=None, command="lidar", code="not_ready", reason="offline", count=1),
+        Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2),
     )
     assert authority.events() == [
         Event(What.REFUSED, reason="offline", command=command) for command in ("drive", "lidar", "drive")
@@ -799,15 +801,15 @@ def test_equal_refusals_are_counted_together_and_the_newest_stands_last() -> Non
 
 def test_refusals_of_different_senders_are_told_apart() -> None:
     authority = new()
-    authority.refuse("drive", "offline", who="hq.1")
-    authority.refuse("drive", "offline", who="hq.2")
+    authority.refuse("drive", NotReady("offline"), who="hq.1")
+    authority.refuse("drive", NotReady("offline"), who="hq.2")
     assert [(refused.who, refused.count) for refused in authority.report(NOW).refusals] == [("hq.1", 1), ("hq.2", 1)]
 
 
 def test_refusals_are_bounded_and_the_oldest_makes_room() -> None:
     authority = new()
     for number in range(REFUSALS + 3):
-        authority.refuse("raw", f"reason {number}")
+        authority.refuse("raw", NotReady(f"reason {number}"))
     shown = authority.report(NOW).refusals
     assert [refused.reason for refused in shown] == [f"reason {number}" for number in range(3, REFUSALS + 3)]
 
@@ -815,8 +817,8 @@ def test_refusals_are_bounded_and_the_oldest_makes_room() -> None:
 def test_a_refusal_repeated_all_the_time_makes_room_for_no_other() -> None:
     authority = new()
     for number in range(REFUSALS * 2):
-        authority.refuse("drive", "always")
-        authority.refuse("raw", f"reason {number}")
+        authority.refuse("drive", NotReady("always"))
+        authority.refuse("raw", NotReady(f"reason {number}"))
     shown = {refused.reason: refused.count for refused in authority.report(NOW).refusals}
     assert len(shown) == REFUSALS
     assert shown["always"] == REFUSALS * 2
@@ -825,7 +827,7 @@ def test_a_refusal_repeated_all_the_time_makes_room_for_no_other() -> None:
 def test_long_names_and_reasons_are_cut() -> None:
     authority = new()
     authority.acquire(Acquire(who="a" * 1000, priority=1), NOW)
-    authority.refuse("c" * 1000, "r" * 1000, "w" * 1000)
+    authority.refuse("c" * 1000, NotReady("r" * 1000), "w" * 1000)
     authority.acquire(Acquire(who="b" * 1000), NOW)
     control = authority.report(NOW)
     assert control.holder == "a" * 64
@@ -856,7 +858,7 @@ def test_a_bounded_number_of_ended_leases_is_remembered() -> None:
 
 def test_events_are_given_once_and_in_order() -> None:
     authority = moving()
-    authority.refuse("raw", "offline", "bob")
+    authority.refuse("raw", NotReady("offline"), "bob")
     authority.takeover(Acquire(who="bob", priority=1), NOW)
     authority.stop("stop")
     assert [str(event) for event in authority.events()] == [

@@ -11,7 +11,8 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Publisher, Sample
-from zbridge.errors import BusError, Held, LeaseLost, PayloadError, Refused
+from zbridge.errors import BusError, Code, Held, LeaseLost, Malformed, PayloadError, Refused
+from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -27,7 +28,6 @@ from zbridge.fleet.messages import (
     Raw,
 )
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.session.control import LEASE_ENDED
 
 RETRY_S = 0.1
 """Seconds between two questions to a gateway that does not answer."""
@@ -162,19 +162,20 @@ class Driver:
             self._doubted.set()
         news = self._new_refusals(control)
         if news:
-            self._refusal = Refused(f"{self.robot}: {news[-1]}")
+            self._refusal = news[-1]
 
-    def _new_refusals(self, control: Control) -> list[str]:
+    def _new_refusals(self, control: Control) -> list[Refused]:
         """List what was refused to us since we last looked."""
         news, seen = [], {}
         for refusal in control.refusals:
             key = (refusal.command, refusal.reason)
             if refusal.who == self.who and refusal.command.startswith(_MOVING):
                 if refusal.count != self._seen.get(key, 0):
-                    if refusal.reason.startswith(LEASE_ENDED):  # of a lease before this one, or this one's end: ask
+                    if refusal.code == Code.LEASE_ENDED:  # of a lease before this one, or this one's end: ask
                         self._doubted.set()
                     else:
-                        news.append(f"{refusal.command}: {refusal.reason}")
+                        text = f"{self.robot}: {refusal.command}: {refusal.reason}"
+                        news.append(refused(refusal.code, text, holder=control.holder))
                 seen[key] = refusal.count
         self._seen = seen
         return news
@@ -221,9 +222,9 @@ async def acquire(bus: Bus, keys: KeySpace, request: Acquire, *, takeover: bool,
             if lease.ok:
                 return lease
             if lease.holder is None:
-                raise Refused(f"{keys.robot}: {lease.reason}")
+                raise Malformed(f"{keys.robot}: {lease.reason}")
             expires = f", {lease.expires_in_s:.1f} s left" if lease.expires_in_s is not None else ""
-            raise Held(f"{keys.robot} is {lease.reason}{expires}", lease.holder)
+            raise Held(f"{keys.robot} is {lease.reason}{expires}", holder=lease.holder)
         if loop.time() >= deadline:
             break
         await asyncio.sleep(min(RETRY_S, max(0.0, deadline - loop.time())))

@@ -10,7 +10,7 @@ from typing import Any
 from zbridge.bus import Bus, Sample
 from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import Feed, StateFeed, reader
-from zbridge.errors import BusError, PayloadError, Refused
+from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -199,15 +199,15 @@ class Robot:
             refused = 0
         control = await self._stop_until_shown()
         if _stops_refused(control) > refused:
-            reason = next(refusal.reason for refusal in control.refusals if refusal.command == "stop")
-            raise Refused(f"{self.name}: cannot be stopped: {reason}")
+            stop = next(refusal for refusal in control.refusals if refusal.command == "stop")
+            raise refusal(stop.code, f"{self.name}: cannot be stopped: {stop.reason}")
         try:
             status = await self.status.last()
         except PayloadError as error:
-            raise Refused(f"{self.name}: stop taken, but the robot's status cannot be read: {error}") from error
+            raise NotReady(f"{self.name}: stop taken, but the robot's status cannot be read: {error}") from error
         if status is not None and status.state != "established":
             why = status.reason or "no reason known"
-            raise Refused(f"{self.name}: stop taken, but the robot is {status.state}: {why}")
+            raise NotReady(f"{self.name}: stop taken, but the robot is {status.state}: {why}")
 
     async def set_light(self, on: bool) -> None:
         """Turn the light on or off."""
@@ -245,7 +245,7 @@ class Robot:
         question = payloads.encode(Query())
         for answer in await self._bus.ask(self._keys.key(topic.path), question, timeout_s=ANSWER_S):
             if answer.error is not None:
-                raise Refused(f"{self.name}: {answer.error}")
+                raise NotReady(f"{self.name}: {answer.error}")
             return payloads.decode(message, answer.payload)
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
 

@@ -154,11 +154,12 @@ class Status(FleetMessage, frozen=True):
     links: tuple[LinkStatus, ...] = ()
 
 
-class Refusal(msgspec.Struct, frozen=True):
-    """A command that was not carried out, and how often."""
+class Refusal(msgspec.Struct, frozen=True, kw_only=True):
+    """A command that was not carried out, and how often. code: one of :class:`zbridge.errors.Code`, for programs."""
 
     who: str | None
     command: str
+    code: str = ""
     reason: str
     count: int
 

@@ -15,13 +15,9 @@ from enum import Enum
 
 import msgspec
 
-from zbridge.errors import Refused
+from zbridge.errors import Code, Held, LeaseLost, Malformed, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
 
-LEASE_ENDED = "the lease has ended"
-"""How every refusal of an ended lease's token begins."""
-NEUTRAL_FIRST = ": send a neutral drive first"
-"""How the refusal of motion ends that must wait for neutral."""
 REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
 TOKEN_BYTES = 16
@@ -54,6 +50,7 @@ class Event(msgspec.Struct, frozen=True):
     reason: str | None = None
     priority: int | None = None
     command: str | None = None
+    code: Code | None = None
     stops: bool = False
 
     def __str__(self) -> str:
@@ -98,7 +95,7 @@ class Authority:
         self._moving: set[str] = set()
         self._stop_at = math.inf
         self._ended: OrderedDict[bytes, tuple[str, str]] = OrderedDict()
-        self._refusals: OrderedDict[tuple[str | None, str, str], int] = OrderedDict()
+        self._refusals: OrderedDict[tuple[str | None, str, Code, str], int] = OrderedDict()
         self._events: list[Event] = []
 
     def __repr__(self) -> str:
@@ -121,8 +118,9 @@ class Authority:
         self.expire(now)
         holder = self._holder
         if holder is not None and request.priority <= holder.priority:
-            self.refuse("acquire", f"held by {holder.described}", request.who)
-            return self._denied(f"held by {holder.described}", now)
+            held = Held(f"held by {holder.described}", holder=holder.who)
+            self.refuse("acquire", held, request.who)
+            return self._denied(held, now)
         return self._grant(request, What.ACQUIRED, now)
 
     def takeover(self, request: Acquire, now: float) -> Lease:
@@ -155,16 +153,16 @@ class Authority:
         """Give the holder whose command this is, and use its number up; raise Refused where it is nobody's."""
         self.expire(now)
         if attachment is None:
-            raise Refused("no lease: acquire first")
+            raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
         try:
             shown = _read_authorization(attachment)
         except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-            raise Refused("malformed attachment: expected {token, seq}") from error
+            raise Malformed("malformed attachment: expected {token, seq}") from error
         holder = self._shown_by(shown.token)
         if holder is None:
-            raise Refused(self._why_not(shown.token))
+            raise self._why_not(shown.token)
         if shown.seq <= holder.seq:
-            raise Refused("repeated or out of order")
+            raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)
         holder.seq = shown.seq
         holder.expires_at = now + holder.lease_s
         return holder.who
@@ -172,7 +170,7 @@ class Authority:
     def require_motion(self) -> None:
         """Raise Refused where the holder must send neutral before the robot moves."""
         if self._held_back is not None:
-            raise Refused(f"{self._held_back}{NEUTRAL_FIRST}")
+            raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
 
     def applied(self, part: str, now: float, *, moving: bool) -> None:
         """Take note that the holder's command for one part of the robot was carried out."""
@@ -195,14 +193,14 @@ class Authority:
             return holder.who
         return self._ended.get(token, (None, ""))[0]
 
-    def refuse(self, command: str, reason: str, who: str | None = None) -> None:
+    def refuse(self, command: str, refusal: Refused, who: str | None = None) -> None:
         """Count a refusal; it shows on ``control``."""
-        who, command, reason = who and who[:_NAMED], command[:_NAMED], reason[:_EXPLAINED]
-        key = (who, command, reason)
+        who, command, reason = who and who[:_NAMED], command[:_NAMED], str(refusal)[:_EXPLAINED]
+        key = (who, command, refusal.code, reason)
         self._refusals[key] = self._refusals.pop(key, 0) + 1
         if len(self._refusals) > REFUSALS:
             self._refusals.popitem(last=False)
-        self._events.append(Event(What.REFUSED, who, reason, command=command))
+        self._events.append(Event(What.REFUSED, who, reason, command=command, code=refusal.code))
 
     # Stops
 
@@ -262,8 +260,8 @@ class Authority:
             priority=holder.priority if holder else None,
             expires_in_s=max(0.0, holder.expires_at - now) if holder else None,
             refusals=tuple(
-                Refusal(who=who, command=command, reason=reason, count=count)
-                for (who, command, reason), count in self._refusals.items()
+                Refusal(who=who, command=command, code=code, reason=reason, count=count)
+                for (who, command, code, reason), count in self._refusals.items()
             ),
         )
 
@@ -275,12 +273,12 @@ class Authority:
     def _grant(self, request: Acquire, what: What, now: float) -> Lease:
         try:
             if not request.who or not request.who.isprintable():
-                raise Refused(f"who = {request.who[:_NAMED]!r}: expected a name that others are shown")
+                raise Malformed(f"who = {request.who[:_NAMED]!r}: expected a name that others are shown")
             lease_s = _wish("lease_s", request.lease_s, self.lease_s)
             deadman_s = _wish("deadman_s", request.deadman_s, self.deadman_s)
         except Refused as refusal:
-            self.refuse("takeover" if what is What.TAKEN_OVER else "acquire", str(refusal), request.who)
-            return self._denied(str(refusal), now)
+            self.refuse("takeover" if what is What.TAKEN_OVER else "acquire", refusal, request.who)
+            return self._denied(refusal, now)
         who = request.who[:_NAMED]
         if self._holder is not None:
             self._end(f"taken over by {who}", What.ENDED, stops=self.moving)
@@ -291,16 +289,18 @@ class Authority:
         self._events.append(Event(what, who, priority=request.priority))
         return Lease(ok=True, token=token, expires_in_s=lease_s, holder=who)
 
-    def _denied(self, reason: str, now: float) -> Lease:
+    def _denied(self, refusal: Refused, now: float) -> Lease:
         holder = self._holder
         expires_in_s = max(0.0, holder.expires_at - now) if holder else None
-        return Lease(ok=False, expires_in_s=expires_in_s, holder=holder.who if holder else None, reason=reason)
+        return Lease(ok=False, expires_in_s=expires_in_s, holder=holder.who if holder else None, reason=str(refusal))
 
-    def _why_not(self, token: bytes) -> str:
+    def _why_not(self, token: bytes) -> Refused:
         ended = self._ended.get(token)
         if ended is not None:
-            return f"{LEASE_ENDED} ({ended[1]})"
-        return f"held by {self._holder.described}" if self._holder else "no lease: acquire first"
+            return LeaseLost(f"the lease has ended ({ended[1]})")
+        if self._holder is not None:
+            return Held(f"held by {self._holder.described}", holder=self._holder.who)
+        return LeaseLost("no lease: acquire first", Code.NO_LEASE)
 
     def _lose(self, reason: str) -> None:
         self._end(reason, What.ENDED, stops=self.moving)
@@ -327,5 +327,5 @@ def _wish(name: str, wish_s: float | None, most_s: float) -> float:
     if wish_s is None:
         return most_s
     if not wish_s >= LEAST_S:
-        raise Refused(f"{name} = {wish_s:g}: expected at least {LEAST_S:g}")
+        raise Malformed(f"{name} = {wish_s:g}: expected at least {LEAST_S:g}")
     return min(wish_s, most_s)

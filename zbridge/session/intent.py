@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from enum import Enum
 
-from zbridge.errors import Refused
+from zbridge.errors import Code, LeaseLost, NeutralFirst
 
 LEASE_S = 3.0
 """Seconds of neutral or silence after which a robot is given back, until a lease says otherwise."""
@@ -72,10 +72,10 @@ class Intent:
         """
         self.expire(now)
         if self.held_back is not None:
-            raise Refused(f"{self.held_back}: let go of the stick first")
+            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
         if self.mode == "none":
             self.held_back, self._modeless_at = _MODE_NONE, now
-            raise Refused(_MODE_NONE)
+            raise LeaseLost(_MODE_NONE, Code.NO_LEASE)
         self._used_at = now
         if lasts:
             self._moved_at, self._moving = now, True
@@ -95,7 +95,7 @@ class Intent:
             self.held_back = None  # the motion was sent after this, and came first
         if mode == "autonomous" and self.held_back is not None:
             self.mode = mode  # it stands all the same: programs say it once
-            raise Refused(f"{self.held_back}: let go of the stick first")
+            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
         if "autonomous" in (mode, self.mode):  # a robot that moved by itself was in use until now
             self._used_at = now
         self.mode = mode

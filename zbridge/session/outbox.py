@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from zbridge.errors import Refused
+from zbridge.errors import Code, NotReady
 
 URGENT = 256
 """Frames of a stop that may wait: one for each motor there can be."""
@@ -74,7 +74,7 @@ class Outbox:
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when too many wait."""
         if len(self._queue) >= self._limit:
-            raise Refused(f"busy: {self._limit} packets wait for the robot")
+            raise NotReady(f"{self._limit} packets wait for the robot", Code.BUSY)
         self._queue.append(frame)
 
     def quiet(self, until: float) -> None:
@@ -84,7 +84,7 @@ class Outbox:
     def put_exempt(self, frame: bytes) -> None:
         """Queue a frame that goes first, and through a silence; raise Refused when too many wait."""
         if len(self._exempt) >= self._limit:
-            raise Refused(f"busy: {self._limit} packets of the handshake wait")
+            raise NotReady(f"{self._limit} packets of the handshake wait", Code.BUSY)
         self._exempt.append(frame)
 
     def stand(

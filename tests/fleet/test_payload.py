@@ -108,7 +108,7 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
             "holder": None,
             "priority": None,
             "expires_in_s": None,
-            "refusals": [{"who": None, "command": "drive", "reason": "offline", "count": 2}],
+            "refusals": [{"who": None, "command": "drive", "code": "not_ready", "reason": "offline", "count": 2}],
         },
     ),
     (

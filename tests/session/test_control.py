@@ -795,7 +795,8 @@ def test_equal_refusals_are_counted_together_and_the_newest_stands_last() -> Non
         Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2),
     )
     assert authority.events() == [
-        Event(What.REFUSED, reason="offline", command=command) for command in ("drive", "lidar", "drive")
+        Event(What.REFUSED, reason="offline", command=command, code=Code.NOT_READY)
+        for command in ("drive", "lidar", "drive")
     ]
 
 

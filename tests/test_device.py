@@ -25,12 +25,12 @@ from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
-from zbridge.leases import STOP_REPEAT_S
 from zbridge.link import Address, FakeLink
 from zbridge.metrics import Metrics
 from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
 from zbridge.session.motion import MotionLimits
+from zbridge.standstill import STOP_REPEAT_S
 
 ADDRESS = Address("robot.test", 11001)
 LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
@@ -150,6 +150,7 @@ class Rig:
         lease_s: float = FOREVER_S,
         deadman_s: float = 2.0,
         limits: MotionLimits | None = None,
+        idle_stop_s: float = 0.0,
         bus: OpenBus | None = None,
     ) -> None:
         self.loop = asyncio.get_running_loop()
@@ -173,6 +174,7 @@ class Rig:
             metrics=self.metrics,
             audit=Audit("r1", self.audit_lines.append),
             limits=limits,
+            idle_stop_s=idle_stop_s,
             connect=self._connect,
             clock_ns=lambda: 1234,
         )

@@ -19,6 +19,9 @@ _OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
 """Commands that move a robot, or may: they need the lease."""
 
 
+LINK_BLOCKED = "the robot's link takes nothing"
+
+
 class Commands:
     """Carries out and refuses. ``publish`` shows a message on the bus, ``pump`` writes to the robot."""
 
@@ -42,9 +45,12 @@ class Commands:
         self._pump = pump
         self._clock = clock
         self._closing: str | None = None
+        self.blocked = False
+        """Whether the robot's link takes nothing: drives wait in vain, and all else is refused."""
         self._topics = {keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
         self._taken = metrics.count("commands")
         self._slowed = metrics.count("drives_slowed")
+        self._unwritten = metrics.count("drives_unwritten")
 
     def __repr__(self) -> str:
         return f"<Commands {self._keys.robot}>"
@@ -94,11 +100,16 @@ class Commands:
             self._move(topic, command, now, who)
             return
         self.require_ready()
-        on_its_own = _moves_by_itself(command)
-        if on_its_own:
+        if self.blocked:
+            raise NotReady(LINK_BLOCKED)
+        autonomous = isinstance(command, Mode) and command.mode == "autonomous"
+        if autonomous or isinstance(command, Raw):
             self._authority.require_motion()
         self._show(topic, self._robot.command(topic, command, now), who)
-        self._authority.on_its_own = self._authority.on_its_own or on_its_own
+        if isinstance(command, Mode):
+            self._authority.autonomous = autonomous
+        elif isinstance(command, Raw):  # nobody here can read it: it may do anything
+            self._authority.opaque = True
         self._pump()
 
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
@@ -114,12 +125,13 @@ class Commands:
             wished, command = command, self._limits.limit(command, now)
             self._slowed.value += command is not wished and command != wished
         outcome = self._robot.command(topic, command, now)
+        self._unwritten.value += self.blocked
         self._pump()  # the robot first, the accounts after it
         if isinstance(command, Drive):
             self._limits.sent(command, now)
         self._authority.applied(topic.path, now, moving=command.moving)
         if not command.moving:
-            self._leases.stands(now)
+            self._leases.standstill.neutral(now)
         self._show(topic, outcome, who)
 
     def _show(self, topic: Topic, outcome: Outcome, who: str | None) -> None:
@@ -127,8 +139,3 @@ class Commands:
             self._publish(shown, message)
         if outcome.left_out:
             self._authority.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
-
-
-def _moves_by_itself(command: FleetMessage) -> bool:
-    """Tell a command after which a robot may move without being driven: what is opaque may do anything."""
-    return isinstance(command, Raw) or (isinstance(command, Mode) and command.mode == "autonomous")

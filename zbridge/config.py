@@ -75,6 +75,8 @@ lease_s = 3.0                           # the most a holder may ask for: a lease
 deadman_s = 2.0                         # the most a holder may ask for: motion without a fresh command ends
 # rate_hz = 50.0                        # drives a second that are carried out, the others are refused
 # slew_per_s = 2.0                      # how fast a drive may grow, full scales a second; braking is never slowed
+idle_stop_s = 1.0                       # a stop so often while nobody drives: it may lose those that end motion;
+                                        # 0: only when motion ends
 audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it: a file in the working directory,
 audit_bytes = 1000000                   # rotated at this size,
 audit_files = 5                         # with so many older ones kept
@@ -129,11 +131,13 @@ class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[control]``: the most a holder may ask for in seconds, limits on motion, and the audit log.
 
     rate_hz: drives a second that are carried out. slew_per_s: change of each part of a drive, full scales a second.
+    idle_stop_s: seconds between two stops while nobody drives; 0: only when motion ends.
     audit: the file of the audit log, rotated at ``audit_bytes``, with ``audit_files`` older ones kept.
     """
 
     lease_s: Seconds = 3.0
     deadman_s: Seconds = 2.0
+    idle_stop_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 1.0
     rate_hz: Annotated[float, msgspec.Meta(gt=0)] | None = None
     slew_per_s: Annotated[float, msgspec.Meta(gt=0)] | None = None
     audit: Annotated[str, msgspec.Meta(min_length=1)] | None = None

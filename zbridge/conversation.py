@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from zbridge.link import Link, Receiver
+from zbridge.link import STALLED_S, Link, Receiver
 from zbridge.metrics import Count
 from zbridge.session.session import Datagram, Session, State
 
@@ -15,10 +15,16 @@ log = logging.getLogger("zbridge.link")
 
 _ESTABLISHED = State.ESTABLISHED
 
+LOOK_S = 0.05
+"""Seconds between two looks at a link that takes nothing."""
+
 
 class Conversation:
     """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
 
+    Nothing is written to a link on which bytes have waited for their acknowledgement for longer than STALLED_S: a robot
+    would read what piles up as one packet, and lose it. ``stalled`` is told when that begins (True) and when all is
+    acknowledged (False), before anything else is written.
     ``before`` is called before anything is written: it may have something that must be written first.
     ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
     """
@@ -34,9 +40,13 @@ class Conversation:
         foreign: Count | None = None,
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
+        stalled: Callable[[bool], object] = lambda stalled: None,
     ) -> None:
         self.session = session
         self._before = before
+        self._on_stall = stalled
+        self.blocked = False
+        """Whether nothing is written because the peer's machine acknowledges nothing."""
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._clock = clock or loop.time
@@ -104,7 +114,8 @@ class Conversation:
         self._before()
         session, link = self.session, self._link
         outbox = session.outbox
-        while link is not None and link.ready:
+        writing = link is not None and self._takes(link)
+        while writing and link is not None and link.ready:
             frame = session.outgoing(self._clock())
             if frame is None:
                 break
@@ -119,7 +130,8 @@ class Conversation:
         if session.state is State.CLOSED:
             self._end()
         else:
-            self._set_timer(session.deadline(writing=link is not None and link.ready))
+            ready = writing and link is not None and link.ready
+            self._set_timer(self._next(session.deadline(writing=ready), link))
 
     def close(self, reason: str) -> None:
         """End the conversation from our side."""
@@ -162,6 +174,23 @@ class Conversation:
         self._timer = None
         self.session.expire(self._clock())
         self.pump()
+
+    def _takes(self, link: Link) -> bool:
+        """Tell whether the peer's machine acknowledges what is written; once it does not, wait for the last byte."""
+        waited_s = link.unacknowledged_s
+        blocked = waited_s > (0.0 if self.blocked else STALLED_S)
+        if blocked is not self.blocked:
+            self.blocked = blocked
+            self._on_stall(blocked)
+        return not blocked
+
+    def _next(self, deadline: float | None, link: Link | None) -> float | None:
+        """Give the next time to do anything: the session's, or a look at what is not acknowledged."""
+        waited_s = link.unacknowledged_s if link is not None else 0.0
+        if not waited_s and not self.blocked:
+            return deadline
+        look_at = self._clock() + (LOOK_S if self.blocked else max(0.0, STALLED_S - waited_s) + LOOK_S / 10)
+        return look_at if deadline is None else min(deadline, look_at)
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from zbridge.audit import Audit
 from zbridge.bus import Bus, Handle, Lane, Publisher, Question
-from zbridge.commands import Commands
+from zbridge.commands import LINK_BLOCKED, Commands
 from zbridge.conditions import Conditions
 from zbridge.endpoint import Connect, Endpoint, Hooks
 from zbridge.errors import BusError, ProtocolError, Refused
@@ -23,7 +23,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
-from zbridge.leases import STOP_REPEAT_S, Leases
+from zbridge.leases import Leases
 from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot, Translate
@@ -32,6 +32,7 @@ from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
 from zbridge.session.motion import MotionLimits
 from zbridge.session.session import Session, State
+from zbridge.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 
 log = logging.getLogger("zbridge.device")
 
@@ -64,6 +65,7 @@ class Device:
         audit: Audit,
         limits: MotionLimits | None = None,
         conditions: Conditions | None = None,
+        idle_stop_s: float = IDLE_STOP_S,
         connect: Connect = connect,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
@@ -82,6 +84,14 @@ class Device:
         self._leaving = False
         self._greeted: Session[Any] | None = None
         self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
+        self._standstill = Standstill(
+            robot,
+            self._conditions,
+            idle_stop_s=idle_stop_s,
+            driven=lambda: authority.moving,
+            pump=self._pump,
+            clock=clock,
+        )
         self._leases = Leases(
             robot,
             authority,
@@ -89,8 +99,8 @@ class Device:
             metrics,
             audit,
             limits or MotionLimits(),
+            self._standstill,
             publish=self._publish,
-            pump=self._pump,
             clock=clock,
         )
         self._commands = Commands(
@@ -99,6 +109,7 @@ class Device:
         self._published = metrics.count("published")
         self._lost = metrics.count("commands_lost")
         self._untranslatable = metrics.count("untranslatable")
+        self._stalls = metrics.count("link_stalls")
         self._endpoints = [
             Endpoint(
                 name,
@@ -115,6 +126,7 @@ class Device:
                     foreign=metrics.count("foreign_datagrams"),
                     clock=clock,
                     before=self._leases.look_at_time,
+                    stalled=partial(self._on_stall, name),
                 ),
             )
             for index, (name, address) in enumerate(zip(robot.link_names, addresses, strict=True))
@@ -127,6 +139,7 @@ class Device:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it."""
         self._publish_status()
         self._leases.report()
+        self._standstill.begin()
         self._bus.on_relief(self._resume)
         declared = [
             *self._leases.serve(self._bus),
@@ -155,9 +168,10 @@ class Device:
         self._leases.refuse_all(_LEAVING)
         if self._leases.authority.moving:
             self._leases.stop(_LEAVING)
-        await asyncio.sleep(min(self._leases.stopping_s, STOP_REPEAT_S))
+        await asyncio.sleep(min(self._standstill.stopping_s, STOP_REPEAT_S))
         await asyncio.gather(*(endpoint.close(_LEAVING, LEAVE_S) for endpoint in self._endpoints))
         self._publish_status()
+        self._standstill.close()
         self._leases.close()
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
@@ -172,6 +186,8 @@ class Device:
             return
         busy, self._busy = self._busy, session.busy
         if session.over:
+            self._commands.blocked = False
+            self._conditions.set("link", None)
             if session.version is not None:
                 self._lost.value += len(session.outbox)
                 if not self._leaving:
@@ -180,11 +196,23 @@ class Device:
         elif session.state is State.ESTABLISHED and session is not self._greeted:
             self._greeted = session
             with contextlib.suppress(Refused):  # whoever drove it before, it stands now
-                self._leases.stand_still()
+                self._standstill.stop()
             for topic, message in self._robot.begun(self._clock_ns()):
                 self._publish(topic, message)
         elif busy != self._busy:
             self._leases.hold_back(self._busy or "no longer busy", stops=True)
+
+    def _on_stall(self, name: str, stalled: bool) -> None:
+        """Drive no robot whose link takes nothing: it would obey late, or lose its stop with the rest."""
+        if name != self._endpoints[0].name:
+            return
+        self._commands.blocked = stalled
+        self._conditions.set("link", f"{LINK_BLOCKED}: it is not driven" if stalled else None)
+        if stalled:
+            self._stalls.value += 1
+            log.warning("%s: %s", self._keys.robot, LINK_BLOCKED)
+        else:
+            self._leases.hold_back("the robot's link took nothing", stops=True)
 
     def _pump(self) -> None:
         for endpoint in self._endpoints:

@@ -46,6 +46,8 @@ class Hooks(msgspec.Struct, frozen=True):
     clock: Callable[[], float]
     before: Callable[[], object] = lambda: None
     """Called before anything is written."""
+    stalled: Callable[[bool], object] = lambda stalled: None
+    """Called when the link takes nothing any more (True), and when it does again (False)."""
 
 
 class Endpoint:
@@ -138,6 +140,7 @@ class Endpoint:
             foreign=hooks.foreign,
             clock=hooks.clock,
             before=hooks.before,
+            stalled=hooks.stalled,
         )
         self._set_state("connecting", None)
         self.conversation = conversation

@@ -143,6 +143,7 @@ class Gateway:
             metrics=self.metrics,
             audit=audit,
             conditions=self.conditions,
+            idle_stop_s=control.idle_stop_s,
             clock=time.monotonic,  # the time line of every event loop on Linux, without its rounding
         )
 

@@ -19,18 +19,17 @@ from zbridge.protocol import Robot
 from zbridge.session.control import Authority, What
 from zbridge.session.motion import MotionLimits
 from zbridge.session.session import State
+from zbridge.standstill import Standstill
 
 log = logging.getLogger("zbridge.control")
 
-STOP_REPEAT_S = 1.0
-"""Seconds for which a stop is repeated."""
 _CONTROL_S = 0.05
 """Least time between two publications of ``control`` while refusals come in."""
 _ANYBODY = "*"
 
 
 class Leases:
-    """Carries out what the authority decides. ``publish`` shows a message on the bus, ``pump`` writes to the robot.
+    """Carries out what the authority decides. ``publish`` shows a message on the bus.
 
     ``clock``: seconds on the event loop's time line.
     """
@@ -43,26 +42,25 @@ class Leases:
         metrics: Metrics,
         audit: Audit,
         limits: MotionLimits,
+        standstill: Standstill,
         *,
         publish: Callable[[Topic, FleetMessage], object],
-        pump: Callable[[], None],
         clock: Callable[[], float],
     ) -> None:
         self.authority = authority
         self.limits = limits
+        self.standstill = standstill
         self._robot = robot
         self._keys = keys
         self._metrics = metrics
         self._audit = audit
         self._publish = publish
-        self._pump = pump
         self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = math.inf
         self._control_due: asyncio.TimerHandle | None = None
         self._closing: str | None = None
-        self._stands_at = -math.inf
         self._refused = metrics.count("refused")
 
     def __repr__(self) -> str:
@@ -75,11 +73,6 @@ class Leases:
             *(bus.answer(self._keys.key(topic.path), self._on_question, lane=self.lane) for topic in asked),
             bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
         ]
-
-    @property
-    def stopping_s(self) -> float:
-        """Seconds for which a stop or a neutral is still being repeated."""
-        return max(0.0, self._stands_at - self._clock())
 
     def lane(self, shown: bytes | None) -> Lane:
         """Let what shows the holder's token wait for nobody else's; called on the bus's threads."""
@@ -100,17 +93,6 @@ class Leases:
         """End the lease: its holder cannot be heard any more."""
         self.authority.bus_lost()
         self.settle()
-
-    def stand_still(self) -> None:
-        """Send the robot its stop, for a second; raise Refused where it cannot be sent."""
-        now = self._clock()
-        self._robot.stop(now, now + STOP_REPEAT_S)
-        self.stands(now)
-        self._pump()
-
-    def stands(self, now: float) -> None:
-        """Take note that neutral or a stop is being repeated from now on."""
-        self._stands_at = now + STOP_REPEAT_S
 
     def refuse_all(self, reason: str) -> None:
         """Give no lease from now on."""
@@ -164,7 +146,7 @@ class Leases:
         if session is None or session.state is not State.ESTABLISHED:
             return
         try:
-            self.stand_still()
+            self.standstill.stop()
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
 

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import fcntl
+import logging
 import socket
 import struct
+import termios
+import time
 from collections.abc import AsyncIterator, Callable
 from typing import Protocol, cast
 from urllib.parse import urlsplit
@@ -17,6 +21,9 @@ import msgspec
 
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
+from zbridge.session.backlog import Backlog
+
+log = logging.getLogger("zbridge.link")
 
 READ_BYTES = 64 * 1024
 """Most bytes taken from a robot's socket before the loop serves others."""
@@ -26,6 +33,19 @@ CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes the kernel keeps for a peer that connected to us and reads slowly: what is older than that helps nobody."""
 KEEPALIVE_S = 1
 """Seconds of silence after which a peer that connected to us is asked whether it is there."""
+STALLED_S = 0.3
+"""Seconds without acknowledgement after which a robot's link takes nothing; healthy robots delay theirs up to 50 ms."""
+GIVE_UP_S = 60.0
+"""Seconds without acknowledgement after which a robot's connection is given up: a deployed robot gives only one."""
+CLIENT_GIVE_UP_S = 10.0
+"""The same for a peer that connected to us."""
+_RETRY_MOST_S = 1.0
+"""Longest time between two attempts of the kernel to send a robot what a broken link lost."""
+_TCP_RTO_MAX_MS = 44
+"""Linux 6.15 and newer; Python does not name it yet."""
+_OUTSTANDING = struct.Struct("=i")
+_SIOCOUTQ = termios.TIOCOUTQ
+"""Asks a socket for the bytes that are not acknowledged, by its name for terminals."""
 _TCP_INFO = struct.Struct("=24xI28xI")
 """Of Linux's tcp_info: segments not acknowledged, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
@@ -103,6 +123,13 @@ class Link(Protocol):
     def silent_s(self) -> float:
         """Seconds for which the peer's machine has owed an answer: it was unplugged, or its network is in trouble."""
 
+    @property
+    def unacknowledged_s(self) -> float:
+        """Seconds for which the oldest byte written has waited for its acknowledgement, as far as it is known.
+
+        What has waited for no longer than :data:`STALLED_S` may be acknowledged already; 0 where nobody watches.
+        """
+
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
 
@@ -124,6 +151,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     def __init__(self, receiver: Receiver, hub: DatagramHub | None = None, buffer: bytearray | None = None) -> None:
         self.peer = ""
+        self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = buffer is not None
         self._datagrams: DatagramSocket | None = None
@@ -143,6 +171,8 @@ class TcpLink(asyncio.BufferedProtocol):
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
         if self._transport is not None:
+            if self._backlog is not None:
+                self._backlog.written(len(data), time.monotonic())
             self._transport.write(data)
 
     def write_datagram(self, data: bytes) -> None:
@@ -170,6 +200,17 @@ class TcpLink(asyncio.BufferedProtocol):
         unacknowledged, heard_ms = _TCP_INFO.unpack(info)
         silent_s: float = heard_ms / 1000 - (0.0 if unacknowledged else KEEPALIVE_S)
         return max(0.0, silent_s)
+
+    @property
+    def unacknowledged_s(self) -> float:
+        """Seconds for which the oldest byte written has waited for its acknowledgement; see :class:`Link`."""
+        backlog, transport = self._backlog, self._transport
+        if backlog is None or backlog.since is None or transport is None:
+            return 0.0
+        now = time.monotonic()
+        if now - backlog.since > STALLED_S:
+            backlog.settle(_outstanding(transport))
+        return now - backlog.since if backlog.since is not None else 0.0
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
@@ -205,10 +246,13 @@ class TcpLink(asyncio.BufferedProtocol):
             return
         self.peer = str(Address(*peer[:2]))
         sock = transport.get_extra_info("socket")
-        _tune(sock)
+        _tune(sock, CLIENT_GIVE_UP_S if self._accepted else GIVE_UP_S)
         if self._accepted:
             _keep_alive(sock)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
+        else:
+            _try_again_soon(sock)
+            self._backlog = _new_backlog(sock)
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
@@ -241,14 +285,14 @@ class TcpLink(asyncio.BufferedProtocol):
         self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
-def _tune(sock: socket.socket) -> None:
+def _tune(sock: socket.socket, give_up_s: float) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in (
         ("TCP_KEEPIDLE", 5),
         ("TCP_KEEPINTVL", 2),
         ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", 10_000),
+        ("TCP_USER_TIMEOUT", round(give_up_s * 1000)),
     ):
         if hasattr(socket, option):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
@@ -259,6 +303,42 @@ def _keep_alive(sock: socket.socket) -> None:
     for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
         if hasattr(socket, option):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def _try_again_soon(sock: socket.socket) -> None:
+    """Have what a broken link lost sent again within :data:`_RETRY_MOST_S`, where the kernel can be told."""
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(_RETRY_MOST_S * 1000))
+
+
+_unwatched_said = False
+
+
+def _new_backlog(sock: socket.socket) -> Backlog | None:
+    """Give a backlog where the platform tells what is not acknowledged; say once where it does not."""
+    global _unwatched_said
+    try:
+        _queued(sock)
+    except OSError:
+        if not _unwatched_said:
+            _unwatched_said = True
+            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
+        return None
+    return Backlog()
+
+
+def _outstanding(transport: asyncio.Transport) -> int:
+    """Count the bytes that were written and not acknowledged: the kernel's and the transport's own."""
+    queued = 0
+    with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
+        queued = _queued(transport.get_extra_info("socket"))
+    return queued + transport.get_write_buffer_size()
+
+
+def _queued(sock: socket.socket) -> int:
+    """Count the bytes that the kernel keeps until they are acknowledged; raise OSError where it does not tell."""
+    queued: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
+    return queued
 
 
 async def connect(address: Address, receiver: Receiver) -> TcpLink:
@@ -436,6 +516,7 @@ class FakeLink:
         self.peer = peer
         self.ready = True
         self.silent_s = 0.0
+        self.unacknowledged_s = 0.0
         self.written: list[bytes] = []
         self.datagrams: list[bytes] = []
         self.paused = False

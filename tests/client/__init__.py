@@ -13,6 +13,7 @@ from zbridge.audit import Audit
 from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.commands import Commands
+from zbridge.conditions import Conditions
 from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -24,6 +25,7 @@ from zbridge.protocol import Outcome, Robot
 from zbridge.session.control import Authority
 from zbridge.session.motion import MotionLimits
 from zbridge.session.session import State
+from zbridge.standstill import Standstill
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 
@@ -88,8 +90,15 @@ class Gateway:
             metrics,
             Audit(name, lambda line: None),
             MotionLimits(),
+            Standstill(
+                self.machine,
+                Conditions(),
+                idle_stop_s=0.0,
+                driven=lambda: self.authority.moving,
+                pump=lambda: None,
+                clock=self._loop.time,
+            ),
             publish=self.publish,
-            pump=lambda: None,
             clock=self._loop.time,
         )
         self.commands = Commands(

@@ -84,8 +84,10 @@ class Authority:
     def __init__(self, lease_s: float, deadman_s: float, new_token: Callable[[], bytes]) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
-        self.on_its_own = False
-        """Whether the robot was told to move without being driven: no deadman, but every other stop."""
+        self.autonomous = False
+        """Whether the robot was told to move by itself: no deadman, but every other stop, until another mode."""
+        self.opaque = False
+        """Whether it was sent what nobody here can read, and may move by it: the same, until neutral."""
         self.token: bytes | None = None
         """The token of the lease that is held; only for sorting what comes in."""
         self._new_token = new_token
@@ -109,7 +111,7 @@ class Authority:
     @property
     def moving(self) -> bool:
         """Whether the robot was told to move, or to move on its own, and not yet to stop."""
-        return bool(self._moving) or self.on_its_own
+        return bool(self._moving) or self.autonomous or self.opaque
 
     # The lease
 
@@ -178,6 +180,7 @@ class Authority:
             self._moving.add(part)
         else:
             self._moving.discard(part)
+            self.opaque = self.opaque and bool(self._moving)
             self._held_back = None
         deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
         self._stop_at = now + deadman_s if self._moving else math.inf
@@ -318,7 +321,7 @@ class Authority:
 
     def _still(self) -> None:
         self._moving.clear()
-        self.on_its_own = False
+        self.autonomous = self.opaque = False
         self._stop_at = math.inf
 
 

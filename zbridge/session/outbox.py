@@ -108,6 +108,8 @@ class Outbox:
         if urgent:
             self._urgent.extend(frame for frame in frames if frame not in self._urgent)
             new.due = now + period_s
+            if new.over:
+                del self._standing[slot]
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
 

@@ -11,7 +11,7 @@ import pytest
 
 from zbridge import link as links
 from zbridge.errors import LinkError
-from zbridge.link import Address, DatagramHub, FakeLink, Link, Receiver, TcpLink, connect, listen
+from zbridge.link import STALLED_S, Address, DatagramHub, FakeLink, Link, Receiver, TcpLink, connect, listen
 from zbridge.metrics import Count
 
 SOON_S = 5.0
@@ -633,3 +633,72 @@ def test_a_fake_link_keeps_what_is_done_to_it() -> None:
     link.resume()
     link.close()
     assert (link.paused, link.closed) == (False, True)
+
+
+# What a robot's machine has not acknowledged
+
+
+async def waited(link: TcpLink, least_s: float) -> float:
+    """Wait until bytes have waited for their acknowledgement for so long."""
+    async with asyncio.timeout(SOON_S):
+        while (waited_s := link.unacknowledged_s) < least_s:  # noqa: ASYNC110 - nothing tells when
+            await asyncio.sleep(0.01)
+    return waited_s
+
+
+async def test_bytes_that_the_peers_machine_does_not_take_wait_for_their_acknowledgement_until_it_does() -> None:
+    async with connected() as pair:
+        pair.there.pause()
+        pair.here.write(b"x" * 10_000_000)  # more than both kernels keep
+        await waited(pair.here, STALLED_S + 0.1)
+        pair.there.resume()
+        await pair.far.until("received", received=10_000_000)
+        async with asyncio.timeout(SOON_S):
+            while pair.here.unacknowledged_s:  # noqa: ASYNC110 - nothing tells when
+                await asyncio.sleep(0.01)
+
+
+async def test_bytes_that_arrive_do_not_wait_for_the_program_to_read_them() -> None:
+    """A stalled program cannot be seen from here, as its kernel acknowledges."""
+    async with connected() as pair:
+        pair.there.pause()
+        for _ in range(30):
+            pair.here.write(b"x")
+            await asyncio.sleep(0.02)
+        assert pair.here.unacknowledged_s <= STALLED_S
+
+
+async def test_only_a_robots_link_is_watched() -> None:
+    async with connected() as pair:
+        pair.here.pause()
+        pair.there.write(b"x" * 10_000_000)
+        await asyncio.sleep(STALLED_S + 0.1)
+        assert pair.there.unacknowledged_s == 0.0
+
+
+async def test_a_robots_connection_is_kept_for_a_minute_and_what_was_lost_sent_again_within_a_second() -> None:
+    async with connected() as pair:
+        here, there = (link._transport.get_extra_info("socket") for link in (pair.here, pair.there))  # type: ignore[union-attr]
+        assert here.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 60_000
+        assert there.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 10_000
+        with contextlib.suppress(OSError):  # a kernel before 6.15
+            assert here.getsockopt(socket.IPPROTO_TCP, 44) == 1000
+
+
+async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unknown(*_: object) -> bytes:
+        raise OSError("Inappropriate ioctl for device")
+
+    monkeypatch.setattr(links.fcntl, "ioctl", unknown)
+    monkeypatch.setattr(links, "_unwatched_said", False)
+    for _ in range(2):
+        async with connected() as pair:
+            pair.there.pause()
+            pair.here.write(b"x" * 10_000_000)
+            await asyncio.sleep(STALLED_S + 0.1)
+            assert pair.here.unacknowledged_s == 0.0
+    assert [record.message for record in caplog.records if "acknowledged" in record.message] == [
+        "this platform does not tell what robots acknowledged: drives are written to broken links too"
+    ]

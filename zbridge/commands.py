@@ -107,9 +107,9 @@ class Commands:
             self._authority.require_motion()
         self._show(topic, self._robot.command(topic, command, now), who)
         if isinstance(command, Mode):
-            self._authority.autonomous = autonomous
-        elif isinstance(command, Raw):  # nobody here can read it: it may do anything
-            self._authority.opaque = True
+            self._authority.mode_chosen(autonomous=autonomous)
+        elif isinstance(command, Raw):
+            self._authority.sent_opaque()
         self._pump()
 
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:

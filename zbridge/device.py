@@ -88,7 +88,7 @@ class Device:
             robot,
             self._conditions,
             idle_stop_s=idle_stop_s,
-            driven=lambda: authority.moving,
+            driven=lambda: authority.driven,
             pump=self._pump,
             clock=clock,
         )

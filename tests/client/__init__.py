@@ -94,7 +94,7 @@ class Gateway:
                 self.machine,
                 Conditions(),
                 idle_stop_s=0.0,
-                driven=lambda: self.authority.moving,
+                driven=lambda: self.authority.driven,
                 pump=lambda: None,
                 clock=self._loop.time,
             ),

@@ -48,7 +48,7 @@ def moving() -> Authority:
 
 def by_itself() -> Authority:
     authority = held()
-    authority.autonomous = True
+    authority.on_its_own = True
     return authority
 
 
@@ -758,7 +758,7 @@ def test_a_robot_that_moves_by_itself_is_not_stopped_by_the_deadman() -> None:
     assert authority.moving
     authority.expire(NOW + LEASE_S)
     assert authority.events() == [ended("lease expired", stops=True)]
-    assert not authority.autonomous
+    assert not authority.on_its_own
 
 
 def test_a_robot_that_moves_by_itself_still_moves_after_a_neutral() -> None:

@@ -366,7 +366,7 @@ class Driving(RuleBasedStateMachine):
     def obey_by_itself(self) -> None:
         if not self.is_held_back():
             assert not self.must_neutral
-            self.authority.autonomous = self.robot.on_its_own = True
+            self.authority.on_its_own = self.robot.on_its_own = True
 
     def take_events(self, *, must_stop: bool = False) -> None:
         """Send the robot the stops that were given; whatever ended or was stopped must have come with one."""

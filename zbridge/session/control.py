@@ -84,10 +84,12 @@ class Authority:
     def __init__(self, lease_s: float, deadman_s: float, new_token: Callable[[], bytes]) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
-        self.autonomous = False
-        """Whether the robot was told to move by itself: no deadman, but every other stop, until another mode."""
-        self.opaque = False
-        """Whether it was sent what nobody here can read, and may move by it: the same, until neutral."""
+        self.on_its_own = False
+        """Whether the robot may have moved without being driven since its last stop: no deadman, but every other stop."""
+        self._autonomous = False
+        """Whether its mode is autonomous now."""
+        self._opaque = False
+        """Whether it was sent what nobody here can read, since its last stop or neutral: it may move by that."""
         self.token: bytes | None = None
         """The token of the lease that is held; only for sorting what comes in."""
         self._new_token = new_token
@@ -111,7 +113,12 @@ class Authority:
     @property
     def moving(self) -> bool:
         """Whether the robot was told to move, or to move on its own, and not yet to stop."""
-        return bool(self._moving) or self.autonomous or self.opaque
+        return bool(self._moving) or self.on_its_own
+
+    @property
+    def driven(self) -> bool:
+        """Whether somebody drives the robot, or lets it drive: else it is to be at rest."""
+        return bool(self._moving) or self._autonomous or self._opaque
 
     # The lease
 
@@ -180,10 +187,19 @@ class Authority:
             self._moving.add(part)
         else:
             self._moving.discard(part)
-            self.opaque = self.opaque and bool(self._moving)
+            self._opaque = self._opaque and bool(self._moving)
             self._held_back = None
         deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
         self._stop_at = now + deadman_s if self._moving else math.inf
+
+    def mode_chosen(self, *, autonomous: bool) -> None:
+        """Take note that the holder's choice of who moves the robot was carried out."""
+        self._autonomous = autonomous
+        self.on_its_own = self.on_its_own or autonomous
+
+    def sent_opaque(self) -> None:
+        """Take note that the holder had the robot sent what nobody here can read: it may move by it."""
+        self._opaque = self.on_its_own = True
 
     def owner(self, attachment: bytes | None) -> str | None:
         """Tell whose a refused command was, as far as its token shows."""
@@ -321,7 +337,7 @@ class Authority:
 
     def _still(self) -> None:
         self._moving.clear()
-        self.autonomous = self.opaque = False
+        self.on_its_own = self._autonomous = self._opaque = False
         self._stop_at = math.inf
 
 

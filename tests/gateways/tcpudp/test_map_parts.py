@@ -311,7 +311,10 @@ async def test_a_robot_that_cannot_be_stopped_is_not_lost_for_its_map() -> None:
         assert len(rig.values("map")) == 1
         rig.sends(FIRST)
         await asyncio.sleep(2.0)
-        assert rig.last("status")["reason"] is None
+        assert (
+            rig.last("status")["reason"]
+            == "cannot be stopped: clientJoystickStop: the robot does not announce joystick"
+        )
 
 
 @jumping

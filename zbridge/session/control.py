@@ -85,7 +85,7 @@ class Authority:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
         self.on_its_own = False
-        """Whether the robot may have moved without being driven since its last stop: no deadman, but every other stop."""
+        """Whether the robot may have moved by itself since its last stop: no deadman, but every other stop."""
         self._autonomous = False
         """Whether its mode is autonomous now."""
         self._opaque = False

@@ -15,6 +15,7 @@ import contextlib
 import json
 import math
 import random
+import socket
 import struct
 import sys
 import time
@@ -33,6 +34,11 @@ WHEEL_M, FULL_M_S = 0.05, 0.5
 """Radius of a Webots robot's wheels and its full speed; the gateway is configured with the same."""
 SEND_S = 60.0
 """A vehicle or a simulation waits for its send as long as its kernel does: deployed ones block in it."""
+
+HELD_UP_S = 0.1
+"""Seconds of one send after which a robot's program counts as held up by it."""
+GOES_ON = "on"
+"""The word after the time at which such a program goes on."""
 
 _TCPUDP = tcpudp_wire.Times(silence_s=math.inf)
 _ALF = alf_wire.Times(send_s=SEND_S)
@@ -104,8 +110,21 @@ def _vehicle(dialect: alf_wire.Dialect) -> Callable[[Tell, int], tuple[Judge, Se
     return make
 
 
+class _Controller(StrictController):
+    """Tells when it goes on after its own send held it up: it sends and reads one after the other.
+
+    Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
+    """
+
+    async def _send(self, conn: socket.socket, messages: list[bytes]) -> None:
+        begun = time.monotonic()
+        await super()._send(conn, messages)
+        if time.monotonic() - begun > HELD_UP_S:
+            print(f"{time.monotonic():.6f} {GOES_ON}", flush=True)
+
+
 def _controller(tell: Tell, seed: int) -> tuple[Judge, Serve]:
-    controller = StrictController("deployed", seed=seed, times=_WC2EC)
+    controller = _Controller("deployed", seed=seed, times=_WC2EC)
     controller.robot = _Wheels(tell, seed)
     return controller, controller.serve
 

@@ -15,6 +15,10 @@ time to rest runs from the moment when the robot or its link goes on, or from wh
 that is later; a simulation that was held up by its own send goes on when its kernel has tried again ("held up": the
 longest time after the link was back). Then the robot must stay at rest for ``REST_S``, and be driven again over the
 same connection.
+A cut of ``SHOWN_S`` and more must show in ``status.reason``, no longer afterwards, and in the counter ``link_stalls``.
+
+What drives a robot by datagrams says nothing of a cut by itself: where no stop was on its way by TCP the driver may
+go on after it, and the robot must be at rest after the driver's neutral.
 """
 
 from __future__ import annotations
@@ -628,7 +632,7 @@ def estimate_s(cases: Iterable[Case], repetitions: int, lanes: int) -> float:
 
 def table(outcomes: Iterable[Outcome]) -> Iterator[str]:
     """Write the results as the rows of a Markdown table."""
-    yield "| robot | version | what | s | repetitions | median s | worst s | held up s | drove on | late | other faults |"
+    yield "| robot | version | what | s | times | median s | worst s | held up s | drove on | late | other faults |"
     yield "|---|---|---|---:|---:|---:|---:|---:|---:|---:|---|"
     cells: dict[Case, list[Outcome]] = {}
     for outcome in outcomes:

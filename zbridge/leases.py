@@ -35,9 +35,10 @@ Decide = Callable[[Question], FleetMessage]
 
 
 class Gate:
-    """Lets what the holder sends into its lane, each number once; of commands or of questions, called on bus threads.
+    """Chooses the lane: COMMAND for what the holder's proof shows to be new, else OTHER. Runs on bus threads.
 
-    Nothing but a new proof opens it: who knows the lease's id, or repeats what it overheard, fills no lane of the holder's.
+    Who only knows the lease's id, or repeats what it overheard, fills no lane of the holder's.
+    One gate for commands and one for questions, which are numbered apart.
     """
 
     def __init__(self, authority: Authority) -> None:

@@ -28,7 +28,7 @@ REPEAT_S = 0.05
 
 _MOVING = ("drive", "mode", "motor/", "raw/")
 _PASSING = (Code.OUT_OF_ORDER, *NotReady.codes, *TooFast.codes)
-"""What a gateway may say to a question of a holder that is one still: somebody repeated the question, and came first."""
+"""What one that holds the lease may be told all the same: somebody repeated its question, say, and came first."""
 
 
 def default_who() -> str:

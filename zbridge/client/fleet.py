@@ -120,9 +120,10 @@ class ControlFeed(StateFeed[Control]):
     ) -> AsyncIterator[Driver]:
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
-        who: shown to others as the holder, ``user@host`` by default. name: what ``who`` begins with, before a ``.``, where
-        access rules know this program by less than all of it. priority: a higher one is given the robot of a
-        lower one. deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
+        who: shown to others as the holder, ``user@host`` by default. name: where access rules know this program by the
+        first part of ``who`` only (``op1`` of ``op1.laptop``), that part.
+        priority: a higher one is given the robot of a lower one.
+        deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
         takeover: take the robot from whoever drives it. wait_s: how long to wait for the robot's gateway.
         Raises Held naming the holder, BusError where no gateway answers.
         """

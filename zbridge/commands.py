@@ -93,8 +93,6 @@ class Commands:
 
     def _admit(self, topic: Topic, sample: Sample) -> str | None:
         """Give the holder whose command this is, None of one that needs no lease; raise Refused where it may not be."""
-        if self._closing is not None:
-            raise NotReady(self._closing, Code.CLOSING)
         if topic.message not in _OF_THE_HOLDER:
             return None
         who = self._authority.admit(sample.attachment, sample.key, sample.payload, self._clock())
@@ -102,6 +100,8 @@ class Commands:
         return who
 
     def _carry_out(self, topic: Topic, payload: bytes, who: str | None) -> None:
+        if self._closing is not None:
+            raise NotReady(self._closing, Code.CLOSING)
         now = self._clock()
         command = payloads.decode(topic.message, payload)
         if isinstance(command, _MOVING):

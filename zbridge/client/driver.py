@@ -27,8 +27,8 @@ REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
 
 _MOVING = ("drive", "mode", "motor/", "raw/")
-_PASSING = (Code.OUT_OF_ORDER, *NotReady.codes, *TooFast.codes)
-"""What one that holds the lease may be told all the same: somebody repeated its question, say, and came first."""
+_PASSING = (*NotReady.codes, *TooFast.codes)
+"""What is no word about whose the lease is."""
 
 
 def default_who() -> str:
@@ -135,7 +135,7 @@ class Driver:
             if lease is None:
                 if loop.time() >= expires_at:
                     self._lose("the gateway does not answer")
-            elif lease.ok:
+            elif lease.ok or lease.code == Code.OUT_OF_ORDER:  # somebody repeated our question, and came first with it
                 expires_at = asked_at + (lease.expires_in_s or self._lease_s)
             else:
                 self._lose(lease.reason or "no reason given", lease.holder)
@@ -200,26 +200,26 @@ class Driver:
 async def acquire(bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float) -> Lease:
     """Get the lease, asking as ``name``.
 
-    Raises Held where somebody has it, Malformed where it cannot be asked for like this, BusError where no gateway
-    grants it within ``wait_s``.
+    Raises Held where somebody has it, Malformed where it cannot be asked for like this; after ``wait_s`` NotReady or
+    TooFast where the gateway went on saying so, BusError where none answered.
     """
     key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
-    why = "no gateway answered"
+    refusal: Refused | None = None
     while True:
         left_s = max(RETRY_S, deadline - loop.time())
         for answer in await bus.ask(key, payloads.encode(request), timeout_s=min(ASK_S, left_s)):
             try:
                 return _granted(keys.robot, answer)
-            except (NotReady, TooFast) as refusal:  # for now
-                why = f"the gateway says {str(refusal)!r}"
-            except BusError as error:
-                why = f"no answer ({error})"
+            except (NotReady, TooFast) as later:
+                refusal = later
+            except BusError:
+                continue
         if loop.time() >= deadline:
             break
         await asyncio.sleep(min(RETRY_S, max(0.0, deadline - loop.time())))
-    raise BusError(f"{keys.robot}: {why} within {wait_s:g} s")
+    raise refusal or BusError(f"{keys.robot}: no gateway answered within {wait_s:g} s")
 
 
 def _granted(robot: str, answer: Answer) -> Lease:

@@ -125,7 +125,7 @@ class ControlFeed(StateFeed[Control]):
         priority: a higher one is given the robot of a lower one.
         deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
         takeover: take the robot from whoever drives it. wait_s: how long to wait for the robot's gateway.
-        Raises Held naming the holder, BusError where no gateway answers.
+        Raises Held naming the holder, BusError where no gateway answers, or what else the gateway refused it as.
         """
         who = who or default_who()
         name = name or who

@@ -184,7 +184,7 @@ class Story:
 
 def holder_of(frame: Frame) -> str:
     """Read from a motion which lease it was sent under."""
-    return f"{NAMES[frame.number < 0]} {abs(frame.number) // _NUMBERS}"
+    return f"{NAMES[frame.number < 0]}.{abs(frame.number) // _NUMBERS}"
 
 
 def fight(seconds: float, seed: int = 1) -> Story:

@@ -7,22 +7,25 @@ import contextlib
 import itertools
 import json
 import math
+import re
 import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import msgpack
 import pytest
+import zenoh
 
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import JumpingLoop, jumping
+from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.audit import Audit
 from zbridge.bus import Handle, Lane, Question, Sample
-from zbridge.bus.fake import FakeBus, FakeQuestion
+from zbridge.bus.fake import FakeBus, FakeQuestion, meet
 from zbridge.bus.interface import LaneOf
 from zbridge.conversation import Conversation
 from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
-from zbridge.errors import LinkError
+from zbridge.errors import LinkError, Malformed, NotReady, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.link import Address, FakeLink
@@ -53,7 +56,17 @@ NEUTRAL: dict[str, Any] = {}
 FOREVER_S = 1e6
 """A lease that no test outlives."""
 NEED_A_LEASE = {"drive", "motor", "mode", "raw"}
-DENIED = {"ok": False, "token": None, "expires_in_s": None, "holder": None, "reason": None}
+DENIED = {
+    "ok": False,
+    "lease": None,
+    "token": None,
+    "expires_in_s": None,
+    "holder": None,
+    "reason": None,
+    "code": None,
+}
+STRANGE = lease(99)
+"""A lease that was never given."""
 
 
 class TimedLink(FakeLink):
@@ -94,49 +107,52 @@ class OpenBus(FakeBus):
         return super().subscribe(key_expr, handler, lane=lane, history=history)
 
 
+def payload_of(fields: dict[str, Any] | bytes) -> bytes:
+    return fields if isinstance(fields, bytes) else packed(fields)
+
+
 class Program:
-    """A program on the bus that drives: its lease, and the number of its last command."""
+    """A program on the bus that drives, and its lease."""
 
     def __init__(self, rig: Rig, who: str) -> None:
         self.who = who
-        self.token: bytes | None = None
-        self.seq = 0
+        self.held: Holder | None = None
         self._rig = rig
         self._bus = rig.bus.join(who)
 
-    def ask(self, name: str, **fields: Any) -> dict[str, Any]:
+    def ask(self, name: str, payload: bytes) -> dict[str, Any]:
         """Ask something about the lease."""
-        (reply,) = self._rig.ask(f"control/{name}", msgpack.packb(fields)).replies
+        (reply,) = self._rig.ask(f"control/{name}", payload).replies
         assert reply.error is None
-        lease: dict[str, Any] = msgpack.unpackb(reply.payload)
-        return lease
+        answer: dict[str, Any] = msgpack.unpackb(reply.payload)
+        return answer
 
     def acquire(self, how: str = "acquire", **wishes: Any) -> dict[str, Any]:
-        """Ask for the lease, and keep its token."""
-        lease = self.ask(how, who=self.who, **wishes)
-        if lease["ok"]:
-            self.token = lease["token"]
-        return lease
+        """Ask for the lease, and keep it."""
+        answer = self.ask(f"{how}/{topics.escape(self.who)}", packed({"who": self.who, **wishes}))
+        if answer["ok"]:
+            self.held = Holder.of(answer)
+        return answer
 
     def renew(self) -> dict[str, Any]:
-        return self.ask("renew", token=self.token)
+        assert self.held is not None
+        return self.ask("renew", self.held.question("renew"))
 
     def release(self) -> dict[str, Any]:
-        return self.ask("release", token=self.token)
+        assert self.held is not None
+        return self.ask("release", self.held.question("release"))
 
-    def attachment(self) -> bytes | None:
+    def attachment(self, name: str, fields: dict[str, Any] | bytes) -> bytes | None:
         """What goes with the next command of a holder."""
-        self.seq += 1
-        packed: bytes | None = msgpack.packb({"token": self.token, "seq": self.seq}) if self.token else None
-        return packed
+        return self.held.attachment(name, payload_of(fields)) if self.held is not None else None
 
     def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
         """Command the robot, with the lease where the command needs it."""
-        self.put(name, fields, self.attachment() if name.split("/")[0] in NEED_A_LEASE else None)
+        self.put(name, fields, self.attachment(name, fields) if name.split("/")[0] in NEED_A_LEASE else None)
 
     def put(self, name: str, fields: dict[str, Any] | bytes, attachment: bytes | None) -> None:
         """Command the robot with this attachment."""
-        payload = fields if isinstance(fields, bytes) else msgpack.packb(fields)
+        payload = payload_of(fields)
         self._bus.publisher(f"fleet/r1/@cmd/{name}", topics.CMD_MODE).put(payload, attachment)
 
 
@@ -162,14 +178,13 @@ class Rig:
         self.conversations: list[Conversation] = []
         self.unreachable: str | None = None
         self.audit_lines: list[str] = []
-        tokens = (bytes([number]) * 16 for number in itertools.count(1))
         self.device = Device(
             TcpUdpRobot(options or Options()),
             (ADDRESS,),
             protocol="tcpudp",
             keys=KeySpace("fleet", "r1"),
             bus=self.bus,
-            authority=Authority(lease_s, deadman_s, lambda: next(tokens)),
+            authority=Authority(lease_s, deadman_s, numbered()),
             manager=self.manager,
             metrics=self.metrics,
             audit=Audit("r1", self.audit_lines.append),
@@ -221,10 +236,10 @@ class Rig:
         assert isinstance(self.loop, JumpingLoop)
         self.loop._jumping.now += seconds
 
-    def ask(self, name: str, payload: bytes = b"") -> FakeQuestion:
-        """Play a program on the bus that asks the robot."""
-        question = FakeQuestion(f"fleet/r1/@rpc/{name}", payload)
-        self.bus.answers[question.key](question)
+    def ask(self, name: str, payload: bytes = b"", *, asked: str | None = None) -> FakeQuestion:
+        """Play a program on the bus that asks the robot; ``asked``: by another key expression."""
+        question = FakeQuestion(f"fleet/r1/@rpc/{name}", payload, asked=asked)
+        next(answer for key, answer in self.bus.answers.items() if meet(key, question.key))(question)
         return question
 
     def values(self, path: str) -> list[dict[str, Any]]:
@@ -265,6 +280,14 @@ class Rig:
     def counted(self, what: str) -> int:
         """How often the right to drive changed in this way."""
         return self.metrics.count("control", what=what).value
+
+
+def handlers(rig: Rig, key: str) -> list[Callable[[Sample], None]]:
+    """Give who subscribed to what this key expression meets, by Zenoh's own rules."""
+    expression = zenoh.KeyExpr(key)
+    return [
+        take for subscribed, take in rig.bus._shared.subscribers if zenoh.KeyExpr(subscribed).intersects(expression)
+    ]
 
 
 @contextlib.asynccontextmanager
@@ -708,7 +731,7 @@ async def test_nobody_drives_after_a_stop_before_acquiring_anew() -> None:
             await asyncio.sleep(0.1)
         assert rig.written() == []
         assert await rig.refused() == [("driver", "drive", "the lease has ended (stop)", 3)]
-        assert rig.driver.renew() == {**DENIED, "reason": "the lease has ended (stop)"}
+        assert rig.driver.renew() == {**DENIED, "reason": "the lease has ended (stop)", "code": "lease_ended"}
         rig.hold()
         rig.command("drive", DRIVE_LEFT)
         assert rig.written() == [MOVE_LEFT], "whoever acquires needs no neutral"
@@ -753,7 +776,7 @@ async def test_fresh_commands_keep_the_robot_moving() -> None:
 async def test_nothing_but_the_holders_fresh_commands_keeps_the_robot_moving() -> None:
     async with established(deadman_s=0.6) as rig:
         other = Program(rig, "other")
-        seen = rig.driver.attachment()
+        seen = rig.driver.attachment("drive", DRIVE_LEFT)
         rig.driver.put("drive", DRIVE_LEFT, seen)
         for _ in range(4):
             await asyncio.sleep(0.145)
@@ -852,10 +875,12 @@ OF_THE_HOLDER = [
 @jumping
 async def test_whoever_acquires_a_free_robot_is_given_its_lease_and_shown_as_the_holder() -> None:
     async with established(hold=False, lease_s=3.0) as rig:
-        assert rig.control == {"state": "free", "holder": None, "priority": None, "expires_in_s": None}
-        lease = rig.hold(priority=4)
-        assert lease == {"ok": True, "token": bytes([1]) * 16, "expires_in_s": 3.0, "holder": "driver", "reason": None}
-        assert rig.control == {"state": "held", "holder": "driver", "priority": 4, "expires_in_s": 3.0}
+        free = {"state": "free", "holder": None, "lease": None, "priority": None, "expires_in_s": None}
+        assert rig.control == free
+        granted = {"ok": True, "lease": bytes([1]) * 8, "token": bytes([1]) * 32, "expires_in_s": 3.0}
+        assert rig.hold(priority=4) == {**granted, "holder": "driver", "reason": None, "code": None}
+        held = {"state": "held", "holder": "driver", "lease": bytes([1]) * 8, "priority": 4, "expires_in_s": 3.0}
+        assert rig.control == held
         rig.command("drive", DRIVE_LEFT)
         assert rig.written() == [MOVE_LEFT]
         assert (rig.counted("acquired"), rig.metrics.total("refused")) == (1, 0)
@@ -865,13 +890,18 @@ async def test_whoever_acquires_a_free_robot_is_given_its_lease_and_shown_as_the
 async def test_control_counts_the_time_that_is_left_down_and_never_shows_the_token() -> None:
     async with established(lease_s=5.0) as rig:
         rig.hold("takeover")
-        assert rig.driver.token is not None
+        assert rig.driver.held is not None
         start = rig.loop.time()
         await asyncio.sleep(3 * HEARTBEAT_S)
         left = rig.control["expires_in_s"]
         assert 5.0 - 3 * HEARTBEAT_S <= left < 5.0 - 2 * HEARTBEAT_S + 1e-6
         assert rig.loop.time() == pytest.approx(start + 3.0)
-        assert not any(rig.driver.token in payload for payload in rig.bus.values("fleet/r1/*"))
+        token = rig.driver.held.token
+        rig.command("drive", DRIVE_LEFT)
+        rig.command("stop")
+        assert not any(token in payload for payload in rig.bus.values("fleet/r1/*"))
+        assert not any(token in (sample.attachment or b"") for sample in rig.bus._shared.history)
+        assert len(rig.bus.values("fleet/*/@cmd/**")) == 2, "commands were looked at as well"
 
 
 @pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
@@ -908,13 +938,18 @@ async def test_of_two_programs_only_the_holders_commands_are_carried_out(name: s
 
 
 @jumping
-async def test_a_guessed_token_is_nobodys() -> None:
+async def test_a_guessed_lease_is_nobodys_and_a_guessed_token_of_the_right_one_neither() -> None:
     async with established() as rig:
         forger = Program(rig, "forger")
-        for token in (bytes(16), bytes([1]) * 15, bytes([1]) * 17, b""):
-            forger.put("drive", DRIVE_LEFT, msgpack.packb({"token": token, "seq": 1_000}))
+        for held in (STRANGE, Holder(bytes([1]) * 8, bytes(32)), Holder(bytes([1]) * 8, bytes([1]) * 31)):
+            held.seq = 1_000
+            forger.put("drive", DRIVE_LEFT, held.attachment("drive", packed(DRIVE_LEFT)))
         assert rig.written() == []
-        assert await rig.refused() == [(None, "drive", "held by driver (priority 0)", 4)]
+        assert await rig.refused() == [
+            (None, "drive", "held by driver (priority 0)", 1),
+            (None, "drive", "wrong proof", 2),
+        ]
+        assert [entry["code"] for entry in rig.last("control")["refusals"]] == ["held", "malformed"]
         rig.command("drive", DRIVE_LEFT)
         assert rig.written() == [MOVE_LEFT], "their numbers are not the holder's"
 
@@ -926,12 +961,11 @@ async def test_a_guessed_token_is_nobodys() -> None:
         b"\xc1",
         b"\x90",
         b"\x91" * 100_000,
-        msgpack.packb({}),
-        msgpack.packb({"token": bytes([1]) * 16}),
-        msgpack.packb({"seq": 1}),
-        msgpack.packb({"token": "text", "seq": 1}),
-        msgpack.packb({"token": bytes([1]) * 16, "seq": -1}),
-        msgpack.packb({"token": bytes([1]) * 16, "seq": 1.5}),
+        packed({}),
+        packed({"lease": bytes([1]) * 8, "seq": 1}),
+        packed({"lease": bytes([1]) * 8, "seq": -1, "proof": bytes(16)}),
+        packed({"lease": bytes([1]) * 8, "seq": 1, "proof": bytes(15)}),
+        packed({"token": bytes([1]) * 32, "seq": 1}),
     ],
 )
 @jumping
@@ -939,25 +973,79 @@ async def test_a_malformed_attachment_is_refused(attachment: bytes) -> None:
     async with established() as rig:
         rig.driver.put("drive", DRIVE_LEFT, attachment)
         assert rig.written() == []
-        assert await rig.refused() == [(None, "drive", "malformed attachment: expected {token, seq}", 1)]
+        assert await rig.refused() == [(None, "drive", "malformed authorization: expected {lease, seq, proof}", 1)]
 
 
 @jumping
-async def test_a_command_repeated_or_out_of_order_is_refused() -> None:
+async def test_a_command_repeated_or_out_of_order_is_refused_and_may_be_anybodys() -> None:
     async with established() as rig:
-        late, first = rig.driver.attachment(), rig.driver.attachment()
+        late, first = rig.driver.attachment("drive", DRIVE_LEFT), rig.driver.attachment("drive", {"turn": 0.5})
         rig.driver.put("drive", {"turn": 0.5}, first)
-        for attachment in (first, late, first):
-            rig.driver.put("drive", DRIVE_LEFT, attachment)
+        for fields, attachment in (({"turn": 0.5}, first), (DRIVE_LEFT, late), ({"turn": 0.5}, first)):
+            rig.driver.put("drive", fields, attachment)
         await asyncio.sleep(0.1)
         assert rig.written() == [TURN_LEFT]
-        assert await rig.refused() == [("driver", "drive", "repeated or out of order", 3)]
+        assert await rig.refused() == [(None, "drive", "repeated or out of order", 3)]
+        assert rig.last("control")["refusals"][0]["code"] == "out_of_order"
+
+
+@jumping
+async def test_what_was_overheard_is_good_for_no_other_command_and_no_other_payload() -> None:
+    async with established() as rig:
+        seen = rig.driver.attachment("motor/left", {"value": 0.5})
+        for name, fields in (("motor/right", {"value": 0.5}), ("motor/left", {"value": 0.6}), ("mode", {"value": 0.5})):
+            rig.driver.put(name, fields, seen)
+        assert [(command, reason) for command, reason, _ in await rig.refusals()] == [
+            ("motor/right", "wrong proof"),
+            ("motor/left", "wrong proof"),
+            ("mode", "wrong proof"),
+        ]
+        assert rig.metrics.total("refused") == 3
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "fleet/*/@cmd/drive",
+        "fleet/r1/@cmd/*",
+        "fleet/**/@cmd/drive",
+        "*/r1/@cmd/drive",
+        "fleet/r1/@cmd/**",
+        "fleet/r1/@cmd/motor/*",
+        "fleet/*/@cmd/light",
+    ],
+)
+@jumping
+async def test_a_command_whose_key_has_wildcards_is_refused_whoever_proves_it(key: str) -> None:
+    async with established() as rig:
+        held = rig.driver.held
+        assert held is not None
+        payload = packed(DRIVE_LEFT)
+        attachment = shown(held.lease, held.token, key, 1, payload)
+        rig.hq.publisher(key, topics.CMD_DRIVE).put(payload, attachment)
+        assert MOVE_LEFT not in rig.written()
+        assert await rig.refused() == [(None, key.rpartition("@cmd/")[2], "its key has wildcards", 1)]
+        assert rig.last("control")["refusals"][0]["code"] == "malformed"
+
+
+@pytest.mark.parametrize("key", ["fleet/*/@cmd/stop", "fleet/**/@cmd/stop", "*/*/@cmd/stop", "fleet/r$*/@cmd/stop"])
+@jumping
+async def test_a_stop_alone_may_have_wildcards(key: str) -> None:
+    async with established(deadman_s=60.0) as rig:
+        rig.command("drive", DRIVE_LEFT)
+        await asyncio.sleep(0.1)
+        rig.forget_written()
+        for handler in handlers(rig, key):
+            handler(Sample(key, b""))
+        assert rig.written() == [STOP]
+        assert rig.control["state"] == "stopped"
+        assert await rig.refused() == []
 
 
 @jumping
 async def test_a_late_neutral_of_the_holder_does_not_end_its_motion() -> None:
     async with established(deadman_s=60.0) as rig:
-        neutral = rig.driver.attachment()
+        neutral = rig.driver.attachment("drive", NEUTRAL)
         rig.command("drive", DRIVE_LEFT)
         rig.driver.put("drive", NEUTRAL, neutral)
         await asyncio.sleep(2.0)
@@ -967,10 +1055,11 @@ async def test_a_late_neutral_of_the_holder_does_not_end_its_motion() -> None:
 @jumping
 async def test_the_numbers_of_a_new_lease_begin_anew() -> None:
     async with established() as rig:
-        rig.driver.seq = 1_000_000
+        assert rig.driver.held is not None
+        rig.driver.held.seq = 1_000_000
         rig.command("drive", NEUTRAL)
         rig.hold("takeover")
-        rig.driver.seq = -1
+        rig.driver.held.seq = -1
         rig.command("drive", DRIVE_LEFT)
         await asyncio.sleep(0.1)
         assert rig.written() == [STOP, MOVE_LEFT]
@@ -1039,6 +1128,7 @@ async def test_a_robot_that_is_held_is_not_given_to_another_of_the_same_priority
             "expires_in_s": pytest.approx(3.0 - 1.15),
             "holder": "driver",
             "reason": "held by driver (priority 0)",
+            "code": "held",
         }
         assert await rig.refused() == [("other", "acquire", "held by driver (priority 0)", 1)]
         assert rig.metrics.total("refused") == 1
@@ -1106,30 +1196,110 @@ async def test_a_standing_robot_that_is_released_is_sent_nothing() -> None:
 async def test_a_lease_that_has_ended_or_never_was_is_neither_renewed_nor_released() -> None:
     async with established() as rig:
         rig.driver.release()
-        ended = {**DENIED, "reason": "the lease has ended (released)"}
+        ended = {**DENIED, "reason": "the lease has ended (released)", "code": "lease_ended"}
         assert (rig.driver.renew(), rig.driver.release()) == (ended, ended)
-        assert rig.driver.ask("renew", token=bytes(16)) == {**DENIED, "reason": "no lease: acquire first"}
+        never = {**DENIED, "reason": "no lease: acquire first", "code": "no_lease"}
+        assert rig.driver.ask("renew", STRANGE.question("renew")) == never
         other = Program(rig, "other")
         other.acquire()
         for name in ("renew", "release"):
-            denied = other.ask(name, token=bytes(16))
+            denied = other.ask(name, STRANGE.question(name))
             assert (denied["ok"], denied["token"], denied["holder"]) == (False, None, "other")
-            assert denied["reason"] == "held by other (priority 0)"
+            assert (denied["reason"], denied["code"]) == ("held by other (priority 0)", "held")
         assert rig.control["holder"] == "other"
+        assert await rig.refused() == [
+            ("driver", "renew", "the lease has ended (released)", 1),
+            ("driver", "release", "the lease has ended (released)", 1),
+            (None, "renew", "no lease: acquire first", 1),
+            (None, "renew", "held by other (priority 0)", 1),
+            (None, "release", "held by other (priority 0)", 1),
+        ]
 
 
-@pytest.mark.parametrize("name", ["acquire", "takeover", "renew", "release"])
-@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x90", b"\x81", msgpack.packb({"who": 5, "token": 5})])
+@jumping
+async def test_a_question_about_the_lease_that_was_overheard_is_good_for_nothing() -> None:
+    async with established() as rig:
+        held = rig.driver.held
+        assert held is not None
+        overheard = held.question("renew")
+        assert rig.driver.ask("release", overheard)["code"] == "malformed", "of another key"
+        assert rig.driver.ask("renew", overheard)["ok"]
+        assert rig.driver.ask("renew", overheard)["code"] == "out_of_order"
+        rig.driver.put("drive", b"", overheard)
+        assert rig.control["holder"] == "driver"
+        assert await rig.refused() == [
+            (None, "release", "wrong proof", 1),
+            (None, "renew", "repeated or out of order", 1),
+            (None, "drive", "wrong proof", 1),
+        ]
+        assert rig.driver.release()["ok"]
+
+
+@pytest.mark.parametrize("name", ["acquire", "takeover"])
+@pytest.mark.parametrize(
+    ("who", "at", "ok"),
+    [
+        ("op1", "op1", True),
+        ("op1.laptop", "op1", True),
+        ("me@here", "me%40here", True),
+        ("op2", "op1", False),
+        ("op12", "op1", False),
+        ("op1", "op1.laptop", False),
+        ("op1", "%6Fp1", False),
+    ],
+)
+@jumping
+async def test_a_program_asks_in_its_own_name_only(name: str, who: str, at: str, ok: bool) -> None:
+    async with established(hold=False) as rig:
+        (reply,) = rig.ask(f"control/{name}/{at}", packed({"who": who})).replies
+        if ok:
+            assert rig.control["holder"] == who
+            return
+        assert isinstance(reply.error, Malformed)
+        asked_as = "op1" if at == "%6Fp1" else at
+        reason = f"who = {who!r}: expected {asked_as!r}, or that and '.suffix'"
+        assert str(reply.error) == reason
+        assert await rig.refused() == [(None, name, reason, 1)]
+        assert rig.control["state"] == "free"
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("acquire/*", "fleet/r1/@rpc/control/acquire/*"),
+        ("acquire/other", "fleet/*/@rpc/control/acquire/other"),
+        ("takeover/*", "fleet/*/@rpc/control/takeover/*"),
+        ("renew", "fleet/*/@rpc/control/renew"),
+        ("release", "fleet/r1/@rpc/control/*"),
+    ],
+)
+@jumping
+async def test_a_question_about_the_lease_whose_key_has_wildcards_is_refused(name: str, asked: str) -> None:
+    async with established() as rig:
+        held = rig.driver.held
+        assert held is not None
+        payload = shown(held.lease, held.token, asked, 9) if name in ("renew", "release") else packed({"who": "other"})
+        (reply,) = rig.ask(f"control/{name}", payload, asked=asked).replies
+        assert isinstance(reply.error, Malformed)
+        assert await rig.refused() == [(None, name.partition("/")[0], "its key has wildcards", 1)]
+        assert rig.control["holder"] == "driver"
+
+
+@pytest.mark.parametrize("name", ["acquire/ann", "takeover/ann", "renew", "release"])
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x90", b"\x81", packed({"who": 5, "lease": 5})])
 @jumping
 async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(
     name: str, payload: bytes
 ) -> None:
     async with established(hold=False) as rig:
         (reply,) = rig.ask(f"control/{name}", payload).replies
-        assert reply.error is not None
-        expected = "Acquire" if name in ("acquire", "takeover") else "LeaseToken"
-        assert reply.error.startswith(f"{expected}: "), "the message that was expected"
-        assert len(reply.error) > len(expected) + 5
+        assert isinstance(reply.error, Malformed)
+        reason = str(reply.error)
+        if name in ("renew", "release"):
+            assert reason == "malformed authorization: expected {lease, seq, proof}"
+        else:
+            assert re.match("Acquire: .....", reason), "the message that was expected"
+        assert await rig.refused() == [(None, name.partition("/")[0], reason, 1)]
         assert rig.control["state"] == "free"
 
 
@@ -1148,8 +1318,9 @@ async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_h
     how: str, wishes: dict[str, Any], reason: str
 ) -> None:
     async with established() as rig:
-        denied = rig.driver.ask(how, **{"who": "other", "priority": 9, **wishes})
-        assert (denied["ok"], denied["token"]) == (False, None)
+        wish = {"who": "other", "priority": 9, **wishes}
+        denied = rig.driver.ask(f"{how}/{topics.escape(wish['who'])}", packed(wish))
+        assert (denied["ok"], denied["token"], denied["code"]) == (False, None, "malformed")
         assert denied["reason"].startswith(reason)
         assert rig.control["holder"] == "driver"
         rig.command("drive", DRIVE_LEFT)
@@ -1200,7 +1371,8 @@ async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(
         assert set(stops) == {STOP}
         assert 10 <= len(stops) <= 11
         assert rig.link.times[-len(stops)] == pytest.approx(start + 1.0)
-        assert rig.control == {"state": "stopped", "holder": None, "priority": None, "expires_in_s": None}
+        assert rig.control["state"] == "stopped"
+        assert {rig.control[name] for name in ("holder", "lease", "priority", "expires_in_s")} == {None}
         for again in (NEUTRAL, DRIVE_LEFT):
             rig.command("drive", again)
         assert rig.written() == []
@@ -1391,7 +1563,7 @@ async def test_motion_that_comes_after_the_deadman_time_is_refused_although_the_
         assert rig.counted("stopped") == 1
 
 
-@pytest.mark.parametrize("attachment", [None, b"\xc1", msgpack.packb({"token": bytes(16), "seq": 1})])
+@pytest.mark.parametrize("attachment", [None, b"\xc1", STRANGE.attachment("drive", packed(NEUTRAL))])
 @jumping
 async def test_a_late_command_of_anybody_lets_the_deadman_act(attachment: bytes | None) -> None:
     async with established(deadman_s=0.6) as rig:
@@ -1431,7 +1603,7 @@ async def test_what_the_holder_does_after_its_lease_expired_comes_too_late(how: 
             assert rig.written() == [STOP]
             ((_, reason, _),) = await rig.refusals()
         else:
-            reason = rig.driver.ask(how, token=rig.driver.token)["reason"]
+            reason = getattr(rig.driver, how)()["reason"]
             assert rig.written() == [STOP]
         assert reason == "the lease has ended (lease expired)"
         assert rig.control["state"] == "stopped"
@@ -1499,7 +1671,7 @@ async def test_a_release_stops_a_robot_that_was_let_move_by_itself_whatever_its_
         rig.command("mode", {"mode": mode})
         await asyncio.sleep(0.1)
         rig.forget_written()
-        rig.driver.ask("release", token=rig.driver.token)
+        rig.driver.release()
         assert STOP in rig.written()
 
 
@@ -1615,15 +1787,46 @@ async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing
         assert rig.bus.lanes["fleet/r1/@cmd/stop"] is Lane.STOP
         lane = rig.bus.lanes["fleet/r1/@cmd/**"]
         assert not isinstance(lane, Lane)
-        old = rig.driver.attachment()
-        assert lane(old) is Lane.COMMAND
-        for other in (None, b"", b"\xc1", msgpack.packb({"token": bytes(16), "seq": 1})):
-            assert lane(other) is Lane.OTHER
+        held, drive = rig.driver.held, packed(DRIVE_LEFT)
+        assert held is not None
+
+        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane:
+            return lane(attachment, lambda: (key, payload))
+
+        first, late = held.attachment("drive", drive), held.attachment("drive", drive)
+        for other in (None, b"", b"\xc1", STRANGE.attachment("drive", drive)):
+            assert lane_of(other) is Lane.OTHER
+        near = Holder(held.lease, bytes(32), first=2**40)
+        assert lane_of(near.attachment("drive", drive)) is Lane.OTHER, "who knows the id alone"
+        assert lane_of(first, packed(NEUTRAL)) is lane_of(first, key="fleet/r1/@cmd/mode") is Lane.OTHER
+        assert lane_of(first) is Lane.COMMAND, "whatever numbers others came with"
+        assert lane_of(first) is Lane.OTHER, "what was overheard fills no lane of the holder's"
+        assert lane_of(late) is Lane.COMMAND
+        newest = held.attachment("drive", drive)
         Program(rig, "other").acquire("takeover")
-        assert lane(old) is Lane.OTHER
+        assert lane_of(newest) is Lane.OTHER
         rig.command("stop")
-        assert lane(old) is Lane.OTHER
-        assert lane(b"") is Lane.OTHER
+        assert lane_of(newest) is Lane.OTHER
+        assert lane_of(b"") is Lane.OTHER
+
+
+@pytest.mark.parametrize("name", ["renew", "release"])
+@jumping
+async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
+    async with established() as rig:
+        key = f"fleet/r1/@rpc/control/{name}"
+        lane, commands, held = rig.bus.lanes[key], rig.bus.lanes["fleet/r1/@cmd/**"], rig.driver.held
+        assert not isinstance(lane, Lane)
+        assert not isinstance(commands, Lane)
+        assert held is not None
+        held.seq = 1_000  # its commands have numbers of their own
+        assert commands(held.attachment("drive", b""), lambda: ("fleet/r1/@cmd/drive", b"")) is Lane.COMMAND
+        question = held.question(name)
+        assert lane(question, lambda: (f"fleet/r2/@rpc/control/{name}", b"")) is Lane.OTHER
+        assert lane(question, lambda: (key, b"")) is Lane.COMMAND
+        assert lane(question, lambda: (key, b"")) is Lane.OTHER
+        for asker in ("acquire", "takeover"):
+            assert rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"] is Lane.OTHER
 
 
 # Refusals
@@ -1968,7 +2171,8 @@ async def test_a_query_the_robot_does_not_answer_is_refused_after_two_seconds() 
         assert question.replies == []
         await asyncio.sleep(0.02)
         (reply,) = question.replies
-        assert reply.error == "the robot did not answer within 2 s"
+        assert isinstance(reply.error, NotReady)
+        assert str(reply.error) == "the robot did not answer within 2 s"
         rig.forget_written()
         rig.ask("map")
         assert len(rig.written()) == 1, "the next query asks anew"
@@ -1978,7 +2182,8 @@ async def test_a_query_the_robot_does_not_answer_is_refused_after_two_seconds() 
 async def test_a_query_while_offline_is_refused_at_once() -> None:
     async with serving(unreachable="no route") as rig:
         (reply,) = await rig.hq.ask("fleet/r1/@rpc/map")
-        assert reply.error == "offline"
+        assert isinstance(reply.error, NotReady)
+        assert str(reply.error) == "offline"
 
 
 @jumping
@@ -1986,8 +2191,8 @@ async def test_a_query_the_robot_cannot_be_asked_is_refused_at_once() -> None:
     async with serving() as rig:
         await rig.establish(PLAIN_SETTINGS)
         (reply,) = rig.ask("map").replies
-        assert reply.error is not None
-        assert "slam_map" in reply.error
+        assert isinstance(reply.error, Unsupported)
+        assert "slam_map" in str(reply.error)
         assert rig.written() == []
 
 
@@ -1997,7 +2202,7 @@ async def test_queries_that_wait_are_refused_when_the_robot_is_lost() -> None:
         question = rig.ask("map")
         rig.goes()
         (reply,) = question.replies
-        assert reply.error == "the robot was lost"
+        assert str(reply.error) == "the robot was lost"
         await asyncio.sleep(3.0)
         assert len(question.replies) == 1
 
@@ -2078,15 +2283,16 @@ async def test_a_gateway_that_ends_gives_no_lease_any_more_and_ends_the_one_of_a
     task.cancel()
     await rig.settle()
     rig.forget_written()
-    for name in ("acquire", "takeover", "renew", "release"):
-        (reply,) = rig.ask(f"control/{name}", msgpack.packb({"who": "driver", "token": rig.driver.token})).replies
-        assert reply.error == "gateway stopped"
+    for name in ("acquire/driver", "takeover/driver", "renew", "release"):
+        (reply,) = rig.ask(f"control/{name}", packed({"who": "driver"})).replies
+        assert reply.error is not None
+        assert (str(reply.error), getattr(reply.error, "code", None)) == ("gateway stopped", "closing")
     rig.command("drive", NEUTRAL)
     rig.command("drive", {"turn": 0.5})
     assert rig.control["state"] == "stopped"
     assert rig.audited[-2:] == [
         {"event": "stopped", "who": "driver", "reason": "gateway stopped", "stops": True},
-        {"event": "refused", "who": "driver", "command": "drive", "reason": "gateway stopped"},
+        {"event": "refused", "who": "driver", "command": "drive", "reason": "the lease has ended (gateway stopped)"},
     ]
     with pytest.raises(asyncio.CancelledError):
         await task
@@ -2128,7 +2334,7 @@ async def test_a_standing_robot_is_left_at_once() -> None:
 async def test_a_gateway_that_ends_leaves_the_robots_keys_to_others_and_writes_no_loss_down() -> None:
     async with established() as rig:
         pass
-    assert await rig.hq.ask("fleet/r1/@rpc/control/acquire", msgpack.packb({"who": "ann"})) == []
+    assert await rig.hq.ask("fleet/r1/@rpc/control/acquire/ann", packed({"who": "ann"})) == []
     before = len(rig.values("control"))
     rig.driver.put("stop", NEUTRAL, None)
     await rig.settle()

@@ -13,6 +13,7 @@ import msgpack
 import pytest
 
 from tests.clock import jumping
+from tests.proofs import Holder
 from zbridge.bus import Bus
 from zbridge.bus.fake import FakeBus
 from zbridge.config import plan
@@ -54,8 +55,9 @@ async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
             await running
 
 
-async def asked(bus: FakeBus, name: str, **fields: Any) -> dict[str, Any]:
-    (reply,) = await bus.ask(f"fleet/r1/@rpc/control/{name}", msgpack.packb(fields))
+async def asked(bus: FakeBus, name: str, payload: bytes = b"", **fields: Any) -> dict[str, Any]:
+    path = f"{name}/{fields['who']}" if fields else name
+    (reply,) = await bus.ask(f"fleet/r1/@rpc/control/{path}", payload or msgpack.packb(fields))
     assert reply.error is None
     lease: dict[str, Any] = msgpack.unpackb(reply.payload)
     return lease
@@ -72,11 +74,12 @@ async def test_the_configuration_says_how_long_a_lease_lasts(monkeypatch: pytest
 
 
 @jumping
-async def test_every_lease_has_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_every_lease_has_an_id_and_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serving(configured(), monkeypatch) as bus:
-        tokens = [(await asked(bus, "takeover", who="hq"))["token"] for _ in range(20)]
-        assert {len(token) for token in tokens} == {16}
-        assert len(set(tokens)) == 20
+        leases = [await asked(bus, "takeover", who="hq") for _ in range(20)]
+        tokens, ids = ({lease[name] for lease in leases} for name in ("token", "lease"))
+        assert ({len(token) for token in tokens}, {len(each) for each in ids}) == ({32}, {8})
+        assert len(tokens) == len(ids) == 20
         assert len({byte for token in tokens for byte in token}) > 100, "nothing that could be guessed"
 
 
@@ -86,8 +89,8 @@ async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
 ) -> None:
     file = tmp_path / "log" / "r1.jsonl"
     async with serving(configured(audit=str(file)), monkeypatch) as bus:
-        token = (await asked(bus, "acquire", who="hq"))["token"]
-        await asked(bus, "release", token=token)
+        held = Holder.of(await asked(bus, "acquire", who="hq"))
+        await asked(bus, "release", held.question("release"))
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert [(line["robot"], line["event"], line["who"]) for line in lines] == [
         ("r1", "acquired", "hq"),

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Coroutine
-from itertools import count
 from typing import Any
 
 import pytest
 
-from zbridge.bus.fake import FakeBus
+from tests.proofs import numbered
+from zbridge.bus.fake import FakeBus, FakeQuestion
 from zbridge.bus.interface import Handle, Question, Sample
-from zbridge.errors import BusError, Code, Refused
+from zbridge.errors import BusError, Code, NotReady, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -20,7 +20,6 @@ from zbridge.fleet.messages import (
     Drive,
     FleetMessage,
     Lease,
-    LeaseToken,
     Mode,
     Motor,
     Raw,
@@ -35,6 +34,7 @@ from zbridge.fleet.view import RobotView
 from zbridge.helm import REPEAT_S, WAITING, Bridge, Helm
 from zbridge.session.control import Authority
 from zbridge.session.intent import LEASE_S, Intent
+from zbridge.session.proof import Signer, read
 
 KEYS = KeySpace("fleet", "r1")
 DEADMAN_S = 1.25
@@ -50,8 +50,7 @@ class Gateway:
     def __init__(self, bus: FakeBus, scene: Scene) -> None:
         self.bus = bus
         self.scene = scene
-        numbers = count(1)
-        self.authority = Authority(LEASE_S, 2.0, lambda: next(numbers).to_bytes(16, "big"))
+        self.authority = Authority(LEASE_S, 2.0, numbered())
         self.commands: list[tuple[str, FleetMessage]] = []
         self.refused: list[str] = []
         self.asked: list[str] = []
@@ -63,23 +62,24 @@ class Gateway:
         bus.watch_alive(KEYS.alive("*"), self._on_alive)
 
     def serve(self) -> None:
-        rpc = (topics.RPC_ACQUIRE, topics.RPC_RENEW, topics.RPC_RELEASE, topics.RPC_TAKEOVER)
-        self.serving = [self.bus.answer(KEYS.key(topic.path), self._decide) for topic in rpc]
+        rpc = ("acquire/*", "takeover/*", "renew", "release")
+        self.serving = [self.bus.answer(KEYS.key(f"@rpc/control/{name}"), self._decide) for name in rpc]
 
     def vanish(self) -> None:
         for handle in self.serving:
             handle.close()
 
     def _decide(self, question: Question) -> None:
-        self.asked.append(question.key.rpartition("/")[2])
+        what, _, name = KEYS.path(question.key).removeprefix("@rpc/control/").partition("/")
+        self.asked.append(what)
         now = self.scene.now
-        if self.asked[-1] == "acquire":
+        if what == "acquire":
             self.requests.append(request := payloads.decode(Acquire, question.payload))
+            assert request.who.startswith(f"{name}."), "asked in the name of the listener"
             lease = self.authority.acquire(request, now)
         else:
-            token = payloads.decode(LeaseToken, question.payload).token
-            decide = self.authority.renew if self.asked[-1] == "renew" else self.authority.release
-            lease = decide(token, now)
+            decide = self.authority.renew if what == "renew" else self.authority.release
+            lease = decide(read(question.payload), question.asked, now)
         question.answer(payloads.encode(lease))
 
     def _take(self, sample: Sample) -> None:
@@ -87,8 +87,9 @@ class Gateway:
         assert topic is not None
         message = payloads.decode(topic.message, sample.payload)
         if isinstance(message, Drive | Motor | Mode | Raw):
+            who = None
             try:
-                self.authority.admit(sample.attachment, self.scene.now)
+                who = self.authority.admit(sample.attachment, sample.key, sample.payload, self.scene.now)
                 moving = isinstance(message, Drive | Motor) and message.moving
                 if moving:
                     self.authority.require_motion()
@@ -97,7 +98,7 @@ class Gateway:
             except Refused as refusal:
                 self.refused.append(str(refusal))
                 command = topic.path.removeprefix("@cmd/")
-                self.authority.refuse(command, refusal, self.authority.owner(sample.attachment))
+                self.authority.refuse(command, refusal, refusal.who or who)
                 return
         else:
             assert sample.attachment is None
@@ -282,7 +283,7 @@ async def test_without_a_gateway_the_answer_is_no() -> None:
 @pytest.mark.parametrize(
     ("reply", "reason"),
     [
-        (lambda question: question.refuse("not now"), "not now"),
+        (lambda question: question.refuse(NotReady("not now")), "not now"),
         (lambda question: question.answer(b"\xc1"), "Lease: "),
         (lambda question: question.answer(payloads.pack({"ok": True})), "refused"),
         (lambda question: None, "no gateway answers"),
@@ -291,7 +292,7 @@ async def test_without_a_gateway_the_answer_is_no() -> None:
 async def test_an_answer_that_is_none_is_a_no(reply: Any, reason: str) -> None:
     scene = Scene()
     scene.gateway.vanish()
-    scene.gateway.bus.answer(KEYS.key(topics.RPC_ACQUIRE.path), reply)
+    scene.gateway.bus.answer(KEYS.key("@rpc/control/acquire/hq.toy"), reply)
     helm = scene.helm()
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_DRIVE, GO)
@@ -712,6 +713,28 @@ async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     assert scene.gateway.report().holder == "hq.toy.1"
 
 
+async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lease() -> None:
+    scene = Scene()
+    helm = await scene.driving()
+    answering = scene.gateway.serving[2]
+    answering.close()
+    again: list[Question] = []
+
+    def repeat(question: Question) -> None:
+        """Play somebody on the bus who hears the question, and repeats it before it has arrived."""
+        again.append(question)
+        scene.gateway._decide(FakeQuestion(question.key, question.payload))
+        scene.gateway._decide(question)
+
+    scene.gateway.bus.answer(KEYS.key(topics.RPC_RENEW.path), repeat)
+    helm.look(Control(state="free"))
+    await scene.settle()
+    assert len(again) == 1
+    assert scene.gateway.report().refusals[-1].code == "out_of_order"
+    assert helm.intent.held
+    assert scene.told == []
+
+
 async def test_a_takeover_is_noticed_and_told_once() -> None:
     scene = Scene()
     helm = await scene.driving()
@@ -748,9 +771,8 @@ async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one() -> None:
     scene.gateway.authority.stop("stop")
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     lease = scene.gateway.authority.acquire(Acquire(who="hq.toy.1", alive="hq.toy.1"), scene.now)
-    assert lease.token is not None
     helm.intent.granted(LEASE_S)
-    helm._token = lease.token
+    helm._signer = Signer(lease)
     await scene.settle()
     assert helm.intent.held
     assert scene.told == []
@@ -842,11 +864,11 @@ async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monk
     helm = scene.helm()
     helm.command(topics.CMD_DRIVE, STAND)
 
-    async def ask_in_vain(topic: Any, question: Any) -> Lease:
-        await Bridge.ask_lease(scene.bridge, topic, question)
+    async def ask_in_vain(request: Acquire) -> Lease:
+        await Bridge.acquire(scene.bridge, request)
         return Lease(ok=False, reason="no gateway answers")
 
-    monkeypatch.setattr(scene.bridge, "ask_lease", ask_in_vain)
+    monkeypatch.setattr(scene.bridge, "acquire", ask_in_vain)
     helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: no gateway answers"]

@@ -17,6 +17,8 @@ from zbridge.protocol import Outcome, Robot
 _MOVING = (Drive, Motor)
 _OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
 """Commands that move a robot, or may: they need the lease."""
+_ANY_STOP = f"/{topics.CMD_STOP.path}"
+"""The end of the key of a stop, which alone may have wildcards."""
 
 
 LINK_BLOCKED = "the robot's link takes nothing"
@@ -62,16 +64,17 @@ class Commands:
 
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it where everybody sees."""
-        topic = self._topics.get(sample.key) or topics.find(self._keys.path(sample.key))
-        if topic is topics.CMD_STOP:  # has a lane of its own, and came by it
+        if sample.key.endswith(_ANY_STOP):  # has a lane of its own, and came by it
             return
         self._taken.value += 1
+        who = None
         try:
-            self._carry_out(topic, sample)
+            topic = self._topics.get(sample.key) or self._find(sample.key)
+            who = self._admit(topic, sample)
+            self._carry_out(topic, sample.payload, who)
         except (Refused, PayloadError, EncodeError) as error:
             refused = error if isinstance(error, Refused) else Malformed(str(error))
-            command = self._keys.path(sample.key).removeprefix("@cmd/")
-            self._authority.refuse(command, refused, self._authority.owner(sample.attachment))
+            self._authority.refuse(sample.key.rpartition("@cmd/")[2], refused, refused.who or who)
         self._leases.settle()
 
     def require_ready(self) -> None:
@@ -86,16 +89,27 @@ class Commands:
         """Take nothing but stops from now on."""
         self._closing = reason
 
-    def _carry_out(self, topic: Topic | None, sample: Sample) -> None:
+    def _find(self, key: str) -> Topic:
+        if not topics.is_concrete(key):
+            raise Malformed("its key has wildcards")
+        topic = topics.find(self._keys.path(key))
         if topic is None or topic.delivery is not Delivery.COMMAND:
             raise Unsupported("no such command")
+        return topic
+
+    def _admit(self, topic: Topic, sample: Sample) -> str | None:
+        """Give the holder whose command this is, None of one that needs no lease; raise Refused where it may not be."""
+        if topic.message not in _OF_THE_HOLDER:
+            return None
+        who = self._authority.admit(sample.attachment, sample.key, sample.payload, self._clock())
+        self._leases.settle()
+        return who
+
+    def _carry_out(self, topic: Topic, payload: bytes, who: str | None) -> None:
         if self._closing is not None:
             raise NotReady(self._closing, Code.CLOSING)
-        now, who = self._clock(), None
-        if topic.message in _OF_THE_HOLDER:
-            who = self._authority.admit(sample.attachment, now)
-            self._leases.settle()
-        command = payloads.decode(topic.message, sample.payload)
+        now = self._clock()
+        command = payloads.decode(topic.message, payload)
         if isinstance(command, _MOVING):
             self._move(topic, command, now, who)
             return

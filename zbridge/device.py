@@ -329,4 +329,4 @@ class Device:
                 self._pump()
         except Refused as refusal:
             self._questions.remove(topic, question)
-            question.refuse(str(refusal))
+            question.refuse(refusal)

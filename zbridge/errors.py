@@ -58,16 +58,20 @@ class PayloadError(ZbridgeError):
 class Refused(ZbridgeError):
     """A command will not be carried out: ``code`` says why for programs, the text for people.
 
-    Raise one of the classes below. holder: who has the robot, where that is why.
+    Raise one of the classes below. holder: who has the robot, where that is why. who: whose command it was, where its
+    proof shows that.
     """
 
     codes: ClassVar[tuple[Code, ...]]
     """The codes of this family, the usual one first."""
 
-    def __init__(self, text: str, code: Code | None = None, *, holder: str | None = None) -> None:
+    def __init__(
+        self, text: str, code: Code | None = None, *, holder: str | None = None, who: str | None = None
+    ) -> None:
         super().__init__(text)
         self.code = code or self.codes[0]
         self.holder = holder
+        self.who = who
 
 
 class Held(Refused):

@@ -10,7 +10,6 @@ import secrets
 import signal
 import time
 from collections.abc import Coroutine, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,7 @@ from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.listener import Listener
 from zbridge.metrics import Metrics
-from zbridge.session.control import TOKEN_BYTES, Authority
+from zbridge.session.control import Authority
 from zbridge.session.manager import SessionManager
 from zbridge.session.motion import MotionLimits
 
@@ -137,7 +136,7 @@ class Gateway:
             protocol=plan.protocol.name,
             keys=self._keys,
             bus=bus,
-            authority=Authority(control.lease_s, control.deadman_s, partial(secrets.token_bytes, TOKEN_BYTES)),
+            authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes),
             limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf),
             manager=self.sessions,
             metrics=self.metrics,

@@ -12,26 +12,15 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Handle, Publisher
-from zbridge.errors import BusError, Code, NotReady, PayloadError, TooFast, Unsupported
+from zbridge.errors import BusError, Code, NotReady, PayloadError, Refused, TooFast, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Acquire,
-    Authorization,
-    Control,
-    Drive,
-    FleetMessage,
-    Lease,
-    LeaseToken,
-    Mode,
-    Motor,
-    Raw,
-    Refusal,
-)
+from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Lease, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.fleet.view import RobotView
 from zbridge.session.allowance import Allowance
 from zbridge.session.intent import Do, Intent
+from zbridge.session.proof import Signer
 
 log = logging.getLogger("zbridge.hq")
 
@@ -45,7 +34,6 @@ OPEN_HZ = 50.0
 """Commands a second of one client that need no lease: they share the robot's queue with everybody's."""
 OURS_S = 1.0
 """Seconds within which a refusal that bears no name is taken for that of a client's command."""
-_encode = msgspec.msgpack.Encoder().encode
 
 
 class Bridge:
@@ -63,25 +51,36 @@ class Bridge:
     def __repr__(self) -> str:
         return f"<Bridge to {self.keys.robot}>"
 
-    def put(self, topic: Topic, message: FleetMessage, attachment: bytes | None = None) -> None:
-        """Put a command on the bus."""
+    def put(self, topic: Topic, message: FleetMessage, signer: Signer | None = None) -> None:
+        """Put a command on the bus; one that needs the lease is signed."""
         publisher = self._publishers.get(topic.path)
         if publisher is None:
             publisher = self._publishers[topic.path] = self.bus.publisher(self.keys.key(topic.path), topic)
-        publisher.put(payloads.encode(message), attachment)
+        payload = payloads.encode(message)
+        publisher.put(payload, signer.command(publisher.key, payload) if signer is not None else None)
 
-    async def ask_lease(self, topic: Topic, question: FleetMessage) -> Lease:
+    async def acquire(self, request: Acquire) -> Lease:
+        """Ask for the lease, in the name of the listener."""
+        name = request.who.rpartition(".")[0]
+        return await self._ask_lease(self.keys.key(topics.RPC_ACQUIRE(name).path), payloads.encode(request))
+
+    async def ask_lease(self, topic: Topic, signer: Signer) -> Lease:
+        """Renew or release a lease."""
+        key = self.keys.key(topic.path)
+        return await self._ask_lease(key, signer.question(key))
+
+    async def _ask_lease(self, key: str, payload: bytes) -> Lease:
         """Ask one thing about the lease; where there is no answer, the answer is no, and says so."""
-        why = "no gateway answers"
+        why, code = "no gateway answers", None
         try:
-            answers = await self.bus.ask(self.keys.key(topic.path), payloads.encode(question), timeout_s=ASK_S)
-            for answer in answers:
+            for answer in await self.bus.ask(key, payload, timeout_s=ASK_S):
                 if answer.error is None:
                     return payloads.decode(Lease, answer.payload)
-                why = why if answer.error == "Timeout" else answer.error
+                if isinstance(answer.error, Refused):
+                    why, code = str(answer.error), answer.error.code
         except (BusError, PayloadError) as error:
             why = str(error)
-        return Lease(ok=False, reason=why)
+        return Lease(ok=False, reason=why, code=code)
 
     def close(self) -> None:
         """Give the keys up."""
@@ -115,8 +114,7 @@ class Helm:
         self._hold = hold
         self._tell = tell
         self._clock = clock
-        self._token: bytes | None = None
-        self._seq = 0
+        self._signer: Signer | None = None
         self._light = False
         self._set: dict[str, tuple[Topic, FleetMessage]] = {}
         """What is in motion, by path."""
@@ -131,7 +129,7 @@ class Helm:
         self._returned.set()
         self._closed = False
         self._due = 0.0
-        self._seen: dict[tuple[str | None, str, str], int] = {}
+        self._seen: dict[tuple[str | None, str, str, str], int] = {}
         self._allowance = Allowance(OPEN_HZ)
         self._open: dict[str, float] = {}
         """When commands were last given that need no lease, and so bear no name."""
@@ -204,7 +202,7 @@ class Helm:
 
     def look(self, control: Control) -> None:
         """Take news from ``control``: whether the robot is still ours, and what was refused."""
-        if self.intent.held and (control.state != "held" or control.holder != self.who):
+        if self._signer is not None and control.lease != self._signer.lease:
             self._doubt()
         elif control.holder == self.who and not (self.active or self._returning):
             self._forget_token()  # the answer that granted it was lost; so ends that lease
@@ -220,8 +218,8 @@ class Helm:
         news, seen, now = [], {}, self._clock()
         for refusal in control.refusals:
             lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
-            if refusal.who == self.who or refusal.who is None:
-                key = (refusal.who, refusal.command, refusal.reason)
+            if refusal.by is None and (refusal.who == self.who or refusal.who is None):
+                key = (refusal.who, refusal.command, refusal.code, refusal.reason)
                 if refusal.count != self._seen.get(key, 0) and (refusal.who is not None or lately):
                     news.append(refusal)
                 seen[key] = refusal.count
@@ -314,20 +312,20 @@ class Helm:
         if self._handle is None:
             self._handle = bridge.bus.announce(bridge.keys.alive(self.who))
         request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self.who)
-        lease = await bridge.ask_lease(topics.RPC_ACQUIRE, request)
-        if not lease.ok or lease.token is None:
+        lease = await bridge.acquire(request)
+        if not lease.ok or lease.lease is None or lease.token is None:
             if self.intent.asking:
                 self._lose(lease.reason or "refused")
         elif self._closed or not self.intent.asking:
-            await bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(lease.token))
+            await bridge.ask_lease(topics.RPC_RELEASE, Signer(lease))
         else:
-            self._begin(lease.token, lease.expires_in_s)
+            self._begin(Signer(lease), lease.expires_in_s)
         if self._closed:
             self._forget_token()
 
-    def _begin(self, token: bytes, lease_s: float | None) -> None:
+    def _begin(self, signer: Signer, lease_s: float | None) -> None:
         intent, now = self.intent, self._clock()
-        self._token, self._seq, self._light = token, 0, False
+        self._signer, self._light = signer, False
         intent.granted(lease_s or intent.lease_s)
         intent.expire(now)
         waiting, self._queue = self._queue, []
@@ -339,14 +337,15 @@ class Helm:
 
     def _doubt(self) -> None:
         """Ask whether the lease is still ours, which also renews it."""
-        if not self._doubting and self._token is not None:
+        if not self._doubting and self._signer is not None:
             self._doubting = True
-            self._bridge.spawn(self._verify(self._token))
+            self._bridge.spawn(self._verify(self._signer))
 
-    async def _verify(self, token: bytes) -> None:
-        lease = await self._bridge.ask_lease(topics.RPC_RENEW, LeaseToken(token))
+    async def _verify(self, signer: Signer) -> None:
+        lease = await self._bridge.ask_lease(topics.RPC_RENEW, signer)
         self._doubting = False
-        if not lease.ok and token == self._token:
+        lost = not lease.ok and lease.code != Code.OUT_OF_ORDER  # somebody repeated the question, and came first
+        if lost and signer is self._signer:
             self._lose(lease.reason or "the lease has ended")
 
     def _lose(self, why: str) -> None:
@@ -355,18 +354,18 @@ class Helm:
         self._tell(f"not driving: {why}")
 
     def _release(self, why: str) -> None:
-        token = self._token
+        signer = self._signer
         self._drop(why)
         self.intent.released()
-        if token is not None:
+        if signer is not None:
             self._returning += 1
             self._returned.clear()
-            self._bridge.spawn(self._give_back(token))
+            self._bridge.spawn(self._give_back(signer))
 
-    async def _give_back(self, token: bytes) -> None:
+    async def _give_back(self, signer: Signer) -> None:
         with contextlib.suppress(BusError):  # what was commanded before, goes before
             await self._bridge.bus.flush()
-        await self._bridge.ask_lease(topics.RPC_RELEASE, LeaseToken(token))
+        await self._bridge.ask_lease(topics.RPC_RELEASE, signer)
         self._returning -= 1
         if not self._returning:
             self._returned.set()
@@ -376,7 +375,7 @@ class Helm:
     def _drop(self, why: str) -> None:
         level = logging.INFO if self.intent.held else logging.DEBUG
         log.log(level, "%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
-        self._token = None
+        self._signer = None
         self._queue.clear()
         self._set.clear()
 
@@ -389,17 +388,16 @@ class Helm:
 
     def _send(self, topic: Topic, message: FleetMessage) -> None:
         """Put a command on the bus, after those before it: they are numbered, and must not overtake each other."""
-        if self._writing or self._token is None:
+        if self._writing or self._signer is None:
             self._wait(topic, message)
         else:
             self._put(topic, message)
 
     def _put(self, topic: Topic, message: FleetMessage) -> None:
-        assert self._token is not None
+        assert self._signer is not None
         if isinstance(message, Drive):
             message = self._lit(message)
-        self._seq += 1
-        self._bridge.put(topic, message, _encode(Authorization(self._token, self._seq)))
+        self._bridge.put(topic, message, self._signer)
         if topic is not topics.CMD_DRIVE:  # goes by way of a thread
             self._writing = True
             self._bridge.spawn(self._written())
@@ -419,7 +417,7 @@ class Helm:
             log.warning("%s: %s", self.who, error)
         self._writing = False
         self.intent.expire(self._clock())
-        while self._queue and not self._writing and self._token is not None:
+        while self._queue and not self._writing and self._signer is not None:
             topic, message = self._queue.pop(0)
             if not self._overdue(message):
                 self._send(topic, message)

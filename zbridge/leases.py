@@ -8,24 +8,57 @@ import math
 from collections.abc import Callable
 
 from zbridge.audit import Audit
-from zbridge.bus import Bus, Handle, Lane, Question
-from zbridge.errors import Code, NotReady, PayloadError, Refused
+from zbridge.bus import Bus, Handle, Lane, Look, Question
+from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, FleetMessage, Lease, LeaseToken
+from zbridge.fleet.messages import Acquire, FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot
 from zbridge.session.control import Authority, What
 from zbridge.session.motion import MotionLimits
+from zbridge.session.proof import read
 from zbridge.session.session import State
 from zbridge.standstill import Standstill
 
 log = logging.getLogger("zbridge.control")
 
+_NAMED = 64
+"""Characters of a name that are repeated to whoever uses it wrongly."""
 _CONTROL_S = 0.05
 """Least time between two publications of ``control`` while refusals come in."""
 _ANYBODY = "*"
+
+Decide = Callable[[Question], FleetMessage]
+
+
+class Gate:
+    """Chooses the lane: COMMAND for what the holder's proof shows to be new, else OTHER. Runs on bus threads.
+
+    Who only knows the lease's id, or repeats what it overheard, fills no lane of the holder's.
+    One gate for commands and one for questions, which are numbered apart.
+    """
+
+    def __init__(self, authority: Authority) -> None:
+        self._authority = authority
+        self._newest = (b"", -1)
+
+    def __call__(self, shown: bytes | None, look: Look) -> Lane:
+        verifier = self._authority.verifier
+        if verifier is None or shown is None or not verifier.plausible(shown):
+            return Lane.OTHER
+        try:
+            said = read(shown)
+        except Malformed:
+            return Lane.OTHER
+        lease, seq = self._newest
+        if said.lease != verifier.lease or (said.lease == lease and said.seq <= seq):
+            return Lane.OTHER
+        if not verifier.proves(said, *look()):
+            return Lane.OTHER
+        self._newest = (said.lease, said.seq)
+        return Lane.COMMAND
 
 
 class Leases:
@@ -50,6 +83,8 @@ class Leases:
         self.authority = authority
         self.limits = limits
         self.standstill = standstill
+        self.lane = Gate(authority)
+        """Chooses the lane of a command."""
         self._robot = robot
         self._keys = keys
         self._metrics = metrics
@@ -68,16 +103,15 @@ class Leases:
 
     def serve(self, bus: Bus) -> list[Handle]:
         """Answer questions about the lease, and watch whether its holder lives."""
-        asked = (topics.RPC_ACQUIRE, topics.RPC_TAKEOVER, topics.RPC_RENEW, topics.RPC_RELEASE)
+        gate = Gate(self.authority)
         return [
-            *(bus.answer(self._keys.key(topic.path), self._on_question, lane=self.lane) for topic in asked),
+            self._answer(bus, "acquire/*", self._acquire),
+            self._answer(bus, "takeover/*", self._take_over),
+            self._answer(bus, "renew", self._renew, gate),
+            self._answer(bus, "release", self._release, gate),
             bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
         ]
 
-    def lane(self, shown: bytes | None) -> Lane:
-        """Let what shows the holder's token wait for nobody else's; called on the bus's threads."""
-        token = self.authority.token
-        return Lane.COMMAND if token and shown and token in shown else Lane.OTHER
 
     def stop(self, reason: str) -> None:
         """Stop the robot at once and for a second, and end the lease."""
@@ -176,20 +210,50 @@ class Leases:
             self.authority.vanished(key.removeprefix(self._keys.alive("")))
             self.settle()
 
-    def _on_question(self, question: Question) -> None:
-        try:
-            question.answer(payloads.encode(self._decide(self._keys.path(question.key), question.payload)))
-        except (PayloadError, Refused) as error:
-            question.refuse(str(error))
-        self.settle()
+    # Questions
 
-    def _decide(self, path: str, payload: bytes) -> Lease:
-        if self._closing is not None:
-            raise NotReady(self._closing, Code.CLOSING)
-        authority, now = self.authority, self._clock()
-        if path == topics.RPC_RENEW.path:
-            return authority.renew(payloads.decode(LeaseToken, payload).token, now)
-        if path == topics.RPC_RELEASE.path:
-            return authority.release(payloads.decode(LeaseToken, payload).token, now)
-        request = payloads.decode(Acquire, payload)
-        return authority.takeover(request, now) if path == topics.RPC_TAKEOVER.path else authority.acquire(request, now)
+    def _answer(self, bus: Bus, name: str, decide: Decide, lane: Gate | Lane = Lane.OTHER) -> Handle:
+        """Answer one kind of question, or refuse it where everybody sees."""
+        command = name.removesuffix("/*")
+
+        def answer(question: Question) -> None:
+            if self._closing is not None:
+                question.refuse(NotReady(self._closing, Code.CLOSING))
+                return
+            try:
+                if not topics.is_concrete(question.asked):
+                    raise Malformed("its key has wildcards")
+                question.answer(payloads.encode(decide(question)))
+            except (PayloadError, Refused) as error:
+                refusal = error if isinstance(error, Refused) else Malformed(str(error))
+                self.authority.refuse(command, refusal)
+                question.refuse(refusal)
+            self.settle()
+
+        return bus.answer(self._keys.key(f"@rpc/control/{name}"), answer, lane=lane)
+
+    def _acquire(self, question: Question) -> FleetMessage:
+        return self.authority.acquire(_request(question), self._clock())
+
+    def _take_over(self, question: Question) -> FleetMessage:
+        return self.authority.takeover(_request(question), self._clock())
+
+    def _renew(self, question: Question) -> FleetMessage:
+        return self.authority.renew(read(question.payload), question.asked, self._clock())
+
+    def _release(self, question: Question) -> FleetMessage:
+        return self.authority.release(read(question.payload), question.asked, self._clock())
+
+
+def _request(question: Question) -> Acquire:
+    """Read who asks for the lease; raise Malformed where it asks in another name than its key's."""
+    request = payloads.decode(Acquire, question.payload)
+    _require_own_name(question, request.who)
+    return request
+
+
+def _require_own_name(question: Question, who: str) -> None:
+    """Raise Malformed where somebody asks in another name than its key's."""
+    name = question.asked.rpartition("/")[2]
+    if not topics.speaks_for(who, name):
+        raise Malformed(f"who = {who[:_NAMED]!r}: expected {topics.unescape(name)[:_NAMED]!r}, or that and '.suffix'")

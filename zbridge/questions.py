@@ -67,7 +67,7 @@ class Questions:
         for entries in entries_of_all:
             for question, timer in entries:
                 timer.cancel()
-                question.refuse(reason)
+                question.refuse(NotReady(reason))
 
     def _expire(self, topic: Topic, question: Question, again: int = PATIENCE) -> None:
         if self._patient() and again:  # the answer is on its way, in parts
@@ -77,4 +77,4 @@ class Questions:
             waiting[place] = (question, timer)
             return
         self.remove(topic, question)
-        question.refuse(f"the robot did not answer within {self._answer_s:g} s")
+        question.refuse(NotReady(f"the robot did not answer within {self._answer_s:g} s"))

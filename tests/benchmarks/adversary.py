@@ -1,8 +1,9 @@
-"""Drives that nobody may give, in four kinds by turns: a token that was never given, the driver's own attachments
-again, the token of an ended lease, none at all.
+"""Drives that nobody may give, in four kinds by turns: the driver's public lease with a proof made up, the driver's own
+attachments with another payload, a proof of an ended lease, none at all.
 
-``python -m tests.benchmarks.adversary ENDPOINT``; ``arm TOKEN ENDED FIRST_SEQ LAST_SEQ COUNT`` makes them ready,
-``go RATE_HZ`` sends them (0: as fast as Zenoh takes them). They block where the bus is full, so that every one arrives.
+``python -m tests.benchmarks.adversary ENDPOINT``; ``arm LEASE ENDED FIRST_SEQ LAST_SEQ COUNT`` makes them ready, where
+both leases are ``ID:TOKEN``; ``go RATE_HZ`` sends them (0: as fast as Zenoh takes them). They block where the bus is
+full, so that every one arrives.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ import time
 
 import zenoh
 
-from tests.benchmarks.drives import ADVERSE, DRIVE, attachment, drive, packed
+from tests.benchmarks.drives import ADVERSE, DRIVE, drive, packed
 from tests.benchmarks.peer import hear, open_session, tell
+from tests.proofs import shown
 
 Command = tuple[bytes, bytes | None]
+Lease = tuple[bytes, bytes]
 
 
 def main() -> None:
@@ -35,8 +38,7 @@ def main() -> None:
         while True:
             word, *arguments = (hear() or "").split() or [""]
             if word == "arm":
-                token, ended = map(bytes.fromhex, arguments[:2])
-                commands = _commands(token, ended, *map(int, arguments[2:]))
+                commands = _commands(*map(_read_lease, arguments[:2]), *map(int, arguments[2:]))
                 tell(armed=len(commands))
             elif word == "go":
                 begun_ns = time.perf_counter_ns()
@@ -44,26 +46,38 @@ def main() -> None:
                 tell(begun_ns=begun_ns, ended_ns=time.perf_counter_ns())
 
 
-def _commands(token: bytes, ended: bytes, first_seq: int, last_seq: int, count: int) -> list[Command]:
+def _read_lease(written: str) -> Lease:
+    lease, token = map(bytes.fromhex, written.split(":"))
+    return lease, token
+
+
+def _commands(lease: Lease, ended: Lease, first_seq: int, last_seq: int, count: int) -> list[Command]:
     """Make one drive after the other, each with a number of its own that is no driver's."""
-    used = last_seq - first_seq + 1
-    kinds = (
-        lambda number: attachment(os.urandom(16), number),
-        lambda number: attachment(token, first_seq + number // 4 % used),
-        lambda number: attachment(ended, number),
-        lambda number: None,
-    )
-    return [(packed(drive(ADVERSE + number)), kinds[number % 4](number)) for number in range(count)]
+    used, theirs = last_seq - first_seq + 1, packed(drive(1))
+    made: list[Command] = []
+    for number in range(count):
+        payload = packed(drive(ADVERSE + number))
+        match number % 4:
+            case 0:
+                attachment = packed({"lease": lease[0], "seq": 2**63, "proof": os.urandom(16)})
+            case 1:
+                attachment = shown(*lease, DRIVE, first_seq + number // 4 % used, theirs)
+            case 2:
+                attachment = shown(*ended, DRIVE, number, payload)
+            case _:
+                attachment = None
+        made.append((payload, attachment))
+    return made
 
 
 def _send(publisher: zenoh.Publisher, commands: list[Command], rate_hz: float) -> None:
     put, now_ns = publisher.put, time.perf_counter_ns
     begun_ns, period_ns = now_ns(), 1e9 / rate_hz if rate_hz else 0.0
-    for number, (payload, shown) in enumerate(commands):
+    for number, (payload, attachment) in enumerate(commands):
         wait_ns = begun_ns + number * period_ns - now_ns()
         if rate_hz and wait_ns > 0:
             time.sleep(wait_ns / 1e9)
-        put(payload, attachment=shown)
+        put(payload, attachment=attachment)
 
 
 if __name__ == "__main__":

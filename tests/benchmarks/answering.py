@@ -16,7 +16,8 @@ from tests.benchmarks.peer import hear, open_session, tell
 def main() -> None:
     """Answer until the harness is gone."""
     key = f"{CONTROL}/renew"
-    answer = packed({"ok": True, "token": None, "expires_in_s": 3.0, "holder": "bench", "reason": None})
+    fields = {"ok": True, "lease": None, "token": None, "expires_in_s": 3.0, "holder": "bench"}
+    answer = packed({**fields, "reason": None, "code": None})
 
     def reply(query: zenoh.Query) -> None:
         with query:

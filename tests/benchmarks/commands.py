@@ -20,10 +20,12 @@ Run it from the root of a checkout, on a machine that does nothing else. What is
 - The default ``gap_s`` beside it: 10 ms between two packets, so that of 500 commands a second most are replaced by a
   newer one before they are written; the latency is that of the commands that were.
 - Renewing the lease, against a bare queryable that answers in its callback; both asked one after the other.
-- Adversaries: 100 000 drives of another process while the driver drives at 50/s, a quarter each with a wrong token,
-  the driver's own attachments again, the token of an ended lease, and none. They block, so that all of them arrive;
-  the robot must see none, and the gateway must count each as refused or dropped. The driver's time meanwhile against
-  the time right before.
+- The proof of a command alone, in this process: checking it, its fields read first, as the gateway does on the bus's
+  thread and again before it carries a command out; and making it, as a client does.
+- Adversaries: 100 000 drives of another process while the driver drives at 50/s, a quarter each with the driver's
+  public lease and a proof made up, with the driver's own attachments and another payload, with a proof of an ended
+  lease, and with none. They block, so that all of them arrive; the robot must see none, and the gateway must count each
+  as refused or dropped. The driver's time meanwhile against the time right before.
 """
 
 from __future__ import annotations
@@ -32,14 +34,18 @@ import argparse
 import signal
 import sys
 import time
+import timeit
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
+from tests.benchmarks.drives import DRIVE, drive, packed
 from tests.benchmarks.gateway import head
 from tests.benchmarks.harness import Spread, thread_cpu_s
 from tests.benchmarks.scene import WARM, Drive, Flood, Scene, Through, bare_queries, p99, scene
 from tests.benchmarks.stages import STAGES
+from zbridge.fleet.messages import Lease
+from zbridge.session.proof import Signer, Verifier, read
 
 RATES_HZ = (50, 500)
 FLOOD_HZ = 10_000.0
@@ -47,6 +53,7 @@ FLOOD_DRIVE_HZ = 50.0
 DEFAULT_OPTIONS = ""
 PROFILED_HZ = 5000
 PROFILED_S = 5.0
+PROOFS = 20_000
 _ROWS = 24
 
 
@@ -108,7 +115,7 @@ class Benchmark:
 
     def run(self) -> list[Figure]:
         """Measure everything; say on the way what came out."""
-        return [*self._latencies(), *self._default_gap(), *self._floods()]
+        return [*self._latencies(), *_proofs(), *self._default_gap(), *self._floods()]
 
     # Latency, idle and under load, and the lease
 
@@ -206,6 +213,27 @@ class Benchmark:
     def _flooded(self, floods: Sequence[Flood], how: str, target: float | None) -> Figure:
         ratios = [run.meanwhile.p99_us / run.calm.p99_us for run in floods]
         return Figure(f"adversaries {how}: driver's 99th percentile / before", Spread.of(ratios), target)
+
+
+def _proofs() -> list[Figure]:
+    """Measure what the proof of one command costs at either end."""
+    given = Lease(ok=True, lease=bytes(range(8)), token=bytes(range(32)), expires_in_s=3.0)
+    signer, verifier = Signer(given), Verifier(bytes(range(8)), bytes(range(32)))
+    payload = packed(drive(1))
+    attachment = signer.command(DRIVE, payload)
+
+    def check() -> None:
+        assert verifier.plausible(attachment)
+        assert verifier.proves(read(attachment), DRIVE, payload)
+
+    def sign() -> None:
+        signer.command(DRIVE, payload)
+
+    figures = []
+    for what, work in (("checked", check), ("made", sign)):
+        each_us = [seconds / PROOFS * 1e6 for seconds in timeit.repeat(work, number=PROOFS, repeat=7)]
+        figures.append(Figure(f"a command's proof {what}", Spread.of(each_us), unit="us"))
+    return figures
 
 
 def _joined(rounds: Sequence[Drives]) -> Drives:

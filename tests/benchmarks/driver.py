@@ -2,7 +2,7 @@
 
 ``python -m tests.benchmarks.driver ENDPOINT LEASED``; LEASED 0 drives the script, which knows of no lease. Words:
 
-- ``lease``: get a lease anew, after having had one that has ended; tells both tokens.
+- ``lease``: get a lease anew, after having had one that has ended; tells the ids and tokens of both.
 - ``drive FIRST COUNT RATE_HZ``: drive with running numbers until COUNT were sent or ``halt`` is said, then neutral;
   tells the first sequence number and the time of every put.
 - ``renew COUNT``: ask one after the other, tells how long each answer took.
@@ -18,21 +18,21 @@ from typing import Any
 import msgpack
 import zenoh
 
-from tests.benchmarks.drives import CONTROL, DRIVE, attachment, drive, packed, plain
-from tests.benchmarks.peer import hear, open_session, tell
+from tests.benchmarks.drives import CONTROL, DRIVE, drive, packed, plain
+from tests.benchmarks.peer import ROBOT, hear, open_session, tell
+from tests.proofs import Holder
 
 _MATCH_S = 15.0
 _ASK_S = 2.0
 
 
 class Driver:
-    """Drives one robot. ``leased``: whoever takes the commands wants to see a token."""
+    """Drives one robot. ``leased``: whoever takes the commands wants to see a proof."""
 
     def __init__(self, session: zenoh.Session, *, leased: bool) -> None:
         self._session = session
         self._leased = leased
-        self._token: bytes | None = None
-        self._seq = 0
+        self._held: Holder | None = None
         self._publisher = session.declare_publisher(
             DRIVE,
             priority=zenoh.Priority.REAL_TIME,
@@ -51,14 +51,14 @@ class Driver:
     def lease(self) -> dict[str, str]:
         """Have a lease end and get another."""
         ended = self._authorize()
-        self._ask("release", token=ended)
-        return {"ended": ended.hex(), "token": self._authorize().hex()}
+        self._ask("release", ended.question("release"))
+        return {"ended": _written(ended), "lease": _written(self._authorize())}
 
     def drive(self, first: int, count: int, rate_hz: float) -> dict[str, Any]:
         """Drive on an absolute schedule; end with neutral, which keeps the lease."""
-        token = self._authorize() if self._leased else None
-        first_seq = self._seq
-        commands = [self._command(token, number) for number in (*range(first, first + count), 0)]
+        held = self._authorize() if self._leased else None
+        first_seq = held.seq + 1 if held is not None else 0
+        commands = [_command(held, number) for number in (*range(first, first + count), 0)]
         sent_ns = self._pace(commands[:-1], rate_hz)
         payload, shown = commands[-1]
         self._publisher.put(payload, attachment=shown)
@@ -66,8 +66,9 @@ class Driver:
 
     def renew(self, count: int) -> list[float]:
         """Ask for the lease to go on, one question after the other; microseconds to each answer."""
-        payload = packed({"token": self._authorize() if self._leased else bytes(16)})
-        return [self._question("renew", payload)[0] for _ in range(count)]
+        held = self._authorize() if self._leased else Holder(bytes(8), bytes(32), ROBOT)
+        questions = [held.question("renew") for _ in range(count)]
+        return [self._question("renew", payload)[0] for payload in questions]
 
     def _pace(self, commands: list[tuple[bytes, bytes | None]], rate_hz: float) -> list[int]:
         put, now_ns = self._publisher.put, time.perf_counter_ns
@@ -80,24 +81,17 @@ class Driver:
             put(payload, attachment=shown)
         return sent_ns
 
-    def _command(self, token: bytes | None, number: int) -> tuple[bytes, bytes | None]:
-        if token is None:
-            return plain(drive(number)), None
-        self._seq += 1
-        return packed(drive(number)), attachment(token, self._seq - 1)
-
-    def _authorize(self) -> bytes:
-        """Give the token of a lease that is held now."""
-        if self._token is None or not self._ask("renew", token=self._token)["ok"]:
-            lease = self._ask("acquire", who="bench", priority=0)
+    def _authorize(self) -> Holder:
+        """Give the lease that is held now."""
+        if self._held is None or not self._ask("renew", self._held.question("renew"))["ok"]:
+            lease = self._ask("acquire/bench", packed({"who": "bench"}))
             if not lease["ok"]:
                 raise SystemExit(f"no lease: {lease['reason']}")
-            self._token = lease["token"]
-        assert self._token is not None
-        return self._token
+            self._held = Holder.of(lease, ROBOT)
+        return self._held
 
-    def _ask(self, what: str, **fields: Any) -> dict[str, Any]:
-        answer: dict[str, Any] = msgpack.unpackb(self._question(what, packed(fields))[1])
+    def _ask(self, what: str, payload: bytes) -> dict[str, Any]:
+        answer: dict[str, Any] = msgpack.unpackb(self._question(what, payload)[1])
         return answer
 
     def _question(self, what: str, payload: bytes) -> tuple[float, bytes]:
@@ -113,6 +107,18 @@ class Driver:
         if reply.ok is None:
             raise SystemExit(f"{what}: {reply.err.payload.to_string() if reply.err else 'no answer'}")
         return took_us, reply.ok.payload.to_bytes()
+
+
+def _command(held: Holder | None, number: int) -> tuple[bytes, bytes | None]:
+    """Write a drive and what goes with it; what the script reads where there is no lease."""
+    if held is None:
+        return plain(drive(number)), None
+    payload = packed(drive(number))
+    return payload, held.attachment("drive", payload)
+
+
+def _written(held: Holder) -> str:
+    return f"{held.lease.hex()}:{held.token.hex()}"
 
 
 def main() -> None:

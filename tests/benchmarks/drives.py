@@ -46,11 +46,6 @@ def plain(fields: dict[str, Any]) -> bytes:
     return json.dumps(fields).encode()
 
 
-def attachment(token: bytes, seq: int) -> bytes:
-    """Authorise one command."""
-    return packed({"token": token, "seq": seq})
-
-
 def moves(reads: list[tuple[int, bytes]]) -> list[tuple[int, int]]:
     """Find the packets 11 in what a robot read: the time of the read that completed each, and its number."""
     found, rest = [], b""

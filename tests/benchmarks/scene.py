@@ -169,7 +169,7 @@ class Scene:
         lease = self._ask(self._driver, "lease")
         calm = self.drive(drive_hz, int(calm_s * drive_hz))
         seqs = " ".join(map(str, calm.seqs))
-        self._ask(adversary, f"arm {lease['token']} {lease['ended']} {seqs} {count}")
+        self._ask(adversary, f"arm {lease['lease']} {lease['ended']} {seqs} {count}")
         before, cpu = self._counters(), cpu_s(self.tested.pid)
         first = self._begin(drive_hz, int(ENDLESS_S * drive_hz))
         time.sleep((WARM + 1) / drive_hz)

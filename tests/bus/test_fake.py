@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from tests.clock import jumping
 from zbridge.bus import Answer, Lane, LaneOf, Question, Sample
-from zbridge.bus.fake import FakeBus, FakeQuestion, matches
+from zbridge.bus.fake import FakeBus, FakeQuestion, matches, meet
+from zbridge.errors import NotReady
 from zbridge.fleet import topics
 
 MATCHES = [
@@ -67,6 +68,36 @@ def test_a_key_expression_matches_as_zenoh_itself_says(key_expr: str, key: str) 
     assert matches(str(canonical), key) is canonical.includes(zenoh.KeyExpr(key))
 
 
+@given(
+    *2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)],
+)
+def test_two_key_expressions_meet_as_zenoh_itself_says(one: str, other: str) -> None:
+    first, second = zenoh.KeyExpr.autocanonize(one), zenoh.KeyExpr.autocanonize(other)
+    assert meet(str(first), str(second)) is first.intersects(second)
+
+
+def test_what_is_put_on_an_expression_reaches_whoever_it_meets_with_the_expression_as_its_key() -> None:
+    bus, seen = FakeBus(), list[Sample]()
+    bus.subscribe("fleet/r1/@cmd/**", seen.append)
+    for key in ("fleet/*/@cmd/stop", "fleet/r1/@cmd/*", "fleet/r2/@cmd/*", "fleet/**"):
+        bus.publisher(key, topics.CMD_STOP).put(b"s")
+    assert [sample.key for sample in seen] == ["fleet/*/@cmd/stop", "fleet/r1/@cmd/*"]
+
+
+@jumping
+async def test_a_question_knows_what_was_asked_and_which_key_it_answers() -> None:
+    bus, asked = FakeBus(), list[tuple[str, str]]()
+    for key in ("fleet/r1/@rpc/control/acquire/*", "fleet/r1/@rpc/control/renew"):
+        bus.answer(key, lambda question: asked.append((question.asked, question.key)))
+    for key in ("fleet/r1/@rpc/control/acquire/op1", "fleet/*/@rpc/control/renew", "fleet/r1/@rpc/control/acquire/*"):
+        await bus.ask(key)
+    assert asked == [
+        ("fleet/r1/@rpc/control/acquire/op1", "fleet/r1/@rpc/control/acquire/op1"),
+        ("fleet/*/@rpc/control/renew", "fleet/r1/@rpc/control/renew"),
+        ("fleet/r1/@rpc/control/acquire/*", "fleet/r1/@rpc/control/acquire/*"),
+    ]
+
+
 def test_a_sample_reaches_every_subscriber_that_matches_on_every_session() -> None:
     bus = FakeBus()
     other = bus.join("2")
@@ -122,10 +153,11 @@ async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> No
         question.answer(question.payload + b"!")
 
     bus.answer("fleet/r1/@rpc/map", answer)
-    handle = bus.answer("fleet/r2/@rpc/map", lambda question: question.refuse("offline"))
+    offline = NotReady("offline")
+    handle = bus.answer("fleet/r2/@rpc/map", lambda question: question.refuse(offline))
     assert await bus.ask("fleet/*/@rpc/map", b"hi") == [
         Answer("fleet/r1/@rpc/map", b"hi!"),
-        Answer("fleet/r2/@rpc/map", b"", "offline"),
+        Answer("fleet/r2/@rpc/map", b"", offline),
     ]
     handle.close()
     assert await bus.ask("fleet/r2/@rpc/map") == []
@@ -183,7 +215,7 @@ async def test_what_was_put_is_with_the_bus_at_once() -> None:
     assert bus.values("fleet/r1/@cmd/drive") == [b"1"]
 
 
-@pytest.mark.parametrize("lane", [Lane.STOP, Lane.OTHER, lambda attachment: Lane.COMMAND])
+@pytest.mark.parametrize("lane", [Lane.STOP, Lane.OTHER, lambda shown, look: Lane.COMMAND])
 def test_a_sample_comes_by_whatever_lane(lane: Lane | LaneOf) -> None:
     bus = FakeBus()
     seen: list[Sample] = []
@@ -250,8 +282,9 @@ async def test_frames_are_wanted_only_while_somebody_listens() -> None:
 def test_a_question_keeps_its_replies() -> None:
     question = FakeQuestion("k", b"?")
     question.answer(b"a")
-    question.refuse("no")
-    assert question.replies == [Answer("k", b"a"), Answer("k", b"", "no")]
+    no = NotReady("no")
+    question.refuse(no)
+    assert question.replies == [Answer("k", b"a"), Answer("k", b"", no)]
     assert (question.payload, question.attachment) == (b"?", None)
 
 

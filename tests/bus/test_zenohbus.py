@@ -6,12 +6,13 @@ import asyncio
 import threading
 from collections.abc import AsyncIterator, Callable
 
+import msgpack
 import pytest
 
-from zbridge.bus import BusSettings, Lane
+from zbridge.bus import BusSettings, Lane, Look, Question
 from zbridge.bus import zenohbus as module
 from zbridge.bus.zenohbus import ZenohBus, open_zenoh
-from zbridge.errors import BusError
+from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
 
@@ -72,12 +73,15 @@ async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_th
 async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -> None:
     seen, asked, all_asked = Seen(), list[bytes | None](), threading.Event()
 
-    def lane(attachment: bytes | None) -> Lane:
+    def lane(attachment: bytes | None, look: Look) -> Lane:
         asked.append(attachment)
+        if attachment is not None:
+            looked.append(look())
         if attachment == b"last":
             all_asked.set()
         return Lane.COMMAND if attachment == b"holder" else Lane.OTHER
 
+    looked = list[tuple[str, bytes]]()
     bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload, sample.attachment), lane=lane)
     drive = bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE)
     sent = [(b"1", None), (b"2", b"other"), (b"3", b"holder"), (b"4", b"holder"), (b"5", b"last")]
@@ -85,8 +89,81 @@ async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -
         drive.put(payload, attachment)
     assert all_asked.wait(SOON_S)  # the event loop stands still meanwhile, so that everything waits for it
     assert asked == [attachment for _, attachment in sent]
+    assert looked == [("fleet/r1/@cmd/drive", payload) for payload, attachment in sent if attachment is not None]
     await seen.until(lambda: len(seen) == 5)
     assert seen == [sent[2], sent[3], sent[0], sent[1], sent[4]]
+
+
+async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key(bus: ZenohBus) -> None:
+    chosen = list[tuple[bytes | None, str, bytes]]()
+
+    def lane(payload: bytes | None, look: Look) -> Lane:
+        chosen.append((payload, *look()))
+        return Lane.COMMAND
+
+    bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
+    await bus.ask("fleet/r1/@rpc/control/renew", b"proof")
+    await bus.ask("fleet/*/@rpc/control/renew", b"proof")
+    assert chosen == [
+        (b"proof", "fleet/r1/@rpc/control/renew", b""),
+        (b"proof", "fleet/*/@rpc/control/renew", b""),
+    ]
+
+
+async def test_a_question_knows_what_was_asked_and_is_answered_on_a_concrete_key(bus: ZenohBus) -> None:
+    asked = list[tuple[str, str]]()
+
+    def answer(question: Question) -> None:
+        asked.append((question.asked, question.key))
+        question.answer(b"yes")
+
+    bus.answer("fleet/r1/@rpc/control/acquire/*", answer)
+    bus.answer("fleet/r1/@rpc/control/renew", answer)
+    for key in ("fleet/r1/@rpc/control/acquire/user%40host", "fleet/*/@rpc/control/renew"):
+        (reply,) = await bus.ask(key)
+        assert (reply.payload, reply.error) == (b"yes", None)
+        assert reply.key == asked[-1][1]
+    assert asked == [
+        ("fleet/r1/@rpc/control/acquire/user%40host", "fleet/r1/@rpc/control/acquire/user%40host"),
+        ("fleet/*/@rpc/control/renew", "fleet/r1/@rpc/control/renew"),
+    ]
+
+
+@pytest.mark.parametrize("asked", ["fleet/r1/@rpc/control/acquire/*", "fleet/*/@rpc/control/acquire/op1"])
+async def test_a_question_with_wildcards_can_be_refused(bus: ZenohBus, asked: str) -> None:
+    bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: question.refuse(Held("held by ann")))
+    (reply,) = await bus.ask(asked)
+    assert isinstance(reply.error, Held)
+
+
+async def test_an_error_reply_is_a_map_of_code_and_reason(bus: ZenohBus) -> None:
+    bus.answer("fleet/r1/@rpc/map", lambda question: question.refuse(Unsupported("the robot has no map")))
+    replies = await asyncio.to_thread(lambda: list(bus._session.get("fleet/r1/@rpc/map", timeout=SOON_S)))
+    (error,) = (reply.err for reply in replies)
+    assert error is not None
+    assert msgpack.unpackb(error.payload.to_bytes()) == {"code": "unsupported", "reason": "the robot has no map"}
+    assert str(error.encoding) == "application/msgpack;zbridge.Denied.v1"
+    (reply,) = await bus.ask("fleet/r1/@rpc/map")
+    assert isinstance(reply.error, Unsupported)
+    assert str(reply.error) == "the robot has no map"
+
+
+@pytest.mark.parametrize(
+    ("payload", "kind", "text"),
+    [
+        (b"Timeout", BusError, "Timeout"),
+        (b"\xff\xfe", BusError, "\ufffd\ufffd"),
+        (b"", BusError, ""),
+        (msgpack.packb({"reason": "no code"}), BusError, None),
+        (msgpack.packb({"code": "held", "reason": "held by ann"}), Held, "held by ann"),
+        (msgpack.packb({"code": "of tomorrow", "reason": "why not"}), Unsupported, "why not"),
+    ],
+)
+def test_an_error_reply_of_anybody_is_read(payload: bytes, kind: type[Exception], text: str | None) -> None:
+    error = module._read_error(payload)
+    assert type(error) is kind
+    assert text is None or str(error) == text
+    assert not isinstance(error, Refused) or error.code in Code
 
 
 async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 
+from tests.proofs import Holder, numbered
 from zbridge.audit import Audit
 from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
@@ -81,8 +81,7 @@ class Gateway:
         self._bus = bus.join(f"gateway of {name}")
         self._loop = asyncio.get_running_loop()
         metrics = Metrics()
-        tokens = (bytes([number]) * 16 for number in itertools.count(1))
-        self.authority = Authority(lease_s, DEADMAN_S, lambda: next(tokens))
+        self.authority = Authority(lease_s, DEADMAN_S, numbered())
         self.leases = Leases(
             self.machine,
             self.authority,
@@ -116,8 +115,8 @@ class Gateway:
         self._bus.announce(self.keys.alive("gateway"))
         self.publish(topics.STATUS, Status(state="established"))
         self.leases.report()
-        for topic in (topics.RPC_ACQUIRE, topics.RPC_TAKEOVER, topics.RPC_RENEW, topics.RPC_RELEASE):
-            self._bus.answer(self.keys.key(topic.path), self._note)
+        for name in ("acquire/*", "takeover/*", "renew", "release"):
+            self._bus.answer(self.keys.key(f"@rpc/control/{name}"), self._note)
         self.leases.serve(self._bus)
         self._bus.subscribe(self.keys.key(topics.CMD_STOP.path), self.commands.take_stop)
         self._bus.subscribe(self.keys.key("@cmd/**"), self._take)
@@ -134,13 +133,19 @@ class Gateway:
         """Publish this payload, whatever it is; a state keeps its last value for as long as the gateway is there."""
         self._bus.publisher(self.keys.key(topic.path), topic).put(payload)
 
-    def give(self, who: str, *, takeover: bool = False, **wishes: Any) -> bytes:
-        """Give another program the lease; give its token."""
+    def give(self, who: str, *, takeover: bool = False, **wishes: Any) -> Holder:
+        """Give another program the lease."""
         decide = self.authority.takeover if takeover else self.authority.acquire
         lease = decide(Acquire(who=who, **wishes), self._loop.time())
         self.leases.settle()
-        assert lease.token is not None, lease.reason
-        return lease.token
+        assert lease.lease is not None, lease.reason
+        assert lease.token is not None
+        return Holder(lease.lease, lease.token, self.name)
+
+    def answer_first(self, question: Any) -> None:
+        """Answer what somebody else asks before anything else."""
+        handlers = [answer for key, answer in self._bus._shared.queryables if key == question.key]
+        handlers[-1](question)
 
     def refuse(self, command: str, reason: str, who: str | None) -> None:
         """Show a refusal on ``control``."""
@@ -156,9 +161,9 @@ class Gateway:
         """The drive commands that were carried out."""
         return [command for name, command in self.machine.commands if name == "drive"]
 
-    def questions(self, topic: Topic) -> list[float]:
-        """When this was asked."""
-        return [at for at, path in self.asked if path == topic.path]
+    def questions(self, name: str) -> list[float]:
+        """When this was asked: ``acquire``, ``takeover``, ``renew``, ``release``."""
+        return [at for at, path in self.asked if path.split("/")[2] == name]
 
     def _note(self, question: Any) -> None:
         self.asked.append((self._loop.time(), self.keys.path(question.key)))

@@ -24,7 +24,7 @@ from zbridge.bus.fake import FakeBus
 from zbridge.client import blocking
 from zbridge.client.driver import Driver
 from zbridge.client.feed import WAITING
-from zbridge.errors import BusError, Held, LeaseLost, Refused
+from zbridge.errors import BusError, Held, LeaseLost, NotReady, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -59,7 +59,7 @@ class World:
         self.gateway = Gateway(self.bus)
         self.gateway.serve()
         self.bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(payloads.encode(POSE)))
-        self.bus.answer("fleet/r1/@rpc/map", lambda question: question.refuse("offline"))
+        self.bus.answer("fleet/r1/@rpc/map", lambda question: question.refuse(NotReady("offline")))
         self.closed = False
         self._loop = asyncio.get_running_loop()
 

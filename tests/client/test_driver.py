@@ -6,26 +6,43 @@ import asyncio
 import contextlib
 import getpass
 import math
+import re
 import socket
 import traceback
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
+import msgpack
 import pytest
 
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
-from zbridge.bus import Answer, Handle, Publisher, Sample
-from zbridge.bus.fake import FakeBus
+from tests.proofs import lease, proof
+from zbridge.bus import Answer, Handle, Publisher, Question, Sample
+from zbridge.bus.fake import FakeBus, FakeQuestion
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import RETRY_S, default_who
-from zbridge.errors import BusError, Held, LeaseLost, Refused
+from zbridge.errors import (
+    BusError,
+    Code,
+    Held,
+    LeaseLost,
+    Malformed,
+    NeutralFirst,
+    NotReady,
+    Refused,
+    TooFast,
+    Unsupported,
+)
+from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Authorization, Control, Drive, Mode, Motor, Raw
+from zbridge.fleet.messages import Control, Drive, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import Congestion, Topic
 
 ME = "ann@here"
+MINE = "operator.ann%40here.mine"
+"""The liveliness token of this program."""
 REFUSED = "no legs"
 SEEN_S = 0.06
 """Within this a refusal shows on ``control``."""
@@ -122,8 +139,8 @@ def test_a_user_without_a_name_has_one_nevertheless(error: Exception, monkeypatc
 async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
     world = World()
     async with world.robot.control(ME):
-        assert tokens(world.bus) == ["operator.mine"]
-        world.mine._shared.tell("fleet/r1/@alive/operator.mine", False)
+        assert tokens(world.bus) == [MINE]
+        world.mine._shared.tell(f"fleet/r1/@alive/{MINE}", False)
         assert world.gateway.control.state == "stopped", "the lease names the token"
     assert tokens(world.bus) == []
 
@@ -132,10 +149,32 @@ async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
 async def test_the_token_is_there_before_the_lease_is_asked_for() -> None:
     world = World(served=False)
     there: list[list[str]] = []
-    world.bus.answer("fleet/r1/@rpc/control/acquire", lambda question: there.append(tokens(world.bus)))
+    world.bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: there.append(tokens(world.bus)))
     world.gateway.serve()
     async with world.robot.control(ME):
-        assert there == [["operator.mine"]]
+        assert there == [[MINE]]
+
+
+@jumping
+async def test_the_lease_is_asked_for_in_the_programs_own_name() -> None:
+    world = World()
+    async with world.robot.control(ME):
+        pass
+    async with world.robot.control("op1.laptop", name="op1", takeover=True):
+        assert tokens(world.bus) == ["operator.op1.mine"]
+        assert world.gateway.control.holder == "op1.laptop"
+    assert [path for _, path in world.gateway.asked if path.count("/") == 3] == [
+        "@rpc/control/acquire/ann%40here",
+        "@rpc/control/takeover/op1",
+    ]
+
+
+@jumping
+async def test_a_name_that_is_not_ones_own_is_refused_at_once() -> None:
+    world = World()
+    with pytest.raises(Malformed, match=r"^r1: who = 'op2': expected 'op1', or that and '\.suffix'$"):
+        await world.robot.control("op2", name="op1").__aenter__()
+    assert tokens(world.bus) == []
 
 
 @jumping
@@ -164,8 +203,11 @@ async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[s
 async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told() -> None:
     world = World()
     world.gateway.leases.refuse_all("gateway stopped")
-    with pytest.raises(BusError, match="r1: the gateway says 'gateway stopped' within 5 s"):
+    asked_at = world.loop.time()
+    with pytest.raises(NotReady, match=r"^r1: gateway stopped$") as refused:
         await world.robot.control(ME).__aenter__()
+    assert refused.value.code is Code.CLOSING
+    assert world.loop.time() - asked_at == pytest.approx(5.0, abs=2 * RETRY_S)
     world.loop.call_later(1.0, setattr, world.gateway.leases, "_closing", None)
     async with world.robot.control(ME):
         assert world.gateway.control.holder == ME
@@ -176,7 +218,7 @@ async def test_a_program_that_does_not_wait_asks_once() -> None:
     world = World()
     async with world.robot.control(ME, wait_s=0.0):
         assert world.gateway.control.holder == ME
-    assert len(world.gateway.questions(topics.RPC_ACQUIRE)) == 1
+    assert len(world.gateway.questions("acquire")) == 1
 
 
 @jumping
@@ -187,7 +229,7 @@ async def test_held_names_the_holder_at_once() -> None:
             await world.others.control("bob@there", priority=2).__aenter__()
         assert held.value.holder == ME
         assert world.loop.time() == asked_at
-        assert tokens(world.bus) == ["operator.mine"]
+        assert tokens(world.bus) == [MINE]
         await drive(forward=0.5)
         assert drive.loss is None
 
@@ -250,7 +292,7 @@ async def test_a_cancelled_wait_for_the_lease_leaves_nothing_behind() -> None:
     world = World(served=False)
     waiting = asyncio.create_task(world.robot.control(ME).__aenter__())
     await asyncio.sleep(1.0)
-    assert tokens(world.bus) == ["operator.mine"]
+    assert tokens(world.bus) == [MINE]
     waiting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting
@@ -262,9 +304,10 @@ async def test_a_cancelled_wait_for_the_lease_leaves_nothing_behind() -> None:
 
 
 @jumping
-async def test_commands_reach_the_robot_with_the_token_and_rising_numbers() -> None:
+async def test_commands_reach_the_robot_with_proofs_and_rising_numbers() -> None:
     async with driving() as (world, drive):
-        token = world.gateway.authority.token
+        sent: list[Sample] = []
+        world.bus.subscribe("fleet/*/@cmd/**", sent.append)
         await drive(forward=0.5, left=-0.25, turn=1.0)
         await drive(turn=-1.0, light=True)
         await drive.mode("autonomous")
@@ -279,10 +322,16 @@ async def test_commands_reach_the_robot_with_the_token_and_rising_numbers() -> N
             ("raw/tcpudp", Raw(id=7, body=b"abc")),
             ("drive", Drive()),
         ]
-        assert {shown.token for shown in world.gateway.attachments} == {token}
-        numbers = [shown.seq for shown in world.gateway.attachments]
-        assert numbers == sorted(set(numbers))
-        assert len(numbers) == 6
+        held = lease(1)
+        assert [msgpack.unpackb(sample.attachment or b"") for sample in sent] == [
+            {
+                "lease": held.lease,
+                "seq": number,
+                "proof": proof(held.token, sample.key, number, sample.payload),
+            }
+            for number, sample in enumerate(sent, 1)
+        ]
+        assert not any(held.token in (sample.attachment or b"") + sample.payload for sample in sent)
 
 
 @pytest.mark.parametrize("name", ["forward", "left", "turn"])
@@ -424,7 +473,7 @@ async def test_an_idle_program_keeps_its_lease() -> None:
             least_s = min(least_s, left_s)
         assert least_s >= LEASE_S / 2, "renewed with time to spare for a lost answer"
         assert drive.loss is None
-        assert 50 <= len(world.gateway.questions(topics.RPC_RENEW)) <= 70
+        assert 50 <= len(world.gateway.questions("renew")) <= 70
 
 
 @jumping
@@ -440,7 +489,7 @@ async def test_one_answer_that_does_not_come_costs_nothing() -> None:
     async with driving() as (world, drive):
         world.gateway.leases.refuse_all("not now")
         await asyncio.sleep(LEASE_S / 2)
-        assert world.gateway.questions(topics.RPC_RENEW)
+        assert world.gateway.questions("renew")
         world.gateway.leases._closing = None
         await asyncio.sleep(2 * LEASE_S)
         assert drive.loss is None
@@ -452,7 +501,7 @@ async def test_a_malformed_answer_does_not_end_the_renewals() -> None:
     async with driving() as (world, drive):
         nonsense = world.garble(topics.RPC_RENEW)
         await asyncio.sleep(LEASE_S / 2)
-        assert world.gateway.questions(topics.RPC_RENEW)
+        assert world.gateway.questions("renew")
         nonsense.close()
         await asyncio.sleep(3 * LEASE_S)
         assert drive.loss is None
@@ -499,15 +548,27 @@ async def test_a_takeover_names_the_new_holder() -> None:
 
 
 @jumping
+async def test_a_loss_has_the_holder_and_a_code_for_programs() -> None:
+    async with driving() as (world, drive):
+        async with world.others.control("bob@there", takeover=True):
+            await asyncio.wait_for(drive.lost.wait(), 0.1)
+            for _ in range(2):
+                with pytest.raises(LeaseLost) as loss:
+                    await drive(forward=0.5)
+                assert (loss.value.code, loss.value.holder) == (Code.LEASE_ENDED, "bob@there")
+        await asyncio.sleep(0)
+
+
+@jumping
 async def test_a_higher_priority_is_given_the_robot_and_named() -> None:
     async with driving(priority=1) as (world, drive), world.others.control("bob@there", priority=2):
         assert "held by bob@there" in await lost(world, drive, 0.1)
 
 
 @jumping
-async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_within_the_lease() -> None:
+async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_as_soon() -> None:
     async with driving() as (world, drive), world.others.control(ME, takeover=True) as other:
-        assert "taken over by ann@here" in await lost(world, drive, LEASE_S)
+        assert "taken over by ann@here" in await lost(world, drive, 0.1)
         assert other.loss is None
 
 
@@ -540,7 +601,7 @@ async def test_a_lease_that_ran_out_is_noticed() -> None:
 async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_out() -> None:
     async with driving() as (world, drive):
         await asyncio.sleep(10.0)
-        renewed_at = world.gateway.questions(topics.RPC_RENEW)[-1]
+        renewed_at = world.gateway.questions("renew")[-1]
         await world.gateway.vanish()
         await asyncio.wait_for(drive.lost.wait(), 2 * LEASE_S)
         assert LEASE_S <= world.loop.time() - renewed_at <= LEASE_S * 5 / 3
@@ -568,9 +629,63 @@ async def test_what_others_do_to_control_is_no_loss() -> None:
         world.gateway.publish(topics.CONTROL, Control(state="held", holder="bob@there"))
         await asyncio.sleep(0.1)
         assert drive.loss is None, "the gateway was asked, and it knows better"
-        assert 1 <= len(world.gateway.questions(topics.RPC_RENEW)) <= 3
+        assert 1 <= len(world.gateway.questions("renew")) <= 3
         await drive(forward=0.5)
         assert len(world.gateway.driven) == 1
+
+
+@jumping
+async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -> None:
+    async with driving() as (world, drive):
+        heard: list[bytes] = []
+
+        def repeat(question: Question) -> None:
+            if question.payload not in heard:
+                heard.append(question.payload)
+                world.gateway.answer_first(FakeQuestion(question.key, question.payload))
+
+        world.bus.answer("fleet/r1/@rpc/control/renew", repeat)
+        queryables = world.bus._shared.queryables
+        queryables.insert(0, queryables.pop())
+        await asyncio.sleep(3 * LEASE_S)
+        assert len(heard) >= 3
+        assert {refusal.code for refusal in world.gateway.control.refusals} == {"out_of_order"}
+        assert drive.loss is None
+        await drive(forward=0.5)
+        assert len(world.gateway.driven) == 1
+
+
+@jumping
+async def test_whoever_repeats_our_commands_makes_us_neither_raise_nor_stop() -> None:
+    async with driving() as (world, drive):
+        overheard: list[Sample] = []
+        watching = world.bus.subscribe("fleet/*/@cmd/**", overheard.append)
+        for _ in range(3):
+            await drive(forward=0.5)
+        watching.close()
+        for sample in overheard:
+            world.bus.publisher(sample.key, topics.CMD_DRIVE).put(sample.payload, sample.attachment)
+        await asyncio.sleep(SEEN_S)
+        assert [(refusal.who, refusal.code, refusal.count) for refusal in world.gateway.control.refusals] == [
+            (None, "out_of_order", 3)
+        ]
+        await drive(forward=0.25)
+        assert len(world.gateway.driven) == 4
+
+
+@jumping
+async def test_what_a_listener_says_it_refused_in_our_name_is_nothing_to_us() -> None:
+    async with driving() as (world, drive):
+        for refusal in (NotReady("offline"), LeaseLost("gone"), Held("held by bob"), NeutralFirst("stop")):
+            world.gateway.authority.refuse("drive", refusal, ME, by="hq.forger")
+            world.gateway.authority.refuse("stop", refusal, None, by="hq.forger")
+        world.gateway.leases.settle()
+        await asyncio.sleep(SEEN_S)
+        asked = len(world.gateway.questions("renew"))
+        await drive(forward=0.5)
+        assert len(world.gateway.driven) == 1
+        assert len(world.gateway.questions("renew")) == asked
+        await world.others.stop()
 
 
 @jumping
@@ -759,6 +874,69 @@ async def test_motion_after_the_deadman_is_refused_and_neutral_makes_it_possible
         assert world.gateway.driven == [Drive(forward=0.5), Drive(), Drive(forward=0.25)]
 
 
+@pytest.mark.parametrize(
+    ("refusal", "kind"),
+    [
+        (NotReady("offline"), NotReady),
+        (NotReady("busy: map", Code.BUSY), NotReady),
+        (NotReady("gateway stopped", Code.CLOSING), NotReady),
+        (Unsupported("no legs"), Unsupported),
+        (NeutralFirst("deadman: send a neutral drive first"), NeutralFirst),
+        (TooFast("more than 50 a second"), TooFast),
+        (Malformed("Drive: expected a map"), Malformed),
+    ],
+)
+@jumping
+async def test_a_refusal_is_raised_as_the_class_of_its_code(refusal: Refused, kind: type[Refused]) -> None:
+    async with driving() as (world, drive):
+        world.gateway.authority.refuse("drive", refusal, ME)
+        world.gateway.leases.settle()
+        await asyncio.sleep(SEEN_S)
+        with pytest.raises(kind) as raised:
+            await drive(forward=0.5)
+        assert (type(raised.value), raised.value.code) == (kind, refusal.code)
+        assert str(raised.value) == f"r1: drive: {refusal}"
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind", "text"),
+    [
+        (Lease(ok=False, holder="bob", reason="held by bob (priority 0)", code="held"), Held, "r1 is held by bob"),
+        (Lease(ok=False, reason="who = '': expected a name", code="malformed"), Malformed, "r1: who = ''"),
+        (Lease(ok=False, reason="not this one", code="unsupported"), Unsupported, "r1: not this one"),
+        (Lease(ok=False, reason="of a gateway to come", code="too_late"), Unsupported, "r1: of a gateway to come"),
+        (Lease(ok=False), Unsupported, "r1: no reason given"),
+    ],
+)
+@jumping
+async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words(
+    answer: Lease, kind: type[Refused], text: str
+) -> None:
+    world = World(served=False)
+    world.bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: question.answer(payloads.encode(answer)))
+    with pytest.raises(kind, match=re.escape(text)) as raised:
+        await world.robot.control(ME).__aenter__()
+    assert type(raised.value) is kind
+    assert raised.value.holder == answer.holder
+
+
+@pytest.mark.parametrize("code", [Code.RATE, Code.NOT_READY, Code.CLOSING])
+@jumping
+async def test_a_lease_that_cannot_be_given_for_now_is_asked_for_again(code: Code) -> None:
+    world = World(served=False)
+    asked: list[Question] = []
+
+    def answer(question: Question) -> None:
+        asked.append(question)
+        question.answer(payloads.encode(Lease(ok=False, reason="later", code=code)))
+
+    closing = world.bus.answer("fleet/r1/@rpc/control/acquire/*", answer)
+    world.loop.call_later(1.0, closing.close)
+    world.loop.call_later(1.0, world.gateway.serve)
+    async with world.robot.control(ME):
+        assert len(asked) >= 5
+
+
 # Giving the lease back
 
 
@@ -779,7 +957,7 @@ async def test_the_lease_is_given_back_when_the_program_raises(error: type[BaseE
     with pytest.raises(error):
         await program()
     assert world.gateway.control.state == "free"
-    assert len(world.gateway.questions(topics.RPC_RELEASE)) == 1
+    assert len(world.gateway.questions("release")) == 1
     assert world.machine.stops == 1, "it moved"
     assert tokens(world.bus) == []
     assert subscriptions(world.bus, "fleet/r1/control") == 0
@@ -829,7 +1007,7 @@ async def test_nothing_runs_on_when_the_lease_was_given_back() -> None:
         await settle()
     await settle()
     assert asyncio.all_tasks() == before
-    assert world.gateway.questions(topics.RPC_RENEW) == []
+    assert world.gateway.questions("renew") == []
 
 
 class SlowToAsk(FakeBus):
@@ -867,7 +1045,7 @@ async def test_a_program_cancelled_while_it_gives_the_lease_back_has_given_it_ba
     with pytest.raises(asyncio.CancelledError):
         await task
     await asyncio.sleep(0.2)
-    assert len(world.gateway.questions(topics.RPC_RELEASE)) == 1
+    assert len(world.gateway.questions("release")) == 1
 
 
 @jumping
@@ -897,14 +1075,3 @@ async def test_a_gateway_that_is_gone_is_not_waited_for_in_vain() -> None:
         await world.gateway.vanish()
         left_at = world.loop.time()
     assert world.loop.time() - left_at <= 1.5
-
-
-@jumping
-async def test_the_attachment_is_a_map_of_token_and_seq() -> None:
-    async with driving() as (world, drive):
-        taken: list[Sample] = []
-        world.bus.subscribe("fleet/r1/@cmd/drive", taken.append)
-        await drive(forward=0.5)
-        assert world.gateway.attachments == [Authorization(world.gateway.authority.token or b"", 1)]
-        assert taken[0].attachment is not None
-        assert taken[0].attachment[0] == 0x82

@@ -15,6 +15,7 @@ from tests.clock import jumping
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Feed, Fleet, Robot
 from zbridge.client.feed import WAITING
+from zbridge.errors import NotReady
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -320,7 +321,7 @@ async def test_last_is_none_before_a_state_was_published_and_then_its_value(
 @jumping
 async def test_last_is_none_where_the_question_is_refused() -> None:
     world = World()
-    world.bus.answer("fleet/r1/map", lambda question: question.refuse("no map"))
+    world.bus.answer("fleet/r1/map", lambda question: question.refuse(NotReady("no map")))
     assert await world.robot.map.last() is None
 
 

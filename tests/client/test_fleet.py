@@ -16,7 +16,7 @@ from zbridge.bus import Answer, Question, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.fleet import CONFIRM_S
-from zbridge.errors import BusError, Held, PayloadError, Refused
+from zbridge.errors import BusError, Held, NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -131,14 +131,14 @@ async def test_questions_are_answered_refused_or_not_answered(
         if len(asked) == 1:
             question.answer(payloads.encode(message))
         else:
-            question.refuse("offline")
+            question.refuse(NotReady("offline"))
 
     world.bus.answer(f"fleet/r1/{topic.path}", answer)
     got = await ask(world.robot)
     assert type(got) is type(message)
     assert payloads.encode(got) == payloads.encode(message)
     assert payloads.decode(Query, asked[0].payload) == Query()
-    with pytest.raises(Refused, match=r"^r1: offline$"):
+    with pytest.raises(NotReady, match=r"^r1: offline$"):
         await ask(world.robot)
 
 
@@ -378,7 +378,7 @@ async def test_a_program_can_stop_what_it_drives_and_take_it_again() -> None:
 async def test_several_robots_are_driven_at_once() -> None:
     world = World("r1", "r2")
     async with world.fleet["r1"].control("ann@here") as one, world.fleet["r2"].control("ann@here") as two:
-        assert tokens(world.bus, "r1") == tokens(world.bus, "r2") == ["operator.program"]
+        assert tokens(world.bus, "r1") == tokens(world.bus, "r2") == ["operator.ann%40here.program"]
         await asyncio.gather(one.during(1.0, forward=0.5), two.during(1.0, turn=0.5))
         with pytest.raises(Held):
             await Fleet(world.bus.join("bob"))["r1"].control("bob@there").__aenter__()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import random
 import signal
@@ -19,6 +18,8 @@ from typing import Any, TypeVar
 import msgpack
 import pytest
 import zenoh
+
+from tests.proofs import Holder, packed
 
 T = TypeVar("T")
 WAIT_S = 10.0
@@ -74,16 +75,15 @@ class Lease:
     def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
         self._session = session
         self._key = f"fleet/{robot}/@rpc/control/"
-        self.answer = self._ask(how, wishes)
+        self.answer = self._ask(f"{how}/{wishes['who']}", packed(wishes))
         assert self.answer["ok"], self.answer
-        self.token: bytes = self.answer["token"]
-        self._numbers = itertools.count(1)
+        self.held = Holder.of(self.answer, robot)
         self._closed = threading.Event()
         threading.Thread(target=self._renew, daemon=True).start()
 
-    def _ask(self, name: str, fields: dict[str, Any]) -> dict[str, Any]:
-        """Ask one thing about the lease; an error text is no answer."""
-        for reply in self._session.get(self._key + name, payload=msgpack.packb(fields), timeout=3.0):
+    def _ask(self, name: str, payload: bytes) -> dict[str, Any]:
+        """Ask one thing about the lease; an error is no answer."""
+        for reply in self._session.get(self._key + name, payload=payload, timeout=3.0):
             if reply.ok is not None:
                 answer: dict[str, Any] = msgpack.unpackb(reply.ok.payload.to_bytes())
                 return answer
@@ -92,18 +92,13 @@ class Lease:
     def _renew(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session was closed
             while not self._closed.wait(self.answer["expires_in_s"] / 3):
-                if not self._ask("renew", {"token": self.token})["ok"]:
+                if not self._ask("renew", self.held.question("renew"))["ok"]:
                     return
-
-    def attachment(self) -> bytes:
-        """What goes with the next command."""
-        packed: bytes = msgpack.packb({"token": self.token, "seq": next(self._numbers)})
-        return packed
 
     def release(self) -> dict[str, Any]:
         """Give the lease back."""
         self.close()
-        return self._ask("release", {"token": self.token})
+        return self._ask("release", self.held.question("release"))
 
     def close(self) -> None:
         """Renew it no longer."""
@@ -127,10 +122,10 @@ class Fleet:
         return (self.seen.get(f"fleet/{path}") or [{}])[-1]
 
     def get(self, key: str, timeout_s: float = 3.0, **fields: Any) -> list[Any]:
-        """Plain get: the decoded replies, error texts as strings."""
+        """Plain get: the decoded replies, errors too."""
         payload = msgpack.packb(fields) if fields else None
         return [
-            msgpack.unpackb(reply.ok.payload.to_bytes()) if reply.ok else reply.err.payload.to_string()
+            msgpack.unpackb((reply.ok or reply.err).payload.to_bytes())
             for reply in self.session.get(key, payload=payload, timeout=timeout_s)
         ]
 
@@ -150,11 +145,12 @@ class Fleet:
         self.put_payload(path, msgpack.packb(fields))
 
     def put_payload(self, path: str, payload: bytes) -> None:
-        lease = self._leases.get(path.split("/")[0])
+        robot, _, command = path.partition("/@cmd/")
+        lease = self._leases.get(robot)
         self.session.put(
             f"fleet/{path}",
             payload,
-            attachment=lease.attachment() if lease is not None else None,
+            attachment=lease.held.attachment(command, payload) if lease is not None else None,
             congestion_control=zenoh.CongestionControl.BLOCK,
         )
 

@@ -34,13 +34,13 @@ from tests.e2e.loss import (
     STOP,
     Frame,
     Scene,
-    authorization,
     commander,
     configuration,
     kill,
     query,
     start,
 )
+from tests.proofs import Holder
 
 NAMES = ("anna", "bert")
 LEASE_S, DEADMAN_S = 0.4, 0.15
@@ -65,7 +65,7 @@ class Driver:
         self._asked = 0
         self._drive = commander(session, "drive")
         self._stop = commander(session, "stop")
-        self._alive = f"operator.{session.zid()}"
+        self._alive = f"operator.{name}.{session.zid()}"
         self._announced = session.liveliness().declare_token(f"fleet/r1/@alive/{self._alive}")
 
     def fight(self, seconds: float) -> None:
@@ -74,7 +74,7 @@ class Driver:
         while time.monotonic() < ends_at:
             lease = self._ask()
             if lease.get("ok"):
-                self._use(lease["token"])
+                self._use(Holder.of(lease, first=0))
             elif self._rng.random() < 0.1:
                 self._stop_robot()
             time.sleep(self._rng.uniform(0.0, 0.05))
@@ -84,55 +84,53 @@ class Driver:
         """Ask for the lease: mostly politely, sometimes with more right, sometimes as who may take it over."""
         self._asked += 1
         how = self._rng.choices(("acquire", "takeover"), (5, 1))[0]
-        wishes = {"who": f"{self._name} {self._asked}", "priority": self._rng.choice((0, 0, 0, 1, 2))}
-        return self._query(how, **wishes, lease_s=LEASE_S, deadman_s=DEADMAN_S, alive=self._alive)
+        wishes = {"who": f"{self._name}.{self._asked}", "priority": self._rng.choice((0, 0, 0, 1, 2))}
+        return self._query(f"{how}/{self._name}", **wishes, lease_s=LEASE_S, deadman_s=DEADMAN_S, alive=self._alive)
 
-    def _use(self, token: bytes) -> None:
+    def _use(self, held: Holder) -> None:
         """Drive for a while, whether or not the lease is lost meanwhile, and leave it in one of many ways."""
-        seqs = itertools.count()
-        self._move(token, seqs, self._rng.uniform(0.05, 0.3))
+        self._move(held, self._rng.uniform(0.05, 0.3))
         match self._rng.choice(("release", "release", "stop", "silence", "expire", "nothing")):
             case "release":
-                self._query("release", token=token)
+                self._query("release", held.question("release"))
             case "stop":
                 self._stop_robot()
             case "silence":  # longer than the deadman; motion only after a neutral
                 time.sleep(DEADMAN_S * 1.5)
-                self._query("renew", token=token)
-                self._send(token, next(seqs), 0.0)
-                self._move(token, seqs, 0.1)
-                self._query("release", token=token)
+                self._query("renew", held.question("renew"))
+                self._send(held, 0.0)
+                self._move(held, 0.1)
+                self._query("release", held.question("release"))
             case "expire":
                 time.sleep(LEASE_S * 1.2)
-                self._move(token, seqs, 0.03)
+                self._move(held, 0.03)
 
-    def _move(self, token: bytes, seqs: itertools.count[int], seconds: float) -> None:
+    def _move(self, held: Holder, seconds: float) -> None:
         ends_at = time.monotonic() + seconds
         while time.monotonic() < ends_at:
-            seq = next(seqs)
-            self._send(token, seq, (self._asked * _NUMBERS + seq % _NUMBERS) / SCALE)
+            self._send(held, (self._asked * _NUMBERS + (held.seq + 1) % _NUMBERS) / SCALE)
             time.sleep(self._rng.uniform(0.005, 0.03))
 
-    def _send(self, token: bytes, seq: int, speed: float) -> None:
+    def _send(self, held: Holder, speed: float) -> None:
         """Send a drive; one of the two drives backwards."""
-        forward = speed if self._name == NAMES[0] else -speed
-        self._drive.put(msgpack.packb({"forward": forward}), attachment=authorization(token, seq))
+        payload = msgpack.packb({"forward": speed if self._name == NAMES[0] else -speed})
+        self._drive.put(payload, attachment=held.attachment("drive", payload))
 
     def _stop_robot(self) -> None:
         began = time.time()
         self._stop.put(msgpack.packb({}))
         self._tell("stop", began, {"ok": True})
 
-    def _query(self, how: str, **fields: Any) -> dict[str, Any]:
+    def _query(self, how: str, payload: bytes = b"", **fields: Any) -> dict[str, Any]:
         began = time.time()
-        answer = query(self._session, f"@rpc/control/{how}", **fields)
-        self._tell(how, began, answer)
+        answer = query(self._session, f"@rpc/control/{how}", payload, **fields)
+        self._tell(how.partition("/")[0], began, answer)
         return answer
 
     def _tell(self, what: str, began: float, answer: dict[str, Any]) -> None:
         account = {
             "what": what,
-            "who": f"{self._name} {self._asked}",
+            "who": f"{self._name}.{self._asked}",
             "ok": answer.get("ok", False),
             "answered": bool(answer),
             "reason": answer.get("reason"),
@@ -186,7 +184,7 @@ class Story:
 
 def holder_of(frame: Frame) -> str:
     """Read from a motion which lease it was sent under."""
-    return f"{NAMES[frame.number < 0]} {abs(frame.number) // _NUMBERS}"
+    return f"{NAMES[frame.number < 0]}.{abs(frame.number) // _NUMBERS}"
 
 
 def fight(seconds: float, seed: int = 1) -> Story:

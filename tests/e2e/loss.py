@@ -111,9 +111,9 @@ def configuration(mode: str, endpoints: Iterable[str]) -> zenoh.Config:
     return config
 
 
-def query(session: zenoh.Session, path: str, **fields: Any) -> dict[str, Any]:
+def query(session: zenoh.Session, path: str, payload: bytes = b"", **fields: Any) -> dict[str, Any]:
     """Ask ``fleet/r1/<path>``; {} where nobody answers or the question was refused."""
-    replies = session.get(f"fleet/r1/{path}", payload=msgpack.packb(fields), timeout=1.0)
+    replies = session.get(f"fleet/r1/{path}", payload=payload or msgpack.packb(fields), timeout=1.0)
     answers = [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok]
     return answers[0] if answers else {}
 
@@ -126,11 +126,6 @@ def commander(session: zenoh.Session, path: str) -> zenoh.Publisher:
         congestion_control=zenoh.CongestionControl.DROP if path == "drive" else zenoh.CongestionControl.BLOCK,
         express=True,
     )
-
-
-def authorization(token: bytes, seq: int) -> bytes:
-    """Write what shows that a command is the holder's."""
-    return bytes(msgpack.packb({"token": token, "seq": seq}))
 
 
 def be_router(endpoint: str) -> None:

@@ -31,7 +31,6 @@ from tests.e2e.loss import (
     Result,
     Scene,
     Way,
-    authorization,
     be_measurement,
     commander,
     configuration,
@@ -47,6 +46,7 @@ from tests.e2e.loss import (
     query,
     thaw_driver,
 )
+from tests.proofs import Holder
 
 DEADMAN_S = 0.2
 LEASE_S = 1.0
@@ -57,18 +57,18 @@ FEW = 10
 def be_driver(endpoint: str, deadman_s: float, rate_hz: float, first: int) -> None:
     """Acquire the lease and drive until stdin ends; then leave without a release."""
     with zenoh.open(configuration("client", [endpoint])) as session:
-        alive = f"operator.{session.zid()}"
+        alive = f"operator.driver.{session.zid()}"
         announced = session.liveliness().declare_token(f"fleet/r1/@alive/{alive}")
-        wishes = {"who": f"driver {first}", "deadman_s": deadman_s, "lease_s": LEASE_S, "alive": alive}
+        wishes = {"who": f"driver.{first}", "deadman_s": deadman_s, "lease_s": LEASE_S, "alive": alive}
         lease: dict[str, Any] = {}
         while not lease.get("ok"):
-            lease = query(session, "@rpc/control/acquire", **wishes)
+            lease = query(session, "@rpc/control/acquire/driver", **wishes)
             if select.select([sys.stdin], [], [], 0.0 if lease.get("ok") else 0.02)[0]:
                 return
-        drive = commander(session, "drive")
-        for seq in itertools.count():
-            command = msgpack.packb({"forward": (first + seq) / SCALE})
-            drive.put(command, attachment=authorization(lease["token"], seq))
+        drive, held = commander(session, "drive"), Holder.of(lease)
+        for number in itertools.count(first):
+            command = msgpack.packb({"forward": number / SCALE})
+            drive.put(command, attachment=held.attachment("drive", command))
             if select.select([sys.stdin], [], [], 1 / rate_hz)[0]:
                 break
         announced.undeclare()
@@ -95,7 +95,7 @@ class DriverScene(Scene):
 
 def _take_over(scene: Scene) -> float:
     at = time.monotonic()
-    lease = query(scene.session, "@rpc/control/takeover", who="supervisor", lease_s=LEASE_S)
+    lease = query(scene.session, "@rpc/control/takeover/supervisor", who="supervisor", lease_s=LEASE_S)
     if not lease.get("ok"):
         scene.faults.append(f"takeover refused: {lease}")
     return at

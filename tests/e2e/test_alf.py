@@ -324,16 +324,19 @@ def test_sigterm_stops_the_vehicle_says_end_on_both_links_and_nothing_behind_it(
 
 
 DRIVER = """
-import itertools, sys, time, msgpack, zenoh
+import sys, time, msgpack, zenoh
+from tests.proofs import Holder
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", '["%s"]' % sys.argv[1])
 with zenoh.open(config) as session:
-    (reply,) = session.get("fleet/r1/@rpc/control/acquire", payload=msgpack.packb({"who": "driver"}), timeout=3)
-    token = msgpack.unpackb(reply.ok.payload.to_bytes())["token"]
+    request = msgpack.packb({"who": "driver"})
+    (reply,) = session.get("fleet/r1/@rpc/control/acquire/driver", payload=request, timeout=3)
+    held = Holder.of(msgpack.unpackb(reply.ok.payload.to_bytes()))
     drive = session.declare_publisher("fleet/r1/@cmd/drive")
-    for seq in itertools.count():
-        drive.put(msgpack.packb({"forward": 0.5}), attachment=msgpack.packb({"token": token, "seq": seq}))
+    while True:
+        command = msgpack.packb({"forward": 0.5})
+        drive.put(command, attachment=held.attachment("drive", command))
         time.sleep(0.02)
 """
 

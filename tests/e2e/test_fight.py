@@ -17,7 +17,7 @@ def story() -> Story:
 
 def test_two_drivers_never_move_a_robot_at_the_same_time_and_the_audit_log_tells_all(story: Story) -> None:
     assert not faults(story), story
-    holders = {holder_of(frame).split()[0] for frame in story.frames if frame.moves}
+    holders = {holder_of(frame).split(".")[0] for frame in story.frames if frame.moves}
     assert holders == {"anna", "bert"}
     events = {line["event"] for line in story.audit}
     assert events == {"acquired", "taken over", "released", "ended", "stopped", "refused"}

@@ -233,7 +233,7 @@ def test_of_two_programs_the_holder_drives_until_the_other_takes_over(bench: Ben
     until(lambda: established(bench))
     fleet, other = bench.fleet, Fleet(bench.fleet.session)
     fleet.hold("r1", "first")
-    assert [denied["holder"] for denied in fleet.get("fleet/r1/@rpc/control/acquire", who="second")] == ["first"]
+    assert [denied["holder"] for denied in fleet.get("fleet/r1/@rpc/control/acquire/second", who="second")] == ["first"]
     other.put("r1/@cmd/drive", forward=0.5)
     until(lambda: "no lease: acquire first" in refusals(bench), what="refusal")
     assert not robot.packets(11)
@@ -256,9 +256,10 @@ def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_wa
 ) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
-    (text,) = bench.fleet.get("fleet/r1/@rpc/control/acquire", priority=1)
-    assert text.startswith("Acquire: ")
-    assert "who" in text
+    (error,) = bench.fleet.get("fleet/r1/@rpc/control/acquire/me", priority=1)
+    assert error["code"] == "malformed"
+    assert error["reason"].startswith("Acquire: ")
+    assert "who" in error["reason"]
 
 
 def test_limits_and_the_audit_log_are_as_configured(bench: Bench, robot: ScriptedRobot) -> None:
@@ -285,7 +286,8 @@ def stops_since(robot: ScriptedRobot, since: float) -> list[tuple[float, bytes]]
 
 
 DRIVER = """
-import itertools, sys, time, msgpack, zenoh
+import sys, time, msgpack, zenoh
+from tests.proofs import Holder
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", '["%s"]' % sys.argv[1])
@@ -294,11 +296,12 @@ with zenoh.open(config) as session:
     if len(sys.argv) > 2:
         alive = session.liveliness().declare_token("fleet/r1/@alive/" + sys.argv[2])
         request["alive"] = sys.argv[2]
-    (reply,) = session.get("fleet/r1/@rpc/control/acquire", payload=msgpack.packb(request), timeout=3)
-    token = msgpack.unpackb(reply.ok.payload.to_bytes())["token"]
+    (reply,) = session.get("fleet/r1/@rpc/control/acquire/driver", payload=msgpack.packb(request), timeout=3)
+    held = Holder.of(msgpack.unpackb(reply.ok.payload.to_bytes()))
     drive = session.declare_publisher("fleet/r1/@cmd/drive")
-    for seq in itertools.count():
-        drive.put(msgpack.packb({"forward": 0.5}), attachment=msgpack.packb({"token": token, "seq": seq}))
+    while True:
+        command = msgpack.packb({"forward": 0.5})
+        drive.put(command, attachment=held.attachment("drive", command))
         time.sleep(0.02)
 """
 
@@ -349,7 +352,9 @@ def test_refusals_show_on_control(bench: Bench, robot: ScriptedRobot) -> None:
     until(lambda: len(refusals(bench)) == 5, what="five refusals")
     reasons = refusals(bench)
     assert {entry["command"] for entry in reasons.values()} == {"drive", "camera", "raw/tcpudp", "dance"}
-    assert {entry["who"] for entry in reasons.values()} == {"hq"}
+    proven = {entry["command"] for entry in reasons.values() if entry["who"] == "hq"}
+    assert proven == {"drive", "raw/tcpudp"}, "of commands that need no lease nobody looks at the proof"
+    assert {entry["who"] for entry in reasons.values()} == {"hq", None}
     assert any("<= 1.0" in reason for reason in reasons)
     assert not robot.packets(11)
     assert not robot.packets(70)

@@ -334,17 +334,19 @@ def test_a_robot_of_54_devices_and_a_second_on_another_port(bench: Bench, robots
 # Who may drive
 
 DRIVER = """
-import itertools, sys, time, msgpack, zenoh
+import sys, time, msgpack, zenoh
+from tests.proofs import Holder
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", '["%s"]' % sys.argv[1])
 with zenoh.open(config) as session:
-    (reply,) = session.get("fleet/r1/@rpc/control/acquire", payload=msgpack.packb({"who": "driver"}), timeout=3)
-    token = msgpack.unpackb(reply.ok.payload.to_bytes())["token"]
+    request = msgpack.packb({"who": "driver"})
+    (reply,) = session.get("fleet/r1/@rpc/control/acquire/driver", payload=request, timeout=3)
+    held = Holder.of(msgpack.unpackb(reply.ok.payload.to_bytes()))
     command = session.declare_publisher("fleet/r1/@cmd/" + sys.argv[2])
-    for seq in itertools.count():
-        field = {"forward": 0.5} if sys.argv[2] == "drive" else {"value": 5.0}
-        command.put(msgpack.packb(field), attachment=msgpack.packb({"token": token, "seq": seq}))
+    payload = msgpack.packb({"forward": 0.5} if sys.argv[2] == "drive" else {"value": 5.0})
+    while True:
+        command.put(payload, attachment=held.attachment(sys.argv[2], payload))
         time.sleep(0.02)
 """
 

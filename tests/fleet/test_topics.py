@@ -45,10 +45,10 @@ TABLE = [
     ("@cmd/raw/tcpudp", messages.Raw, Delivery.COMMAND),
     ("@rpc/map", messages.Query, Delivery.QUERY),
     ("@rpc/pose", messages.Query, Delivery.QUERY),
-    ("@rpc/control/acquire", messages.Acquire, Delivery.QUERY),
-    ("@rpc/control/takeover", messages.Acquire, Delivery.QUERY),
-    ("@rpc/control/renew", messages.LeaseToken, Delivery.QUERY),
-    ("@rpc/control/release", messages.LeaseToken, Delivery.QUERY),
+    ("@rpc/control/acquire/op1", messages.Acquire, Delivery.QUERY),
+    ("@rpc/control/takeover/user%40host", messages.Acquire, Delivery.QUERY),
+    ("@rpc/control/renew", messages.Authorization, Delivery.QUERY),
+    ("@rpc/control/release", messages.Authorization, Delivery.QUERY),
 ]
 
 
@@ -60,7 +60,8 @@ def test_every_key_of_the_design_is_known(path: str, message: type[messages.Flee
 @pytest.mark.parametrize(
     "path",
     ["", "/", "scans", "Scan", "scan/", "sensor", "sensor/", "sensor/a/b", "@cmd", "@cmd/", "@cmd/fly", "cmd/drive"]
-    + ["@rpc/control", "@rpc/control/", "@rpc/control/steal", "@rpc/acquire", "control/acquire"],
+    + ["@rpc/control", "@rpc/control/", "@rpc/control/steal", "@rpc/acquire", "control/acquire"]
+    + ["@rpc/control/acquire", "@rpc/control/takeover", "@rpc/control/renew/op1"],
 )
 def test_other_paths_are_not(path: str) -> None:
     assert find(path) is None
@@ -137,6 +138,40 @@ def test_a_family_escapes_its_names() -> None:
     assert find("sensor/front%20left") == topics.SENSOR("front left")
     assert topics.SENSOR("").path == "sensor/%"
     assert find("sensor/%") == topics.SENSOR("")
+
+
+@pytest.mark.parametrize(
+    ("who", "chunk", "may"),
+    [
+        ("op1", "op1", True),
+        ("op1.laptop", "op1", True),
+        ("op1.laptop.2", "op1", True),
+        ("op1.laptop.2", "op1.laptop", True),
+        ("hq.desk.3", "hq.desk", True),
+        ("user@host", "user%40host", True),
+        ("user@host.example.org", "user%40host", True),
+        ("op12", "op1", False),
+        ("op1", "op1.laptop", False),
+        ("op2.op1", "op1", False),
+        ("", "op1", False),
+        ("op1", "%", False),
+        (".x", "%", False),
+        ("op1", "*", False),
+        ("op1", "$*", False),
+        ("op1", "%6Fp1", False),  # there is one way to write a name: rules need not know of others
+        ("user@host", "user@host", False),
+        ("OP1", "op1", False),
+    ],
+)
+def test_a_program_speaks_in_the_name_that_it_asks_at(who: str, chunk: str, may: bool) -> None:
+    assert topics.speaks_for(who, chunk) is may
+
+
+@pytest.mark.parametrize(
+    ("key", "concrete"), [("fleet/r1/@cmd/stop", True), ("fleet/*/@cmd/stop", False), ("**", False), ("a$*b", False)]
+)
+def test_a_key_is_told_from_an_expression(key: str, concrete: bool) -> None:
+    assert topics.is_concrete(key) is concrete
 
 
 @pytest.mark.parametrize(

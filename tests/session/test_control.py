@@ -4,21 +4,35 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import msgpack
 import msgspec
 import pytest
 
-from zbridge.errors import Code, NotReady, Refused
-from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
-from zbridge.session.control import ENDED, LEAST_S, REFUSALS, TOKEN_BYTES, Authority, Event, What
+from tests.proofs import numbered, proof, shown
+from zbridge.errors import Code, Held, LeaseLost, Malformed, NotReady, Refused
+from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
+from zbridge.session.control import ENDED, LEAST_S, REFUSALS, Authority, Event, What
 
 NOW = 100.0
 LEASE_S, DEADMAN_S = 3.0, 2.0
 """The most a holder may ask for."""
-ANN, BOB = b"\x01" * TOKEN_BYTES, b"\x02" * TOKEN_BYTES
-"""The first and the second token of an authority. Ann has, or had, the lease; Bob asks for it."""
-FORGED = b"\xff" * TOKEN_BYTES
+DRIVE = "fleet/r1/@cmd/drive"
+RENEW, RELEASE = "fleet/r1/@rpc/control/renew", "fleet/r1/@rpc/control/release"
+PAYLOAD = b"\x81\xa7forward\x01"
+
+
+class Given(NamedTuple):
+    """What was given with a lease."""
+
+    lease: bytes
+    token: bytes
+
+
+ANN, BOB = Given(b"\x01" * 8, b"\x01" * 32), Given(b"\x02" * 8, b"\x02" * 32)
+"""The first and the second lease of an authority. Ann has, or had, the first; Bob asks for it."""
+FORGED = Given(b"\xff" * 8, b"\xff" * 32)
 ALIVE = "ann.1"
 SEQ = 7
 """The number of Ann's last command."""
@@ -29,12 +43,11 @@ Does = Callable[[Authority], object]
 
 
 def new() -> Authority:
-    tokens = itertools.count(1)
-    return Authority(LEASE_S, DEADMAN_S, lambda: bytes([next(tokens)]) * TOKEN_BYTES)
+    return Authority(LEASE_S, DEADMAN_S, numbered())
 
 
 def released() -> Authority:
-    return after(held(), lambda authority: authority.release(ANN, NOW))
+    return after(held(), release(ANN))
 
 
 def held() -> Authority:
@@ -83,9 +96,17 @@ def after(authority: Authority, *done: Does) -> Authority:
     return authority
 
 
-def attach(token: bytes, seq: int) -> bytes:
-    attachment: bytes = msgpack.packb({"token": token, "seq": seq})
-    return attachment
+def attach(given: Given, seq: int, key: str = DRIVE, payload: bytes = PAYLOAD) -> bytes:
+    return shown(given.lease, given.token, key, seq, payload)
+
+
+_questions = itertools.count(1)
+
+
+def asking(given: Given, seq: int | None = None, key: str = RENEW) -> Authorization:
+    """What is asked with by who was given this; with the next number where it says none."""
+    seq = next(_questions) if seq is None else seq
+    return Authorization(lease=given.lease, seq=seq, proof=proof(given.token, key, seq))
 
 
 def acquire(priority: int = 0, now: float = NOW) -> Does:
@@ -96,16 +117,21 @@ def takeover(priority: int = 0, now: float = NOW) -> Does:
     return lambda authority: authority.takeover(Acquire(who="bob", priority=priority), now)
 
 
-def renew(token: bytes, now: float = NOW) -> Does:
-    return lambda authority: authority.renew(token, now)
+def renew(given: Given, now: float = NOW) -> Does:
+    return lambda authority: authority.renew(asking(given), RENEW, now)
 
 
-def release(token: bytes, now: float = NOW) -> Does:
-    return lambda authority: authority.release(token, now)
+def release(given: Given, now: float = NOW) -> Does:
+    return lambda authority: authority.release(asking(given, key=RELEASE), RELEASE, now)
 
 
 def admit(attachment: bytes | None, now: float = NOW) -> Does:
-    return lambda authority: authority.admit(attachment, now)
+    return lambda authority: authority.admit(attachment, DRIVE, PAYLOAD, now)
+
+
+def held_lease(authority: Authority) -> bytes | None:
+    """The lease that is held, as those who sort what comes in see it."""
+    return authority.verifier.lease if authority.verifier is not None else None
 
 
 def ended(reason: str, *, stops: bool, what: What = What.ENDED) -> Event:
@@ -120,7 +146,7 @@ def test_the_states_to_start_from_are_what_they_are_called(state: str) -> None:
     authority = STATES[state]()
     assert authority.state == STATE[state]
     assert authority.moving is (state in IN_MOTION)
-    assert authority.token == (ANN if state in HELD else None)
+    assert held_lease(authority) == (ANN.lease if state in HELD else None)
     assert authority.events() == []
 
 
@@ -128,8 +154,9 @@ def test_the_states_to_start_from_are_what_they_are_called(state: str) -> None:
 def test_whoever_asks_first_is_given_a_robot_that_nobody_holds(state: str) -> None:
     authority = STATES[state]()
     lease = authority.acquire(Acquire(who="bob", priority=-1), NOW)
-    assert lease == Lease(ok=True, token=authority.token, expires_in_s=LEASE_S, holder="bob")
-    assert lease.token == (ANN if state == "new" else BOB)
+    given = ANN if state == "new" else BOB
+    assert lease == Lease(ok=True, lease=given.lease, token=given.token, expires_in_s=LEASE_S, holder="bob")
+    assert held_lease(authority) == given.lease
     assert authority.events() == [Event(What.ACQUIRED, "bob", priority=-1)]
     assert authority.state == "held"
     assert not authority.moving
@@ -143,13 +170,13 @@ def test_a_robot_that_is_held_is_not_given_for_the_same_or_a_lower_priority(stat
     before = repr(authority), authority.moving, authority.deadline()
     reason = "held by ann (priority 5)"
     lease = authority.acquire(Acquire(who="bob", priority=priority), NOW)
-    assert lease == Lease(ok=False, expires_in_s=LEASE_S, holder="ann", reason=reason)
+    assert lease == Lease(ok=False, expires_in_s=LEASE_S, holder="ann", reason=reason, code="held")
     assert authority.events() == [Event(What.REFUSED, "bob", reason, command="acquire", code=Code.HELD)]
     assert authority.report(NOW).refusals == (
         Refusal(who="bob", command="acquire", code="held", reason=reason, count=1),
     )
     assert (repr(authority), authority.moving, authority.deadline()) == before
-    assert authority.admit(attach(ANN, SEQ + 1), NOW) == "ann"
+    assert admit(attach(ANN, SEQ + 1))(authority) == "ann"
 
 
 @pytest.mark.parametrize("state", HELD)
@@ -160,7 +187,7 @@ def test_a_higher_priority_or_a_takeover_stops_what_moves_before_it_gives_the_le
     state: str, asks: Does, what: What, priority: int
 ) -> None:
     authority = STATES[state]()
-    assert asks(authority) == Lease(ok=True, token=BOB, expires_in_s=LEASE_S, holder="bob")
+    assert asks(authority) == Lease(ok=True, lease=BOB.lease, token=BOB.token, expires_in_s=LEASE_S, holder="bob")
     assert authority.events() == [
         ended("taken over by bob", stops=state in IN_MOTION),
         Event(what, "bob", priority=priority),
@@ -168,14 +195,15 @@ def test_a_higher_priority_or_a_takeover_stops_what_moves_before_it_gives_the_le
     assert not authority.moving
     authority.require_motion()
     assert refusal(authority, attach(ANN, SEQ + 1)) == "the lease has ended (taken over by bob)"
-    assert authority.admit(attach(BOB, 0), NOW) == "bob"
+    assert admit(attach(BOB, 0))(authority) == "bob"
 
 
 @pytest.mark.parametrize("state", NOT_HELD)
 def test_a_takeover_of_a_robot_that_nobody_holds_is_granted(state: str) -> None:
     authority = STATES[state]()
     lease = authority.takeover(Acquire(who="bob", priority=2), NOW)
-    assert lease == Lease(ok=True, token=authority.token, expires_in_s=LEASE_S, holder="bob")
+    given = ANN if state == "new" else BOB
+    assert lease == Lease(ok=True, lease=given.lease, token=given.token, expires_in_s=LEASE_S, holder="bob")
     assert authority.events() == [Event(What.TAKEN_OVER, "bob", priority=2)]
 
 
@@ -190,14 +218,14 @@ def test_a_takeover_is_granted_whatever_its_priority(state: str) -> None:
 def test_the_holder_renews_and_its_lease_begins_anew(state: str) -> None:
     authority = STATES[state]()
     authority.applied("drive", NOW, moving=False)
-    assert authority.renew(ANN, NOW + 0.25) == Lease(ok=True, expires_in_s=LEASE_S, holder="ann")
+    assert authority.renew(asking(ANN), RENEW, NOW + 0.25) == Lease(ok=True, expires_in_s=LEASE_S, holder="ann")
     assert authority.events() == []
     assert authority.deadline() == NOW + 0.25 + LEASE_S
 
 
 def test_renewing_does_not_feed_the_deadman() -> None:
     authority = moving()
-    authority.renew(ANN, NOW + 0.25)
+    authority.renew(asking(ANN), RENEW, NOW + 0.25)
     assert authority.deadline() == NOW + WAIT_S
 
 
@@ -207,7 +235,7 @@ def test_renewing_does_not_feed_the_deadman() -> None:
 )
 def test_the_holder_releases_and_what_moves_is_stopped(state: str, event: Event) -> None:
     authority = STATES[state]()
-    assert authority.release(ANN, NOW) == Lease(ok=True)
+    assert authority.release(asking(ANN, key=RELEASE), RELEASE, NOW) == Lease(ok=True)
     assert authority.events() == [event]
     assert authority.state == "free"
     assert not authority.moving
@@ -216,42 +244,101 @@ def test_the_holder_releases_and_what_moves_is_stopped(state: str, event: Event)
 
 
 WHY_NOT = [
-    ("new", ANN, "no lease: acquire first"),
-    ("released", ANN, "the lease has ended (released)"),
-    ("stopped", ANN, "the lease has ended (stop)"),
-    *((state, FORGED, "no lease: acquire first") for state in NOT_HELD),
-    *((state, token, "held by ann (priority 5)") for state in HELD for token in (FORGED, b"", ANN[1:], ANN + ANN)),
+    ("new", ANN, "no lease: acquire first", "no_lease"),
+    ("released", ANN, "the lease has ended (released)", "lease_ended"),
+    ("stopped", ANN, "the lease has ended (stop)", "lease_ended"),
+    *((state, FORGED, "no lease: acquire first", "no_lease") for state in NOT_HELD),
+    *((state, FORGED, "held by ann (priority 5)", "held") for state in HELD),
+    *((state, Given(ANN.lease, FORGED.token), "wrong proof", "malformed") for state in (*HELD, "released", "stopped")),
 ]
 
 
-@pytest.mark.parametrize(("state", "token", "reason"), WHY_NOT)
+@pytest.mark.parametrize(("state", "given", "reason", "code"), WHY_NOT)
 @pytest.mark.parametrize("asks", [renew, release])
-def test_nobody_else_renews_or_releases(state: str, token: bytes, reason: str, asks: Callable[[bytes], Does]) -> None:
+def test_nobody_else_renews_or_releases(
+    state: str, given: Given, reason: str, code: str, asks: Callable[[Given], Does]
+) -> None:
     authority = STATES[state]()
     before = repr(authority), authority.moving, authority.deadline()
-    who, left_s = ("ann", LEASE_S) if state in HELD else (None, None)
-    assert asks(token)(authority) == Lease(ok=False, expires_in_s=left_s, holder=who, reason=reason)
-    assert authority.events() == []
+    holder, left_s = ("ann", LEASE_S) if state in HELD else (None, None)
+    assert asks(given)(authority) == Lease(ok=False, expires_in_s=left_s, holder=holder, reason=reason, code=code)
+    who = "ann" if code == "lease_ended" else None
+    assert authority.events() == [Event(What.REFUSED, who, reason, command=asks.__name__, code=Code(code))]
     assert (repr(authority), authority.moving, authority.deadline()) == before
+
+
+@pytest.mark.parametrize("name", ["renew", "release"])
+def test_a_question_is_taken_once_and_only_for_the_key_it_was_asked_at(name: str) -> None:
+    authority = held()
+    asks = getattr(authority, name)
+    key = f"fleet/r1/@rpc/control/{name}"
+    other = f"fleet/r2/@rpc/control/{name}"
+    for wrong in (
+        asking(ANN, 900, other),
+        asking(ANN, 900, DRIVE),
+        asking(ANN, 900, RENEW + "/"),
+        asking(BOB, 900, key),
+    ):
+        assert asks(wrong, key, NOW).code in ("malformed", "held")
+    renewed = authority.renew(asking(ANN, 800), RENEW, NOW)
+    assert renewed.ok, "what was refused used no number up"
+    repeated = authority.renew(asking(ANN, 800), RENEW, NOW)
+    assert (repeated.ok, repeated.code, repeated.reason) == (False, "out_of_order", "repeated or out of order")
+    assert not authority.release(asking(ANN, 799, RELEASE), RELEASE, NOW).ok, "they share their numbers"
+    assert authority.state == "held"
+    assert [(refused.who, refused.code) for refused in authority.report(NOW).refusals][-1] == (None, "out_of_order")
+    assert authority.release(asking(ANN, 801, RELEASE), RELEASE, NOW).ok
+
+
+def test_questions_and_commands_are_numbered_apart() -> None:
+    authority = held()
+    assert authority.renew(asking(ANN, 2**63), RENEW, NOW).ok
+    assert admit(attach(ANN, SEQ + 1))(authority) == "ann"
+    assert not authority.renew(asking(ANN, SEQ + 2), RENEW, NOW).ok
+
+
+def test_a_command_is_no_question_and_a_question_no_command() -> None:
+    authority = held()
+    as_question = proof(ANN.token, DRIVE, 900)
+    assert authority.renew(Authorization(lease=ANN.lease, seq=900, proof=as_question), RENEW, NOW).code == "malformed"
+    assert refusal(authority, attach(ANN, 900, RENEW, b"")) == "wrong proof"
 
 
 def test_no_answer_but_the_grant_shows_a_token() -> None:
     authority = new()
-    given = authority.acquire(Acquire(who="ann"), NOW)
-    assert given.token is not None
+    granted = authority.acquire(Acquire(who="ann"), NOW)
+    assert (granted.lease, granted.token) == ANN
     answers = [asks(authority) for asks in (acquire(), renew(ANN), renew(FORGED), release(FORGED), release(ANN))]
     assert [answer.token for answer in answers if isinstance(answer, Lease)] == [None] * 5
 
 
-def test_every_lease_has_a_token_of_its_own() -> None:
+def test_every_lease_has_an_id_and_a_token_of_its_own() -> None:
     authority = new()
-    tokens = [authority.takeover(Acquire(who="ann"), NOW).token for _ in range(5)]
-    assert len(set(tokens)) == 5
+    leases = [authority.takeover(Acquire(who="ann"), NOW) for _ in range(5)]
+    assert len({lease.token for lease in leases}) == len({lease.lease for lease in leases}) == 5
+
+
+def test_an_id_is_not_given_again_while_its_lease_is_remembered_whatever_chance_says() -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, lambda size: b"\xff" * size)
+    ids = [authority.takeover(Acquire(who="ann"), NOW).lease for _ in range(ENDED + 1)]
+    assert ids[:3] == [b"\xff" * 8, b"\x00" * 8, b"\x00" * 7 + b"\x01"]
+    assert len(set(ids)) == ENDED + 1
+
+
+def test_the_token_has_32_bytes_and_the_id_8() -> None:
+    sizes: list[int] = []
+
+    def random(size: int) -> bytes:
+        sizes.append(size)
+        return bytes(size)
+
+    Authority(LEASE_S, DEADMAN_S, random).acquire(Acquire(who="ann"), NOW)
+    assert sorted(sizes) == [8, 32]
 
 
 def test_a_holder_that_takes_over_from_itself_has_lost_its_old_token() -> None:
     authority = moving()
-    assert authority.takeover(Acquire(who="ann", priority=5), NOW).token == BOB
+    assert authority.takeover(Acquire(who="ann", priority=5), NOW).token == BOB.token
     assert [(event.what, event.stops) for event in authority.events()] == [
         (What.ENDED, True),
         (What.TAKEN_OVER, False),
@@ -278,7 +365,7 @@ def test_a_wish_for_the_lease_is_capped(wish_s: float | None, given_s: float) ->
     authority = new()
     assert authority.acquire(Acquire(who="ann", lease_s=wish_s), NOW).expires_in_s == given_s
     assert authority.deadline() == NOW + given_s
-    assert authority.renew(ANN, NOW).expires_in_s == given_s
+    assert authority.renew(asking(ANN), RENEW, NOW).expires_in_s == given_s
 
 
 @pytest.mark.parametrize(
@@ -295,7 +382,7 @@ def test_a_wish_for_the_lease_is_capped(wish_s: float | None, given_s: float) ->
 def test_a_wish_for_the_deadman_is_capped(wish_s: float | None, given_s: float) -> None:
     authority = new()
     authority.acquire(Acquire(who="ann", deadman_s=wish_s), NOW)
-    authority.admit(attach(ANN, 0), NOW)
+    admit(attach(ANN, 0))(authority)
     authority.applied("drive", NOW, moving=True)
     assert authority.deadline() == NOW + given_s
 
@@ -308,24 +395,24 @@ NO_TIME = [0.0, -0.0, -1.0, -math.inf, math.nan, math.nextafter(LEAST_S, 0)]
 @pytest.mark.parametrize("wish_s", NO_TIME)
 def test_what_is_no_time_is_refused_and_leaves_everything_as_it_was(state: str, field: str, wish_s: float) -> None:
     authority = STATES[state]()
-    before = repr(authority), authority.moving, authority.deadline(), authority.token
+    before = repr(authority), authority.moving, authority.deadline(), held_lease(authority)
     request = msgspec.structs.replace(Acquire(who="bob", priority=9), **{field: wish_s})
     lease = authority.takeover(request, NOW)
     assert not lease.ok
     assert lease.token is None
     assert lease.reason == f"{field} = {wish_s:g}: expected at least {LEAST_S:g}"
     assert [event.what for event in authority.events()] == [What.REFUSED]
-    assert (repr(authority), authority.moving, authority.deadline(), authority.token) == before
+    assert (repr(authority), authority.moving, authority.deadline(), held_lease(authority)) == before
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_nobody_without_a_name_is_given_a_robot(state: str) -> None:
     authority = STATES[state]()
-    before = repr(authority), authority.moving, authority.deadline(), authority.token
+    before = repr(authority), authority.moving, authority.deadline(), held_lease(authority)
     lease = authority.acquire(Acquire(who="", priority=9), NOW)
     assert (lease.ok, lease.token) == (False, None)
     assert lease.reason == "who = '': expected a name that others are shown"
-    assert (repr(authority), authority.moving, authority.deadline(), authority.token) == before
+    assert (repr(authority), authority.moving, authority.deadline(), held_lease(authority)) == before
 
 
 @pytest.mark.parametrize("who", ["two\nlines", "\x1b[2J", "\x00", "\u2028", "\u202e", "a" * 100 + "\n"])
@@ -349,18 +436,23 @@ def test_a_refused_wish_is_shown_as_the_command_it_was(ask: str) -> None:
 # Commands
 
 
+def refused(authority: Authority, attachment: bytes | None, now: float = NOW) -> Refused:
+    """Give how a command is refused."""
+    with pytest.raises(Refused) as raised:
+        authority.admit(attachment, DRIVE, PAYLOAD, now)
+    return raised.value
+
+
 def refusal(authority: Authority, attachment: bytes | None, now: float = NOW) -> str:
     """Give the reason for which a command is refused."""
-    with pytest.raises(Refused) as refused:
-        authority.admit(attachment, now)
-    return str(refused.value)
+    return str(refused(authority, attachment, now))
 
 
 @pytest.mark.parametrize("state", HELD)
 @pytest.mark.parametrize("seq", [SEQ + 1, SEQ + 1000, 2**64 - 1])
 def test_the_holders_next_command_is_admitted_once(state: str, seq: int) -> None:
     authority = STATES[state]()
-    assert authority.admit(attach(ANN, seq), NOW) == "ann"
+    assert admit(attach(ANN, seq))(authority) == "ann"
     assert refusal(authority, attach(ANN, seq)) == "repeated or out of order"
     assert authority.events() == []
 
@@ -374,13 +466,13 @@ def test_a_repeated_or_late_command_is_refused(state: str, seq: int) -> None:
 def test_the_first_number_may_be_zero() -> None:
     authority = new()
     authority.acquire(Acquire(who="ann"), NOW)
-    assert authority.admit(attach(ANN, 0), NOW) == "ann"
+    assert admit(attach(ANN, 0))(authority) == "ann"
 
 
 def test_numbers_begin_anew_with_each_lease() -> None:
     authority = moving()
     authority.takeover(Acquire(who="bob"), NOW)
-    assert authority.admit(attach(BOB, 0), NOW) == "bob"
+    assert admit(attach(BOB, 0))(authority) == "bob"
 
 
 @pytest.mark.parametrize("state", STATES)
@@ -388,52 +480,153 @@ def test_a_command_without_an_attachment_is_refused(state: str) -> None:
     assert refusal(STATES[state](), None) == "no lease: acquire first"
 
 
+WHOLE = {"lease": ANN.lease, "seq": 9, "proof": proof(ANN.token, DRIVE, 9, PAYLOAD)}
+
+
+def wrong(**fields: object) -> bytes:
+    """The attachment that would be right but for these fields."""
+    attachment: bytes = msgpack.packb({**WHOLE, **fields})
+    return attachment
+
+
 MALFORMED = {
     "empty": b"",
-    "no map": msgpack.packb([ANN, 9]),
+    "no map": msgpack.packb([*WHOLE.values()]),
     "nil": msgpack.packb(None),
-    "the bare token": ANN,
-    "no token": msgpack.packb({"seq": 9}),
-    "no number": msgpack.packb({"token": ANN}),
-    "a token as text": msgpack.packb({"token": ANN.decode(), "seq": 9}),
-    "a negative number": msgpack.packb({"token": ANN, "seq": -1}),
-    "a fraction": msgpack.packb({"token": ANN, "seq": 9.5}),
-    "a truth": msgpack.packb({"token": ANN, "seq": True}),
+    "the bare token": ANN.token,
+    "as it was before": msgpack.packb({"token": ANN.token, "seq": 9}),
+    **{f"no {name}": msgpack.packb({**WHOLE, "x": 0, name: None}) for name in WHOLE},
+    **{f"{name} is not there": msgpack.packb({key: WHOLE[key] for key in WHOLE if key != name}) for name in WHOLE},
+    "a lease as text": wrong(lease=ANN.lease.decode()),
+    "a short lease": wrong(lease=ANN.lease[1:]),
+    "a long lease": wrong(lease=ANN.lease + b"\x01"),
+    "a short proof": wrong(proof=proof(ANN.token, DRIVE, 9, PAYLOAD)[:15]),
+    "no proof at all": wrong(proof=b""),
+    "a longer proof": wrong(proof=proof(ANN.token, DRIVE, 9, PAYLOAD) + b"\x00"),
+    "a proof as text": wrong(proof="0123456789abcdef"),
+    "a negative number": wrong(seq=-1),
+    "a fraction": wrong(seq=9.5),
+    "a truth": wrong(seq=True),
     "cut": attach(ANN, 9)[:-1],
     "more behind it": attach(ANN, 9) + b"\x00",
+    "much beside it": wrong(x=bytes(200)),
     "deeply nested": b"\x91" * 100_000 + b"\xc0",
-    "deeply nested aside": attach(ANN, 9).replace(b"\x82", b"\x83", 1) + b"\xa1x" + b"\x91" * 100_000 + b"\xc0",
+    "deeply nested but short": attach(ANN, 9).replace(b"\x83", b"\x84", 1) + b"\xa1x" + b"\x91" * 60,
 }
 
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("attachment", MALFORMED.values(), ids=MALFORMED)
 def test_a_malformed_attachment_is_refused(state: str, attachment: bytes) -> None:
-    authority = STATES[state]()
-    assert refusal(authority, attachment) == "malformed attachment: expected {token, seq}"
-    assert authority.owner(attachment) is None
+    how = refused(STATES[state](), attachment)
+    assert isinstance(how, Malformed)
+    assert (how.code, str(how), how.who) == (
+        Code.MALFORMED,
+        "malformed authorization: expected {lease, seq, proof}",
+        None,
+    )
 
 
 @pytest.mark.parametrize("size", range(len(attach(ANN, 9))))
 def test_an_attachment_cut_anywhere_is_refused(size: int) -> None:
-    assert refusal(held(), attach(ANN, 9)[:size]) == "malformed attachment: expected {token, seq}"
+    assert refused(held(), attach(ANN, 9)[:size]).code == "malformed"
 
 
-@pytest.mark.parametrize(("state", "token", "reason"), WHY_NOT)
-def test_a_command_with_another_token_is_refused_with_the_reason(state: str, token: bytes, reason: str) -> None:
-    assert refusal(STATES[state](), attach(token, SEQ + 1)) == reason
+def test_whatever_order_its_fields_have_and_however_long_they_are_written_an_attachment_is_read() -> None:
+    backwards: bytes = msgpack.packb(dict(reversed(WHOLE.items())))
+    assert admit(backwards)(held()) == "ann"
+    (lease, proven) = (bytes([0xC6, 0, 0, 0, len(value)]) + value for value in (ANN.lease, WHOLE["proof"]))  # type: ignore[arg-type]
+    number = b"\xcf" + bytes(7) + b"\x09"
+    long = b"\xdf\0\0\0\x03" + b"\xda\0\5lease" + lease + b"\xda\0\3seq" + number + b"\xda\0\5proof" + proven
+    assert admit(long)(held()) == "ann"
+    assert admit(wrong(more="to come"))(held()) == "ann", "readers bear what they do not know"
 
 
-@pytest.mark.parametrize("bit", range(8 * TOKEN_BYTES))
+@pytest.mark.parametrize(("state", "given", "reason", "code"), WHY_NOT)
+def test_a_command_with_another_lease_is_refused_with_the_reason(
+    state: str, given: Given, reason: str, code: str
+) -> None:
+    how = refused(STATES[state](), attach(given, SEQ + 1))
+    assert (str(how), how.code) == (reason, code)
+    assert how.holder == ("ann" if how.code == "held" else None)
+
+
+@pytest.mark.parametrize("bit", range(8 * 16))
+def test_a_proof_with_one_bit_changed_drives_nothing(bit: int) -> None:
+    near = (int.from_bytes(proof(ANN.token, DRIVE, 9, PAYLOAD), "big") ^ 1 << bit).to_bytes(16, "big")
+    assert refused(held(), wrong(proof=near)).code == "malformed"
+
+
+@pytest.mark.parametrize("bit", range(8 * 32))
 def test_a_token_with_one_bit_changed_drives_nothing(bit: int) -> None:
-    token = (int.from_bytes(ANN, "big") ^ 1 << bit).to_bytes(TOKEN_BYTES, "big")
-    assert refusal(held(), attach(token, SEQ + 1)) == "held by ann (priority 5)"
+    token = (int.from_bytes(ANN.token, "big") ^ 1 << bit).to_bytes(32, "big")
+    assert refusal(held(), attach(Given(ANN.lease, token), SEQ + 1)) == "wrong proof"
+
+
+OVERHEARD = attach(ANN, SEQ + 1)
+"""Ann's next command, as whoever listens sees it."""
+ALTERED = {
+    "another payload": (OVERHEARD, DRIVE, PAYLOAD[:-1] + b"\x00"),
+    "a longer payload": (OVERHEARD, DRIVE, PAYLOAD + b"\x00"),
+    "no payload": (OVERHEARD, DRIVE, b""),
+    "another command": (OVERHEARD, "fleet/r1/@cmd/mode", PAYLOAD),
+    "another robot": (OVERHEARD, "fleet/r2/@cmd/drive", PAYLOAD),
+    "another realm": (OVERHEARD, "flee/r1/@cmd/drive", PAYLOAD),
+    "a higher number": (wrong(seq=SEQ + 2, proof=proof(ANN.token, DRIVE, SEQ + 1, PAYLOAD)), DRIVE, PAYLOAD),
+    "the highest number": (wrong(seq=2**64 - 1, proof=proof(ANN.token, DRIVE, SEQ + 1, PAYLOAD)), DRIVE, PAYLOAD),
+    "a byte moved from key to payload": (OVERHEARD, DRIVE[:-1], DRIVE[-1:].encode() + PAYLOAD),
+}
+
+
+@pytest.mark.parametrize(("attachment", "key", "payload"), ALTERED.values(), ids=ALTERED)
+def test_what_was_overheard_and_altered_is_refused_and_costs_the_holder_nothing(
+    attachment: bytes, key: str, payload: bytes
+) -> None:
+    authority = held()
+    with pytest.raises(Malformed, match=r"^wrong proof$") as how:
+        authority.admit(attachment, key, payload, NOW)
+    assert (how.value.code, how.value.who) == (Code.MALFORMED, None)
+    assert admit(OVERHEARD)(authority) == "ann", "it used no number up"
+
+
+def test_what_was_overheard_and_repeated_is_refused_and_is_nobodys() -> None:
+    authority = held()
+    assert admit(OVERHEARD)(authority) == "ann"
+    how = refused(authority, OVERHEARD)
+    assert isinstance(how, Malformed)
+    assert (how.code, how.who) == (Code.OUT_OF_ORDER, None), "or a stranger would make a client think it was its own"
+
+
+def test_what_was_overheard_of_a_lease_that_has_ended_is_refused() -> None:
+    authority = held()
+    admit(OVERHEARD)(authority)
+    authority.takeover(Acquire(who="bob"), NOW)
+    for attachment, who in ((OVERHEARD, None), (attach(ANN, SEQ + 2), "ann"), (attach(ANN, SEQ + 2), None)):
+        how = refused(authority, attachment)
+        assert isinstance(how, LeaseLost)
+        assert (how.code, how.who) == (Code.LEASE_ENDED, who), "a new number is Ann's own; the others anybody's"
+    assert refused(authority, attach(Given(ANN.lease, BOB.token), 99)).code == "malformed"
+    assert admit(attach(BOB, 0))(authority) == "bob"
+
+
+def test_whoever_knows_only_the_public_id_can_neither_use_numbers_up_nor_learn_of_them() -> None:
+    authority = held()
+    answers = {refusal(authority, attach(Given(ANN.lease, FORGED.token), seq)) for seq in (0, SEQ, SEQ + 1, 2**64 - 1)}
+    assert answers == {"wrong proof"}
+    assert admit(attach(ANN, SEQ + 1))(authority) == "ann"
+
+
+def test_who_comes_with_no_lease_of_ours_is_told_who_holds_the_robot() -> None:
+    how = refused(held(), attach(FORGED, 9))
+    assert isinstance(how, Held)
+    assert how.holder == "ann"
 
 
 REFUSED = {
     "no attachment": None,
     "malformed": b"",
     "forged": attach(FORGED, SEQ + 1),
+    "a guess at the token": attach(Given(ANN.lease, FORGED.token), SEQ + 1),
     "repeated": attach(ANN, SEQ),
     "late": attach(ANN, 0),
 }
@@ -445,12 +638,12 @@ def test_a_refused_command_neither_renews_the_lease_nor_feeds_the_deadman(attach
     refusal(authority, attachment, NOW + 0.25)
     assert authority.deadline() == NOW + WAIT_S
     assert authority.report(NOW + 0.25).expires_in_s == LEASE_S - 0.25
-    assert authority.admit(attach(ANN, SEQ + 1), NOW + 0.25) == "ann", "and uses up no number"
+    assert admit(attach(ANN, SEQ + 1), NOW + 0.25)(authority) == "ann", "and uses up no number"
 
 
 def test_a_command_renews_the_lease() -> None:
     authority = held()
-    authority.admit(attach(ANN, SEQ + 1), NOW + 1.0)
+    admit(attach(ANN, SEQ + 1), NOW + 1.0)(authority)
     assert authority.report(NOW + 1.0).expires_in_s == LEASE_S
     assert authority.deadline() == NOW + 1.0 + LEASE_S
 
@@ -458,7 +651,7 @@ def test_a_command_renews_the_lease() -> None:
 def test_a_command_that_was_only_admitted_does_not_feed_the_deadman() -> None:
     authority = moving()
     for step in range(1, 5):
-        authority.admit(attach(ANN, SEQ + step), NOW + 0.1 * step)
+        admit(attach(ANN, SEQ + step), NOW + 0.1 * step)(authority)
     assert authority.deadline() == NOW + WAIT_S, "the robot may have refused it, and then moves on as before"
 
 
@@ -476,7 +669,7 @@ def test_motion_is_allowed_to_a_holder_that_was_not_held_back(state: str) -> Non
 def test_a_holder_that_was_held_back_moves_nothing_before_neutral() -> None:
     authority = held_back()
     for seq in (SEQ + 1, SEQ + 2):
-        authority.admit(attach(ANN, seq), NOW)
+        admit(attach(ANN, seq))(authority)
         with pytest.raises(Refused, match=r"^deadman: send a neutral drive first$"):
             authority.require_motion()
     authority.applied("drive", NOW, moving=False)
@@ -486,7 +679,7 @@ def test_a_holder_that_was_held_back_moves_nothing_before_neutral() -> None:
 
 def test_a_neutral_that_was_only_admitted_allows_no_motion() -> None:
     authority = held_back()
-    authority.admit(attach(ANN, SEQ + 1), NOW)
+    admit(attach(ANN, SEQ + 1))(authority)
     with pytest.raises(Refused):
         authority.require_motion()
 
@@ -504,16 +697,6 @@ def test_a_new_lease_needs_no_neutral(state: str) -> None:
     authority.hold_back("busy")
     authority.takeover(Acquire(who="bob"), NOW)
     authority.require_motion()
-
-
-def test_whose_a_refused_command_was_is_told_by_its_token() -> None:
-    authority = held()
-    assert authority.owner(attach(ANN, 0)) == "ann"
-    assert authority.owner(attach(FORGED, 0)) is None
-    assert authority.owner(None) is None
-    authority.takeover(Acquire(who="bob"), NOW)
-    assert authority.owner(attach(ANN, 0)) == "ann"
-    assert authority.owner(attach(BOB, 0)) == "bob"
 
 
 # Losing the lease
@@ -550,7 +733,7 @@ def test_a_lost_holder_is_written_down_and_what_moves_is_stopped(state: str, hap
     assert authority.events() == [ended(reason, stops=state in IN_MOTION)]
     assert authority.state == "stopped"
     assert not authority.moving
-    assert (authority.deadline(), authority.token) == (None, None)
+    assert (authority.deadline(), held_lease(authority)) == (None, None)
     assert refusal(authority, attach(ANN, SEQ + 1)) == f"the lease has ended ({reason})"
 
 
@@ -594,19 +777,19 @@ def test_a_stop_always_stops_and_ends_the_lease(state: str) -> None:
     assert authority.events() == [Event(What.STOPPED, "ann" if state in HELD else None, "stop", stops=True)]
     assert authority.state == "stopped"
     assert not authority.moving
-    assert (authority.deadline(), authority.token) == (None, None)
+    assert (authority.deadline(), held_lease(authority)) == (None, None)
     assert "acquire first" in refusal(authority, attach(FORGED, 0))
 
 
 def test_nobody_drives_after_a_stop_before_acquiring_anew() -> None:
     authority = stopped()
     assert refusal(authority, attach(ANN, SEQ + 1)) == "the lease has ended (stop)"
-    assert not authority.renew(ANN, NOW).ok
-    assert not authority.release(ANN, NOW).ok
+    assert not authority.renew(asking(ANN), RENEW, NOW).ok
+    assert not authority.release(asking(ANN, key=RELEASE), RELEASE, NOW).ok
     assert authority.state == "stopped"
     authority.acquire(Acquire(who="ann"), NOW)
     assert refusal(authority, attach(ANN, SEQ + 1)) == "the lease has ended (stop)"
-    assert authority.admit(attach(BOB, 0), NOW) == "ann"
+    assert admit(attach(BOB, 0))(authority) == "ann"
     authority.require_motion()
 
 
@@ -700,7 +883,7 @@ def test_an_expired_lease_is_found_by_whoever_comes_first(does: Does) -> None:
     with contextlib.suppress(Refused):
         does(authority)
     assert authority.events()[0] == ended("lease expired", stops=True)
-    assert authority.token != ANN
+    assert held_lease(authority) != ANN.lease
 
 
 def test_a_takeover_too_comes_after_a_stop_that_is_due() -> None:
@@ -723,7 +906,7 @@ def test_every_motion_puts_the_deadman_off() -> None:
     authority = moving()
     for step in range(1, 20):
         now = NOW + 0.4 * step
-        authority.admit(attach(ANN, SEQ + step), now)
+        admit(attach(ANN, SEQ + step), now)(authority)
         authority.applied("drive", now, moving=True)
         assert authority.deadline() == now + WAIT_S
     assert authority.events() == []
@@ -731,7 +914,7 @@ def test_every_motion_puts_the_deadman_off() -> None:
 
 def test_neutral_ends_the_watch_and_keeps_the_lease() -> None:
     authority = moving()
-    authority.admit(attach(ANN, SEQ + 1), NOW)
+    admit(attach(ANN, SEQ + 1))(authority)
     authority.applied("drive", NOW, moving=False)
     assert not authority.moving
     assert authority.state == "held"
@@ -780,7 +963,9 @@ def test_motion_is_watched_even_where_nobody_holds_the_robot() -> None:
 
 
 def test_control_says_who_drives_and_for_how_long() -> None:
-    assert moving().report(NOW + 1.0) == Control(state="held", holder="ann", priority=5, expires_in_s=LEASE_S - 1.0)
+    assert moving().report(NOW + 1.0) == Control(
+        state="held", holder="ann", lease=ANN.lease, priority=5, expires_in_s=LEASE_S - 1.0
+    )
     assert moving().report(NOW + 9.0).expires_in_s == 0.0
     assert new().report(NOW) == Control(state="free")
     assert stopped().report(NOW) == Control(state="stopped")
@@ -841,20 +1026,19 @@ def test_long_names_and_reasons_are_cut() -> None:
 
 
 def test_a_bounded_number_of_ended_leases_is_remembered() -> None:
-    authority = Authority(LEASE_S, DEADMAN_S, iter(map(str.encode, map(str, itertools.count()))).__next__)
-    tokens = [authority.takeover(Acquire(who=f"client {number}"), NOW).token for number in range(ENDED + 2)]
-    *old, held_now = [token for token in tokens if token is not None]
-    forgotten, remembered = old[: len(old) - ENDED], old[len(old) - ENDED :]
-    assert len(forgotten) == 1
-    for token in forgotten:
-        assert authority.owner(attach(token, 9)) is None
-        assert refusal(authority, attach(token, 9)) == f"held by client {ENDED + 1} (priority 0)", (
-            "refused all the same"
+    authority = new()
+    for number in range(1, ENDED + 3):
+        authority.takeover(Acquire(who=f"client {number}"), NOW)
+    forgotten, *remembered, current = (Given(bytes([n]) * 8, bytes([n]) * 32) for n in range(1, ENDED + 3))
+    how = refused(authority, attach(forgotten, 9))
+    assert (how.who, str(how)) == (None, f"held by client {ENDED + 2} (priority 0)"), "refused all the same"
+    for number, given in enumerate(remembered, 2):
+        how = refused(authority, attach(given, 9))
+        assert (how.who, str(how)) == (
+            f"client {number}",
+            f"the lease has ended (taken over by client {number + 1})",
         )
-    for number, token in enumerate(remembered, 1):
-        assert authority.owner(attach(token, 9)) == f"client {number}"
-        assert refusal(authority, attach(token, 9)) == f"the lease has ended (taken over by client {number + 1})"
-    assert authority.admit(attach(held_now, 0), NOW) == f"client {ENDED + 1}"
+    assert admit(attach(current, 0))(authority) == f"client {ENDED + 2}"
 
 
 def test_events_are_given_once_and_in_order() -> None:

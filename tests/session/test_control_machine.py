@@ -7,6 +7,7 @@ does what it is told, forever: what makes it stand is a neutral, or a stop that 
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgpack
 import pytest
@@ -14,13 +15,17 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
+from tests.proofs import proof, shown
 from zbridge.errors import Refused
-from zbridge.fleet.messages import Acquire, Lease
-from zbridge.session.control import TOKEN_BYTES, Authority, What
+from zbridge.fleet.messages import Acquire, Authorization, Lease
+from zbridge.session.control import Authority, What
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 REMEMBERED = 8
-"""Old tokens that are tried again and again."""
+"""Old leases that are tried again and again."""
+KEY, OTHER_KEY = "fleet/r1/@cmd/drive", "fleet/r1/@cmd/mode"
+RENEW, RELEASE = "fleet/r1/@rpc/control/renew", "fleet/r1/@rpc/control/release"
+PAYLOAD = b"\x80"
 
 clients = st.sampled_from(["ann", "bob", "hq.1"])
 priorities = st.integers(-1, 2)
@@ -33,13 +38,24 @@ mostly = st.sampled_from([True, True, True, False])
 which = st.integers(0, REMEMBERED)
 
 
+class Given(NamedTuple):
+    """What was given with a lease."""
+
+    lease: bytes
+    token: bytes
+
+
+NEVER = Given(bytes(8), bytes(32))
+"""A lease that never was."""
+
+
 @dataclass
 class Driver:
     """Who drives, as the model sees it."""
 
     who: str
     priority: int
-    token: bytes
+    given: Given
     alive: str | None
     lease_s: float
     deadman_s: float
@@ -68,14 +84,16 @@ class Robot:
 class Driving(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
-        numbers = itertools.count(1)
-        self.authority = Authority(LEASE_S, DEADMAN_S, lambda: next(numbers).to_bytes(TOKEN_BYTES, "big"))
+        numbers, self.questions = itertools.count(1), itertools.count(1)
+        self.authority = Authority(
+            LEASE_S, DEADMAN_S, lambda size: b"\xa5" * (size - 4) + next(numbers).to_bytes(4, "big")
+        )
         self.now = 1000.0
         self.robot = Robot()
         self.driver: Driver | None = None
         self.stopped = False
         self.must_neutral = False
-        self.tokens: list[bytes] = []
+        self.leases: list[Given] = []
         self.attachments: list[bytes] = []
 
     # The lease
@@ -110,19 +128,19 @@ class Driving(RuleBasedStateMachine):
     @rule(number=which, late=late_s)
     def renew(self, number: int, late: float) -> None:
         self.pass_unwatched(late)
-        token = self.any_token(number)
-        lease = self.authority.renew(token, self.now)
+        given = self.any_lease(number)
+        lease = self.renewed(given)
         self.take_events()
-        assert lease.ok == self.is_drivers(token)
+        assert lease.ok == self.is_drivers(given)
         if self.driver is not None and lease.ok:
             self.driver.expires_at = self.now + self.driver.lease_s
 
     @rule(number=which, late=late_s)
     def release(self, number: int, late: float) -> None:
         self.pass_unwatched(late)
-        token = self.any_token(number)
-        lease = self.authority.release(token, self.now)
-        assert lease.ok == self.is_drivers(token)
+        given = self.any_lease(number)
+        lease = self.released(given)
+        assert lease.ok == self.is_drivers(given)
         if lease.ok:
             self.driver = None
         self.take_events()
@@ -133,7 +151,7 @@ class Driving(RuleBasedStateMachine):
     @rule(part=parts, moving=mostly, skipped=st.integers(0, 3), late=late_s)
     def drive(self, part: str, moving: bool, skipped: int, late: float) -> None:
         assert self.driver is not None
-        attachment = attach(self.driver.token, self.driver.seq + 1 + skipped)
+        attachment = attach(self.driver.given, self.driver.seq + 1 + skipped)
         self.pass_unwatched(late)
         self.command(attachment, self.driver is not None, lambda: self.obey(part, moving))
 
@@ -148,12 +166,12 @@ class Driving(RuleBasedStateMachine):
 
     @rule(number=which, offset=st.integers(-3, 3), part=parts, moving=st.booleans(), late=late_s)
     def drive_somehow(self, number: int, offset: int, part: str, moving: bool, late: float) -> None:
-        """Come with any token that ever was, and any number."""
+        """Come with any lease that ever was, and any number."""
         self.pass_unwatched(late)
-        token, last = self.any_token(number), self.driver.seq if self.driver is not None else 0
+        given, last = self.any_lease(number), self.driver.seq if self.driver is not None else 0
         seq = max(0, last + offset)
-        expected = self.is_drivers(token) and seq > last
-        self.command(attach(token, seq), expected, lambda: self.obey(part, moving))
+        expected = self.is_drivers(given) and seq > last
+        self.command(attach(given, seq), expected, lambda: self.obey(part, moving))
 
     @precondition(lambda self: self.attachments)
     @rule(number=st.integers(0, 100), late=late_s)
@@ -162,15 +180,27 @@ class Driving(RuleBasedStateMachine):
         self.pass_unwatched(late)
         self.command(self.attachments[number % len(self.attachments)], False, lambda: self.obey("drive", True))
 
-    @rule(token=st.binary(max_size=TOKEN_BYTES + 1), bit=st.integers(0, 8 * TOKEN_BYTES - 1), late=late_s)
-    def forge(self, token: bytes, bit: int, late: float) -> None:
-        """Make a token up, or change one bit of the right one."""
+    @rule(
+        lease=st.binary(min_size=8, max_size=8),
+        token=st.binary(min_size=32, max_size=32),
+        bit=st.integers(0, 8 * 16 - 1),
+        late=late_s,
+    )
+    def forge(self, lease: bytes, token: bytes, bit: int, late: float) -> None:
+        """Make a lease or a token up, change one bit of the right proof, or use it for another command."""
         self.pass_unwatched(late)
+        tries = [attach(Given(lease, token), 2**40)]
         if self.driver is not None:
-            near = (int.from_bytes(self.driver.token, "big") ^ 1 << bit).to_bytes(TOKEN_BYTES, "big")
-            self.command(attach(near, self.driver.seq + 1), False, lambda: self.obey("drive", True))
-        if not self.is_drivers(token):
-            self.command(attach(token, 2**40), False, lambda: self.obey("drive", True))
+            given, seq = self.driver.given, self.driver.seq + 1
+            near = (int.from_bytes(proof(given.token, KEY, seq, PAYLOAD), "big") ^ 1 << bit).to_bytes(16, "big")
+            tries += [
+                attach(Given(given.lease, token), seq),
+                msgpack.packb({"lease": given.lease, "seq": seq, "proof": near}),
+                shown(given.lease, given.token, OTHER_KEY, seq, PAYLOAD),
+                shown(given.lease, given.token, KEY, seq, PAYLOAD + b"\x00"),
+            ]
+        for attachment in tries:
+            self.command(attachment, False, lambda: self.obey("drive", True))
 
     @rule(attachment=st.none() | st.binary(max_size=40), late=late_s)
     def send_rubbish(self, attachment: bytes | None, late: float) -> None:
@@ -182,7 +212,7 @@ class Driving(RuleBasedStateMachine):
     def send_what_the_robot_refuses(self, late: float) -> None:
         """Come with a command that is admitted and then not carried out."""
         assert self.driver is not None
-        attachment = attach(self.driver.token, self.driver.seq + 1)
+        attachment = attach(self.driver.given, self.driver.seq + 1)
         self.pass_unwatched(late)
         self.command(attachment, self.driver is not None, lambda: None)
 
@@ -190,7 +220,7 @@ class Driving(RuleBasedStateMachine):
     @rule(late=late_s)
     def send_it_off_by_itself(self, late: float) -> None:
         assert self.driver is not None
-        attachment = attach(self.driver.token, self.driver.seq + 1)
+        attachment = attach(self.driver.given, self.driver.seq + 1)
         self.pass_unwatched(late)
         self.command(attachment, self.driver is not None, self.obey_by_itself)
 
@@ -264,17 +294,19 @@ class Driving(RuleBasedStateMachine):
         assert control.holder == (driver.who if driver else None)
         assert control.priority == (driver.priority if driver else None)
         assert control.expires_in_s == (driver.expires_at - self.now if driver else None)
-        assert self.authority.token == (driver.token if driver else None)
+        assert control.lease == (driver.given.lease if driver else None)
+        verifier = self.authority.verifier
+        assert (verifier.lease if verifier else None) == control.lease
 
     @invariant()
-    def no_other_token_is_good_for_anything(self) -> None:
-        for token in self.tokens:
-            if not self.is_drivers(token):
-                assert not self.authority.renew(token, self.now).ok
-                assert not self.authority.release(token, self.now).ok
+    def no_other_lease_is_good_for_anything(self) -> None:
+        for given in self.leases:
+            if not self.is_drivers(given):
+                assert not self.renewed(given).ok
+                assert not self.released(given).ok
                 with pytest.raises(Refused):
-                    self.authority.admit(attach(token, 2**63), self.now)
-        assert self.authority.events() == []
+                    self.authority.admit(attach(given, 2**63), KEY, PAYLOAD, self.now)
+        assert {event.what for event in self.authority.events()} <= {What.REFUSED}
 
     @invariant()
     def it_is_held_back_until_neutral_or_a_new_lease(self) -> None:
@@ -296,12 +328,22 @@ class Driving(RuleBasedStateMachine):
         if self.driver is not None and self.now >= self.driver.expires_at:
             self.driver, self.stopped = None, True
 
-    def is_drivers(self, token: bytes) -> bool:
-        return self.driver is not None and token == self.driver.token
+    def is_drivers(self, given: Given) -> bool:
+        return self.driver is not None and given == self.driver.given
 
-    def any_token(self, number: int) -> bytes:
-        """Give one of the last tokens, the newest for 0; one that never was where there is none."""
-        return self.tokens[-1 - number % len(self.tokens)] if self.tokens else bytes(TOKEN_BYTES)
+    def any_lease(self, number: int) -> Given:
+        """Give one of the last leases, the newest for 0; one that never was where there is none."""
+        return self.leases[-1 - number % len(self.leases)] if self.leases else NEVER
+
+    def renewed(self, given: Given) -> Lease:
+        return self.authority.renew(self.asking(given, RENEW), RENEW, self.now)
+
+    def released(self, given: Given) -> Lease:
+        return self.authority.release(self.asking(given, RELEASE), RELEASE, self.now)
+
+    def asking(self, given: Given, key: str) -> Authorization:
+        seq = next(self.questions)
+        return Authorization(lease=given.lease, seq=seq, proof=proof(given.token, key, seq))
 
     def is_held_back(self) -> bool:
         try:
@@ -313,11 +355,14 @@ class Driving(RuleBasedStateMachine):
     def take_grant(self, request: Acquire, lease: Lease, granted: bool) -> None:
         assert lease.ok == granted
         if not granted:
-            assert lease.token is None
+            assert (lease.lease, lease.token) == (None, None)
             self.take_events()
             return
+        assert lease.lease is not None
         assert lease.token is not None
-        assert lease.token not in self.tokens
+        given = Given(lease.lease, lease.token)
+        assert given.lease not in (old.lease for old in self.leases)
+        assert given.token not in (old.token for old in self.leases)
         lease_s, deadman_s = (
             most_s if wish_s is None else min(wish_s, most_s)
             for wish_s, most_s in ((request.lease_s, LEASE_S), (request.deadman_s, DEADMAN_S))
@@ -325,16 +370,16 @@ class Driving(RuleBasedStateMachine):
         assert lease.expires_in_s == lease_s
         self.take_events()
         self.driver = Driver(
-            request.who, request.priority, lease.token, request.alive, lease_s, deadman_s, self.now + lease_s
+            request.who, request.priority, given, request.alive, lease_s, deadman_s, self.now + lease_s
         )
-        self.tokens = [*self.tokens[1 - REMEMBERED :], lease.token]
+        self.leases = [*self.leases[1 - REMEMBERED :], given]
         self.stopped = self.must_neutral = False
         assert not self.robot.moving, "the new driver finds a robot that stands"
 
     def command(self, attachment: bytes | None, admitted: bool, carry_out: Callable[[], None]) -> None:
         """Bring a command as the gateway does: admission, what follows from it, then the robot."""
         try:
-            who = self.authority.admit(attachment, self.now)
+            who = self.authority.admit(attachment, KEY, PAYLOAD, self.now)
         except Refused:
             self.take_events()
             assert not admitted
@@ -388,9 +433,8 @@ class Driving(RuleBasedStateMachine):
             assert not self.robot.moving, "the driver is gone, and the robot moves on"
 
 
-def attach(token: bytes, seq: int) -> bytes:
-    attachment: bytes = msgpack.packb({"token": token, "seq": seq})
-    return attachment
+def attach(given: Given, seq: int) -> bytes:
+    return shown(given.lease, given.token, KEY, seq, PAYLOAD)
 
 
 def test_over_any_course_of_events_the_robot_moves_only_for_its_one_driver() -> None:

@@ -10,7 +10,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from zbridge.bus.interface import Answer, Batch, Handle, Lane, LaneOf, Publisher, Question, Sample
-from zbridge.fleet.topics import Topic
+from zbridge.errors import Refused
+from zbridge.fleet.topics import Topic, is_concrete
 
 H = TypeVar("H", bound=Handle)
 
@@ -18,6 +19,22 @@ H = TypeVar("H", bound=Handle)
 def matches(key_expr: str, key: str) -> bool:
     """Tell whether a key expression matches a key; chunks that begin with ``@`` only match an equal chunk."""
     return _match(key_expr.split("/"), key.split("/"))
+
+
+def meet(one: str, other: str) -> bool:
+    """Tell whether there is a key that both key expressions match."""
+    return _meet(one.split("/"), other.split("/"))
+
+
+def _meet(one: list[str], other: list[str]) -> bool:
+    if not one or not other:
+        return all(chunk == "**" for chunk in one + other)
+    if one[0] != "**" and other[0] == "**":
+        one, other = other, one
+    if one[0] == "**":
+        return _meet(one[1:], other) or (not other[0].startswith("@") and _meet(one, other[1:]))
+    wild = "*" in (one[0], other[0]) and "@" not in (one[0][:1], other[0][:1])
+    return (wild or one[0] == other[0]) and _meet(one[1:], other[1:])
 
 
 def _match(expression: list[str], chunks: list[str]) -> bool:
@@ -112,8 +129,9 @@ class FakeBus:
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         questions = []
         for key, handler in tuple(self._shared.queryables):
-            if matches(key_expr, key):
-                questions.append(question := FakeQuestion(key, payload))
+            if meet(key_expr, key):
+                concrete = key if is_concrete(key) else key_expr
+                questions.append(question := FakeQuestion(concrete, payload, asked=key_expr))
                 handler(question)
         kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
         return [reply for question in questions for reply in question.replies] + kept
@@ -211,7 +229,7 @@ class _FakePublisher(_FakeHandle):
         if self._keeps_last:
             self._shared.last[self.key] = payload
         for key_expr, handler in tuple(self._shared.subscribers):
-            if matches(key_expr, self.key):
+            if meet(key_expr, self.key):
                 handler(sample)
         return True
 
@@ -222,8 +240,9 @@ class _FakePublisher(_FakeHandle):
 class FakeQuestion:
     """A query whose answers a test may look at."""
 
-    def __init__(self, key: str, payload: bytes = b"") -> None:
+    def __init__(self, key: str, payload: bytes = b"", *, asked: str | None = None) -> None:
         self.key = key
+        self.asked = asked or key
         self.payload = payload
         self.attachment: bytes | None = None
         self.replies: list[Answer] = []
@@ -231,5 +250,5 @@ class FakeQuestion:
     def answer(self, payload: bytes) -> None:
         self.replies.append(Answer(self.key, payload))
 
-    def refuse(self, reason: str) -> None:
-        self.replies.append(Answer(self.key, b"", reason))
+    def refuse(self, refusal: Refused) -> None:
+        self.replies.append(Answer(self.key, b"", refusal))

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Protocol
 
 import msgspec
 
+from zbridge.errors import BusError, Refused
 from zbridge.fleet.topics import Topic
 
 Endpoint = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
@@ -47,25 +48,32 @@ class Sample(msgspec.Struct, frozen=True):
 
 
 class Question(Protocol):
-    """A query that waits for its answer; answer or refuse it once."""
+    """A query that waits for its answer; answer or refuse it once.
+
+    key: the one that is answered. asked: what was asked for, perhaps with wildcards.
+    """
 
     key: str
+    asked: str
     payload: bytes
     attachment: bytes | None
 
     def answer(self, payload: bytes) -> None:
-        """Reply with a payload on the asked key."""
+        """Reply with a payload."""
 
-    def refuse(self, reason: str) -> None:
-        """Reply with an error text."""
+    def refuse(self, refusal: Refused) -> None:
+        """Reply with an error: its code, and its text."""
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """One reply to a query; ``error`` instead of a payload where it was refused."""
+    """One reply to a query; ``error`` instead of a payload.
+
+    It is Refused as whoever was asked refused it, or BusError with what else came instead of an answer.
+    """
 
     key: str
     payload: bytes
-    error: str | None = None
+    error: Refused | BusError | None = None
 
 
 class Publisher(Protocol):
@@ -99,7 +107,9 @@ class Lane(IntEnum):
     OTHER = 2
 
 
-LaneOf = Callable[[bytes | None], Lane]
+Look = Callable[[], tuple[str, bytes]]
+"""Gives the key and the payload that an authorization came with; of a question the asked key, and no payload."""
+LaneOf = Callable[[bytes | None, Look], Lane]
 """Chooses a lane by a sample's attachment or a question's payload; called on the bus's own threads: quick and sure."""
 
 
@@ -130,7 +140,7 @@ class Bus(Protocol):
         """Take samples by way of a lane; ``history`` asks for last values too."""
 
     def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards."""
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""

@@ -25,9 +25,10 @@ import zenoh.ext
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, LaneOf, Publisher, Question, Sample
 from zbridge.bus.writer import Writer
-from zbridge.errors import BusError
+from zbridge.errors import BusError, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
+from zbridge.fleet.messages import Denied
+from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic, is_concrete
 from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
@@ -44,6 +45,7 @@ OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
 _TIDY = 64
+_DENIED = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(Denied))
 
 _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
@@ -166,9 +168,11 @@ class ZenohBus:
 
             def store(sample: zenoh.Sample) -> None:
                 attachment = sample.attachment
-                inbox.put(
-                    handler, sample, _read_sample, lane(attachment.to_bytes() if attachment is not None else None)
+                own = lane(
+                    attachment.to_bytes() if attachment is not None else None,
+                    lambda: (str(sample.key_expr), sample.payload.to_bytes()),
                 )
+                inbox.put(handler, sample, _read_sample, own)
 
         if not history:
             return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
@@ -178,11 +182,17 @@ class ZenohBus:
         )
 
     def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards."""
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
         inbox, writer = self._inbox, self._writer
 
+        def choose(query: zenoh.Query) -> Lane:
+            if isinstance(lane, Lane):
+                return lane
+            payload = query.payload
+            return lane(payload.to_bytes() if payload is not None else None, lambda: (str(query.key_expr), b""))
+
         def store(query: zenoh.Query) -> None:
-            own = lane if isinstance(lane, Lane) else lane(query.payload.to_bytes() if query.payload else None)
+            own = choose(query)
             inbox.put(handler, query, lambda raw: _Question(raw, key, writer), own)
 
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
@@ -353,8 +363,16 @@ def _read_change(raw: zenoh.Sample) -> tuple[str, bool]:
 def _read_reply(reply: zenoh.Reply) -> Answer:
     if reply.ok is not None:
         return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
-    error = reply.err
-    return Answer("", b"", error.payload.to_bytes().decode("utf-8", "replace") if error else "no answer")
+    return Answer("", b"", _read_error(reply.err.payload.to_bytes() if reply.err is not None else b"no answer"))
+
+
+def _read_error(payload: bytes) -> Refused | BusError:
+    """Read an error reply: what was refused has a code, anything else are words of the bus's."""
+    try:
+        denied = payloads.decode(Denied, payload)
+    except PayloadError:
+        return BusError(payload.decode("utf-8", "replace"))
+    return refusal(denied.code, denied.reason)
 
 
 class _Declared:
@@ -463,7 +481,8 @@ class _Question:
     """A Zenoh query, answered by the writing thread."""
 
     def __init__(self, query: zenoh.Query, key: str, writer: Writer) -> None:
-        self.key = key
+        self.asked = str(query.key_expr)
+        self.key = key if is_concrete(key) else self.asked
         self.payload = query.payload.to_bytes() if query.payload is not None else b""
         self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
         self._query = query
@@ -472,12 +491,13 @@ class _Question:
     def answer(self, payload: bytes) -> None:
         self._writer.put(lambda: _reply_and_drop(self._query, self.key, payload, None))
 
-    def refuse(self, reason: str) -> None:
-        self._writer.put(lambda: self._refuse(reason))
+    def refuse(self, refusal: Refused) -> None:
+        denied = payloads.encode(Denied(code=refusal.code, reason=str(refusal)))
+        self._writer.put(lambda: self._refuse(denied))
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, denied: bytes) -> None:
         try:
-            self._query.reply_err(reason.encode())
+            self._query.reply_err(denied, encoding=_DENIED)
         finally:
             self._query.drop()  # type: ignore[no-untyped-call]
 

@@ -8,36 +8,27 @@ import getpass
 import socket
 from typing import Any
 
-import msgspec
-
-from zbridge.bus import Bus, Publisher, Sample
-from zbridge.errors import BusError, Code, Held, LeaseLost, Malformed, PayloadError, Refused
+from zbridge.bus import Answer, Bus, Publisher, Sample
+from zbridge.errors import BusError, Code, Held, LeaseLost, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Acquire,
-    Authorization,
-    Control,
-    Drive,
-    FleetMessage,
-    Lease,
-    LeaseToken,
-    Mode,
-    Motor,
-    Raw,
-)
+from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.session.proof import Signer
 
 RETRY_S = 0.1
 """Seconds between two questions to a gateway that does not answer."""
 ASK_S = 1.0
 """Longest time one question waits for its answer."""
+LEASE_S = 3.0
+"""Seconds a lease is taken to last that does not say."""
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
 
 _MOVING = ("drive", "mode", "motor/", "raw/")
-_encode = msgspec.msgpack.Encoder().encode
+_PASSING = (*NotReady.codes, *TooFast.codes)
+"""What is no word about whose the lease is."""
 
 
 def default_who() -> str:
@@ -57,21 +48,18 @@ class Driver:
     """
 
     def __init__(self, bus: Bus, keys: KeySpace, who: str, lease: Lease) -> None:
-        assert lease.token is not None
-        assert lease.expires_in_s is not None
         self.who = who
         self.robot = keys.robot
         self.lost = asyncio.Event()
         self.loss: LeaseLost | None = None
         self._bus = bus
         self._keys = keys
-        self._token = lease.token
-        self._lease_s = lease.expires_in_s
-        self._seq = 0
+        self._signer = Signer(lease)
+        self._lease_s = lease.expires_in_s or LEASE_S
         self._lock = asyncio.Lock()
         self._doubted = asyncio.Event()
         self._refusal: Refused | None = None
-        self._seen: dict[tuple[str, str], int] = {}
+        self._seen: dict[tuple[str, str, str], int] = {}
         self._publishers: dict[str, Publisher] = {}
 
     def __repr__(self) -> str:
@@ -116,16 +104,16 @@ class Driver:
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
         async with self._lock:
             if self.loss is not None:
-                raise LeaseLost(*self.loss.args)  # a new one each time: the traceback of a raised exception grows
+                loss = self.loss  # a new one each time: the traceback of a raised exception grows
+                raise LeaseLost(str(loss), loss.code, holder=loss.holder)
             refusal, self._refusal = self._refusal, None
             if refusal is not None and getattr(message, "moving", True):
                 raise refusal
-            self._seq += 1
-            attachment = _encode(Authorization(self._token, self._seq))
             publisher = self._publishers.get(topic.path)
             if publisher is None:
                 publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
-            publisher.put(payloads.encode(message), attachment)
+            payload = payloads.encode(message)
+            publisher.put(payload, self._signer.command(publisher.key, payload))
             if topic is not topics.CMD_DRIVE:  # goes by way of a thread: the next command must not overtake it
                 await self._bus.flush()
             if refusal is not None:  # a neutral is sent whatever there is to tell
@@ -146,8 +134,8 @@ class Driver:
             lease = await self._ask(topics.RPC_RENEW, min(ASK_S, self._lease_s / 3))
             if lease is None:
                 if loop.time() >= expires_at:
-                    self._lose("the gateway does not answer", None)
-            elif lease.ok:
+                    self._lose("the gateway does not answer")
+            elif lease.ok or lease.code == Code.OUT_OF_ORDER:  # somebody repeated our question, and came first with it
                 expires_at = asked_at + (lease.expires_in_s or self._lease_s)
             else:
                 self._lose(lease.reason or "no reason given", lease.holder)
@@ -158,7 +146,7 @@ class Driver:
             control = payloads.decode(Control, sample.payload)
         except PayloadError:
             return
-        if control.state != "held" or control.holder != self.who:
+        if control.lease != self._signer.lease:
             self._doubted.set()
         news = self._new_refusals(control)
         if news:
@@ -168,14 +156,14 @@ class Driver:
         """List what was refused to us since we last looked."""
         news, seen = [], {}
         for refusal in control.refusals:
-            key = (refusal.command, refusal.reason)
-            if refusal.who == self.who and refusal.command.startswith(_MOVING):
+            key = (refusal.command, refusal.code, refusal.reason)
+            if refusal.who == self.who and refusal.by is None and refusal.command.startswith(_MOVING):
                 if refusal.count != self._seen.get(key, 0):
                     if refusal.code == Code.LEASE_ENDED:  # of a lease before this one, or this one's end: ask
                         self._doubted.set()
                     else:
                         text = f"{self.robot}: {refusal.command}: {refusal.reason}"
-                        news.append(refused(refusal.code, text, holder=control.holder))
+                        news.append(refused(refusal.code, text))
                 seen[key] = refusal.count
         self._seen = seen
         return news
@@ -188,58 +176,78 @@ class Driver:
     async def release(self) -> None:
         """Give the lease back; a robot that moves is stopped."""
         if self.loss is None:
-            self._lose("released", None)
+            self._lose("released")
             await self._ask(topics.RPC_RELEASE, ASK_S)
         for publisher in self._publishers.values():
             publisher.close()
 
     async def _ask(self, topic: Topic, timeout_s: float) -> Lease | None:
-        payload = payloads.encode(LeaseToken(self._token))
+        """Ask about the lease; None where nobody says whose it is."""
+        key = self._keys.key(topic.path)
         with contextlib.suppress(BusError, PayloadError):
-            for answer in await self._bus.ask(self._keys.key(topic.path), payload, timeout_s=timeout_s):
+            for answer in await self._bus.ask(key, self._signer.question(key), timeout_s=timeout_s):
                 if answer.error is None:
-                    return payloads.decode(Lease, answer.payload)
+                    lease = payloads.decode(Lease, answer.payload)
+                    return lease if lease.ok or lease.code not in _PASSING else None
         return None
 
-    def _lose(self, reason: str, holder: str | None) -> None:
-        self.loss = LeaseLost(f"{self.robot}: {reason}" + (f"; held by {holder}" if holder else ""))
+    def _lose(self, reason: str, holder: str | None = None) -> None:
+        text = f"{self.robot}: {reason}" + (f"; held by {holder}" if holder else "")
+        self.loss = LeaseLost(text, holder=holder)
         self.lost.set()
 
 
-async def acquire(bus: Bus, keys: KeySpace, request: Acquire, *, takeover: bool, wait_s: float) -> Lease:
-    """Get the lease; raise Held where somebody has it, BusError where no gateway answers within ``wait_s``."""
-    key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE).path)
+async def acquire(bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float) -> Lease:
+    """Get the lease, asking as ``name``.
+
+    Raises Held where somebody has it, Malformed where it cannot be asked for like this; after ``wait_s`` NotReady or
+    TooFast where the gateway went on saying so, BusError where none answered.
+    """
+    key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + wait_s
-    why = "no gateway answered"
+    refusal: Refused | None = None
     while True:
         left_s = max(RETRY_S, deadline - loop.time())
         for answer in await bus.ask(key, payloads.encode(request), timeout_s=min(ASK_S, left_s)):
-            if answer.error is not None:
-                why = f"the gateway says {answer.error!r}"
+            try:
+                return _granted(keys.robot, answer)
+            except (NotReady, TooFast) as later:
+                refusal = later
+            except BusError:
                 continue
-            lease = payloads.decode(Lease, answer.payload)
-            if lease.ok:
-                return lease
-            if lease.holder is None:
-                raise Malformed(f"{keys.robot}: {lease.reason}")
-            expires = f", {lease.expires_in_s:.1f} s left" if lease.expires_in_s is not None else ""
-            raise Held(f"{keys.robot} is {lease.reason}{expires}", holder=lease.holder)
         if loop.time() >= deadline:
             break
         await asyncio.sleep(min(RETRY_S, max(0.0, deadline - loop.time())))
-    raise BusError(f"{keys.robot}: {why} within {wait_s:g} s")
+    raise refusal or BusError(f"{keys.robot}: no gateway answered within {wait_s:g} s")
+
+
+def _granted(robot: str, answer: Answer) -> Lease:
+    """Read the lease; raise Refused as the gateway did, BusError where it was not the gateway that answered."""
+    if isinstance(answer.error, Refused):
+        raise refused(answer.error.code, f"{robot}: {answer.error}")
+    if answer.error is not None:
+        raise answer.error
+    lease = payloads.decode(Lease, answer.payload)
+    if lease.ok:
+        return lease
+    reason = lease.reason or "no reason given"
+    if lease.code == Code.HELD:
+        expires = f", {lease.expires_in_s:.1f} s left" if lease.expires_in_s is not None else ""
+        raise Held(f"{robot} is {reason}{expires}", holder=lease.holder)
+    raise refused(lease.code or "", f"{robot}: {reason}")
 
 
 @contextlib.asynccontextmanager
-async def holding(bus: Bus, keys: KeySpace, request: Acquire, *, takeover: bool, wait_s: float) -> Any:
-    """Hold the lease while the context lasts."""
+async def holding(bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float) -> Any:
+    """Hold the lease while the context lasts. name: which ``who`` begins with, and which it is asked for at."""
     with contextlib.ExitStack() as declared:
         if request.alive is not None:
             token = bus.announce(keys.alive(request.alive))
             declared.callback(token.close)
         known = await _control(bus, keys)
-        driver = Driver(bus, keys, request.who, await acquire(bus, keys, request, takeover=takeover, wait_s=wait_s))
+        lease = await acquire(bus, keys, request, name, takeover=takeover, wait_s=wait_s)
+        driver = Driver(bus, keys, request.who, lease)
         driver.remember(known)
         watch = bus.subscribe(keys.key(topics.CONTROL.path), driver.look)
         declared.callback(watch.close)

@@ -24,6 +24,7 @@ from zbridge.fleet.messages import (
     Query,
     Raw,
     Reading,
+    Refusal,
     Scan,
     Scanner,
     SensorSetting,
@@ -34,7 +35,7 @@ from zbridge.fleet.messages import (
     Switch,
     Text,
 )
-from zbridge.fleet.topics import KeySpace, Topic, is_name, split_key, unescape
+from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
 
 CONFIRM_S = 2.0
 """Seconds within which a stop must be confirmed."""
@@ -110,6 +111,7 @@ class ControlFeed(StateFeed[Control]):
         self,
         who: str | None = None,
         *,
+        name: str | None = None,
         priority: int = 0,
         lease_s: float | None = None,
         deadman_s: float = 0.5,
@@ -118,19 +120,23 @@ class ControlFeed(StateFeed[Control]):
     ) -> AsyncIterator[Driver]:
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
-        who: shown to others as the holder, ``user@host`` by default. priority: a higher one is given the robot of a
-        lower one. deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
+        who: shown to others as the holder, ``user@host`` by default. name: where access rules know this program by the
+        first part of ``who`` only (``op1`` of ``op1.laptop``), that part.
+        priority: a higher one is given the robot of a lower one.
+        deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
         takeover: take the robot from whoever drives it. wait_s: how long to wait for the robot's gateway.
-        Raises Held naming the holder, BusError where no gateway answers.
+        Raises Held naming the holder, BusError where no gateway answers, or what else the gateway refused it as.
         """
+        who = who or default_who()
+        name = name or who
         request = Acquire(
-            who=who or default_who(),
+            who=who,
             priority=priority,
             lease_s=lease_s,
             deadman_s=deadman_s,
-            alive=f"operator.{self._bus.zid}",
+            alive=f"operator.{escape(name)}.{self._bus.zid}",
         )
-        async with holding(self._bus, self._keys, request, takeover=takeover, wait_s=wait_s) as driver:
+        async with holding(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s) as driver:
             yield driver
 
 
@@ -199,7 +205,7 @@ class Robot:
             refused = 0
         control = await self._stop_until_shown()
         if _stops_refused(control) > refused:
-            stop = next(refusal for refusal in control.refusals if refusal.command == "stop")
+            stop = _refused_stops(control)[0]
             raise refusal(stop.code, f"{self.name}: cannot be stopped: {stop.reason}")
         try:
             status = await self.status.last()
@@ -244,8 +250,10 @@ class Robot:
     async def _ask(self, topic: Topic, message: Any) -> Any:
         question = payloads.encode(Query())
         for answer in await self._bus.ask(self._keys.key(topic.path), question, timeout_s=ANSWER_S):
+            if isinstance(answer.error, Refused):
+                raise refusal(answer.error.code, f"{self.name}: {answer.error}")
             if answer.error is not None:
-                raise NotReady(f"{self.name}: {answer.error}")
+                raise BusError(f"{self.name}: {answer.error}")
             return payloads.decode(message, answer.payload)
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
 
@@ -271,6 +279,10 @@ class Robot:
         raise BusError(f"{self.name}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
 
 
+def _refused_stops(control: Control) -> list[Refusal]:
+    """List the stops that the robot's gateway could not send."""
+    return [refusal for refusal in control.refusals if refusal.command == "stop" and refusal.by is None]
+
+
 def _stops_refused(control: Control | None) -> int:
-    refusals = control.refusals if control is not None else ()
-    return sum(refusal.count for refusal in refusals if refusal.command == "stop")
+    return sum(refusal.count for refusal in _refused_stops(control)) if control is not None else 0

@@ -15,6 +15,9 @@ from msgspec import UNSET, UnsetType
 
 Fraction = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
 Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+LeaseId = Annotated[bytes, msgspec.Meta(min_length=8, max_length=8)]
+Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
+Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 Floats = npt.NDArray[np.float32]
 Cells = npt.NDArray[np.uint8]
 
@@ -155,20 +158,25 @@ class Status(FleetMessage, frozen=True):
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):
-    """A command that was not carried out, and how often. code: one of :class:`zbridge.errors.Code`, for programs."""
+    """A command that was not carried out, and how often. code: one of :class:`zbridge.errors.Code`, for programs.
+
+    by: the listener that refused it, ``hq.<listener>``; None where the robot's gateway did.
+    """
 
     who: str | None
     command: str
     code: str = ""
     reason: str
     count: int
+    by: str | None = None
 
 
 class Control(FleetMessage, frozen=True):
-    """Who drives, and what was refused lately."""
+    """Who drives, and what was refused lately. lease: the public id of the lease that is held."""
 
     state: Literal["free", "held", "stopped"]
     holder: str | None = None
+    lease: bytes | None = None
     priority: int | None = None
     expires_in_s: float | None = None
     refusals: tuple[Refusal, ...] = ()
@@ -237,27 +245,38 @@ class Acquire(FleetMessage, frozen=True):
     alive: str | None = None
 
 
-class LeaseToken(FleetMessage, frozen=True):
-    """Renew or release the lease that ``token`` is of."""
-
-    token: bytes
-
-
 class Lease(FleetMessage, frozen=True):
-    """The answer to every question about the lease. token: 16 bytes, for the holder alone; the rest for everybody."""
+    """The answer to every question about the lease.
+
+    lease: its id, 8 bytes that everybody may know. token: 32 bytes for the holder alone, which are never sent again.
+    Both only when granted. code: one of :class:`zbridge.errors.Code` where it is refused, for programs.
+    """
 
     ok: bool
-    token: bytes | None = None
+    lease: LeaseId | None = None
+    token: Token | None = None
     expires_in_s: float | None = None
     holder: str | None = None
     reason: str | None = None
+    code: str | None = None
 
 
-class Authorization(msgspec.Struct, frozen=True):
-    """The attachment of a command: the token of the lease, and a number that rises with every command."""
+class Authorization(FleetMessage, frozen=True):
+    """What shows that a command, or a question about the lease, is the holder's: see :mod:`zbridge.session.proof`.
 
-    token: bytes
+    The attachment of a command, and what is asked at ``renew`` and ``release``. seq: rises with each of the lease.
+    """
+
+    lease: LeaseId
     seq: Annotated[int, msgspec.Meta(ge=0)]
+    proof: Proof
+
+
+class Denied(FleetMessage, frozen=True):
+    """The error reply to a query. code: one of :class:`zbridge.errors.Code`, for programs; reason: for people."""
+
+    code: str
+    reason: str
 
 
 class SessionEntry(msgspec.Struct, frozen=True):

@@ -15,11 +15,11 @@ import msgspec
 
 from zbridge.fleet.messages import (
     Acquire,
+    Authorization,
     Control,
     Devices,
     Drive,
     FleetMessage,
-    LeaseToken,
     Map,
     Mode,
     Motion,
@@ -116,6 +116,20 @@ def unescape(chunk: str) -> str:
     return "" if chunk == "%" else unquote(chunk, errors="surrogateescape")
 
 
+def speaks_for(who: str, chunk: str) -> bool:
+    """Tell whether whoever asks at this key chunk may call itself ``who``: the chunk's name, or that and ``.suffix``.
+
+    So access rules on keys let each program ask in its own name only.
+    """
+    name = escape(who)
+    return name == chunk or name.startswith(f"{chunk}.")
+
+
+def is_concrete(key: str) -> bool:
+    """Tell a key from an expression with wildcards."""
+    return "*" not in key
+
+
 def _family(prefix: str, message: type[FleetMessage], delivery: Delivery) -> Family:
     @lru_cache(maxsize=1024)
     def topic(name: str) -> Topic:
@@ -154,17 +168,17 @@ CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND)
 RPC_SESSIONS = _family("@rpc/sessions", Query, Delivery.QUERY)
 RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
 RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
-RPC_ACQUIRE = Topic("@rpc/control/acquire", Acquire, Delivery.QUERY)
-RPC_TAKEOVER = Topic("@rpc/control/takeover", Acquire, Delivery.QUERY)
-RPC_RENEW = Topic("@rpc/control/renew", LeaseToken, Delivery.QUERY)
-RPC_RELEASE = Topic("@rpc/control/release", LeaseToken, Delivery.QUERY)
+RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY)
+RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY)
+RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY)
+RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY)
 
 _TOPICS = {
     topic.path: topic
     for topic in (
         *(SCAN, MOTION, POSE, TEXT, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
-        *(RPC_MAP, RPC_POSE, RPC_ACQUIRE, RPC_TAKEOVER, RPC_RENEW, RPC_RELEASE),
+        *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE),
     )
 }
 _FAMILIES = {
@@ -174,6 +188,8 @@ _FAMILIES = {
     "@cmd/sensor": CMD_SENSOR,
     "@cmd/raw": CMD_RAW,
     "@rpc/sessions": RPC_SESSIONS,
+    "@rpc/control/acquire": RPC_ACQUIRE,
+    "@rpc/control/takeover": RPC_TAKEOVER,
 }
 
 

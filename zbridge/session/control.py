@@ -7,7 +7,6 @@ robot is to be sent its stop. The transition table is in ``docs/control.md``.
 
 from __future__ import annotations
 
-import hmac
 import math
 from collections import OrderedDict
 from collections.abc import Callable
@@ -17,18 +16,16 @@ import msgspec
 
 from zbridge.errors import Code, Held, LeaseLost, Malformed, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
+from zbridge.session.proof import LEASE_BYTES, TOKEN_BYTES, Verifier, read
 
 REFUSALS = 16
 """Different refusals that ``control`` shows; the oldest makes room."""
-TOKEN_BYTES = 16
 ENDED = 16
-"""Ended leases whose holders can still be told why."""
+"""Ended leases whose holders can still be told why, and whose ids are not given again."""
 LEAST_S = 0.01
 """The shortest lease or deadman that can be asked for, seconds."""
 _NAMED, _EXPLAINED = 64, 200
 """Characters of a name and of a reason that are kept."""
-
-_read_authorization = msgspec.msgpack.Decoder(Authorization).decode
 
 
 class What(Enum):
@@ -62,12 +59,15 @@ class Event(msgspec.Struct, frozen=True):
 class _Holder(msgspec.Struct):
     who: str
     priority: int
-    token: bytes
+    verifier: Verifier
     lease_s: float
     deadman_s: float
     alive: str | None
     expires_at: float
-    seq: int = -1
+    numbers: dict[str, int] = msgspec.field(default_factory=dict)
+    """The last number that was used, of its commands and of its questions."""
+    ended: str | None = None
+    """Why the lease has ended."""
 
     @property
     def described(self) -> str:
@@ -78,10 +78,10 @@ class Authority:
     """The lease of one robot, and the watch over its motion.
 
     lease_s, deadman_s: the most a holder may ask for, and what it gets without asking, in seconds.
-    new_token: gives TOKEN_BYTES bytes that nobody can guess.
+    random: gives so many bytes that nobody can guess.
     """
 
-    def __init__(self, lease_s: float, deadman_s: float, new_token: Callable[[], bytes]) -> None:
+    def __init__(self, lease_s: float, deadman_s: float, random: Callable[[int], bytes]) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
         self.on_its_own = False
@@ -90,16 +90,16 @@ class Authority:
         """Whether its mode is autonomous now."""
         self._opaque = False
         """Whether it was sent what nobody here can read, since its last stop or neutral: it may move by that."""
-        self.token: bytes | None = None
-        """The token of the lease that is held; only for sorting what comes in."""
-        self._new_token = new_token
+        self.verifier: Verifier | None = None
+        """Of the lease that is held; other threads use it to sort what comes in."""
+        self._random = random
         self._holder: _Holder | None = None
         self._stopped = False
         self._held_back: str | None = None
         self._moving: set[str] = set()
         self._stop_at = math.inf
-        self._ended: OrderedDict[bytes, tuple[str, str]] = OrderedDict()
-        self._refusals: OrderedDict[tuple[str | None, str, Code, str], int] = OrderedDict()
+        self._ended: OrderedDict[bytes, _Holder] = OrderedDict()
+        self._refusals: OrderedDict[tuple[str | None, str, Code, str, str | None], int] = OrderedDict()
         self._events: list[Event] = []
 
     def __repr__(self) -> str:
@@ -137,42 +137,40 @@ class Authority:
         self.expire(now)
         return self._grant(request, What.TAKEN_OVER, now)
 
-    def renew(self, token: bytes, now: float) -> Lease:
-        """Put the end of a lease off."""
+    def renew(self, shown: Authorization, key: str, now: float) -> Lease:
+        """Put the end of a lease off. key: the one that was asked."""
         self.expire(now)
-        holder = self._shown_by(token)
-        if holder is None:
-            return self._denied(self._why_not(token), now)
+        try:
+            holder = self._sender("questions", shown, key)
+        except Refused as refusal:
+            self.refuse("renew", refusal, refusal.who)
+            return self._denied(refusal, now)
         holder.expires_at = now + holder.lease_s
         return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
 
-    def release(self, token: bytes, now: float) -> Lease:
-        """Give a lease back; a robot that moves is stopped."""
+    def release(self, shown: Authorization, key: str, now: float) -> Lease:
+        """Give a lease back; a robot that moves is stopped. key: the one that was asked."""
         self.expire(now)
-        holder = self._shown_by(token)
-        if holder is None:
-            return self._denied(self._why_not(token), now)
+        try:
+            self._sender("questions", shown, key)
+        except Refused as refusal:
+            self.refuse("release", refusal, refusal.who)
+            return self._denied(refusal, now)
         self._end("released", What.RELEASED, stops=self.moving)
         self._stopped = False
         return Lease(ok=True)
 
     # Commands
 
-    def admit(self, attachment: bytes | None, now: float) -> str:
-        """Give the holder whose command this is, and use its number up; raise Refused where it is nobody's."""
+    def admit(self, attachment: bytes | None, key: str, payload: bytes, now: float) -> str:
+        """Give the holder whose command this is, and use its number up; raise Refused where it is nobody's.
+
+        key: the one the command came on, without wildcards.
+        """
         self.expire(now)
         if attachment is None:
             raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
-        try:
-            shown = _read_authorization(attachment)
-        except (msgspec.MsgspecError, RecursionError, ValueError) as error:
-            raise Malformed("malformed attachment: expected {token, seq}") from error
-        holder = self._shown_by(shown.token)
-        if holder is None:
-            raise self._why_not(shown.token)
-        if shown.seq <= holder.seq:
-            raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)
-        holder.seq = shown.seq
+        holder = self._sender("commands", read(attachment), key, payload)
         holder.expires_at = now + holder.lease_s
         return holder.who
 
@@ -201,22 +199,13 @@ class Authority:
         """Take note that the holder had the robot sent what nobody here can read: it may move by it."""
         self._opaque = self.on_its_own = True
 
-    def owner(self, attachment: bytes | None) -> str | None:
-        """Tell whose a refused command was, as far as its token shows."""
-        try:
-            token = _read_authorization(attachment or b"").token
-        except (msgspec.MsgspecError, RecursionError, ValueError):
-            return None
-        holder = self._shown_by(token)
-        if holder is not None:
-            return holder.who
-        return self._ended.get(token, (None, ""))[0]
-
-    def refuse(self, command: str, refusal: Refused, who: str | None = None) -> None:
-        """Count a refusal; it shows on ``control``."""
+    def refuse(
+        self, command: str, refusal: Refused, who: str | None = None, *, by: str | None = None, count: int = 1
+    ) -> None:
+        """Count a refusal; it shows on ``control``. by: the listener that refused it, and tells of it."""
         who, command, reason = who and who[:_NAMED], command[:_NAMED], str(refusal)[:_EXPLAINED]
-        key = (who, command, refusal.code, reason)
-        self._refusals[key] = self._refusals.pop(key, 0) + 1
+        key = (who, command, refusal.code, reason, by)
+        self._refusals[key] = self._refusals.pop(key, 0) + count
         if len(self._refusals) > REFUSALS:
             self._refusals.popitem(last=False)
         self._events.append(Event(What.REFUSED, who, reason, command=command, code=refusal.code))
@@ -276,18 +265,42 @@ class Authority:
         return Control(
             state=self.state,  # type: ignore[arg-type]
             holder=holder.who if holder else None,
+            lease=holder.verifier.lease if holder else None,
             priority=holder.priority if holder else None,
             expires_in_s=max(0.0, holder.expires_at - now) if holder else None,
             refusals=tuple(
-                Refusal(who=who, command=command, code=code, reason=reason, count=count)
-                for (who, command, code, reason), count in self._refusals.items()
+                Refusal(who=who, command=command, code=code, reason=reason, count=count, by=by)
+                for (who, command, code, reason, by), count in self._refusals.items()
             ),
         )
 
-    def _shown_by(self, token: bytes) -> _Holder | None:
-        """Give the holder if this is its token."""
+    def _sender(self, what: str, shown: Authorization, key: str, payload: bytes = b"") -> _Holder:
+        """Give the holder who sent this, and use its number up; raise Refused where it is nobody's.
+
+        The proof comes before the number: who knows the lease's id alone uses up none, and learns of none.
+        """
+        holder = self._known(shown.lease)
+        if not holder.verifier.proves(shown, key, payload):
+            raise Malformed("wrong proof")
+        fresh = shown.seq > holder.numbers.get(what, -1)
+        if fresh:
+            holder.numbers[what] = shown.seq
+        if holder.ended is not None:  # repeated, anybody who overheard it may have sent it
+            raise LeaseLost(f"the lease has ended ({holder.ended})", who=holder.who if fresh else None)
+        if not fresh:
+            raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)
+        return holder
+
+    def _known(self, lease: bytes) -> _Holder:
+        """Give the holder of a lease, of one that has ended too; raise Refused where there was none of this id."""
         holder = self._holder
-        return holder if holder is not None and hmac.compare_digest(holder.token, token) else None
+        if holder is not None and holder.verifier.lease == lease:
+            return holder
+        if lease in self._ended:
+            return self._ended[lease]
+        if holder is not None:
+            raise Held(f"held by {holder.described}", holder=holder.who)
+        raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
 
     def _grant(self, request: Acquire, what: What, now: float) -> Lease:
         try:
@@ -301,36 +314,42 @@ class Authority:
         who = request.who[:_NAMED]
         if self._holder is not None:
             self._end(f"taken over by {who}", What.ENDED, stops=self.moving)
-        token = self._new_token()
-        self._holder = _Holder(who, request.priority, token, lease_s, deadman_s, request.alive, now + lease_s)
-        self.token = token
+        lease, token = self._new_lease(), self._random(TOKEN_BYTES)
+        self.verifier = Verifier(lease, token)
+        self._holder = _Holder(who, request.priority, self.verifier, lease_s, deadman_s, request.alive, now + lease_s)
         self._stopped, self._held_back = False, None
         self._events.append(Event(what, who, priority=request.priority))
-        return Lease(ok=True, token=token, expires_in_s=lease_s, holder=who)
+        return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who)
+
+    def _new_lease(self) -> bytes:
+        """Give an id that none of the last leases had."""
+        lease = self._random(LEASE_BYTES)
+        while lease in self._ended:
+            lease = ((int.from_bytes(lease, "big") + 1) % 256**LEASE_BYTES).to_bytes(LEASE_BYTES, "big")
+        return lease
 
     def _denied(self, refusal: Refused, now: float) -> Lease:
         holder = self._holder
         expires_in_s = max(0.0, holder.expires_at - now) if holder else None
-        return Lease(ok=False, expires_in_s=expires_in_s, holder=holder.who if holder else None, reason=str(refusal))
-
-    def _why_not(self, token: bytes) -> Refused:
-        ended = self._ended.get(token)
-        if ended is not None:
-            return LeaseLost(f"the lease has ended ({ended[1]})")
-        if self._holder is not None:
-            return Held(f"held by {self._holder.described}", holder=self._holder.who)
-        return LeaseLost("no lease: acquire first", Code.NO_LEASE)
+        return Lease(
+            ok=False,
+            expires_in_s=expires_in_s,
+            holder=holder.who if holder else None,
+            reason=str(refusal),
+            code=refusal.code,
+        )
 
     def _lose(self, reason: str) -> None:
         self._end(reason, What.ENDED, stops=self.moving)
         self._stopped = True
 
     def _end(self, reason: str, what: What, *, stops: bool) -> None:
-        holder, self._holder, self.token = self._holder, None, None
+        holder, self._holder, self.verifier = self._holder, None, None
         self._still()
         self._held_back = None
         if holder is not None:
-            self._ended[holder.token] = (holder.who, reason)
+            holder.ended = reason
+            self._ended[holder.verifier.lease] = holder
             if len(self._ended) > ENDED:
                 self._ended.popitem(last=False)
         self._events.append(Event(what, holder.who if holder else None, reason, stops=stops))

@@ -240,7 +240,7 @@ async def test_the_first_part_stops_the_robot_and_commands_are_refused_until_the
         assert ("drive", "busy: map", 2) in refusals
         assert ("mode", "busy: map", 1) in refusals
         question = rig.ask("pose")
-        assert [answer.error for answer in question.replies] == ["busy: map"]
+        assert [str(answer.error) for answer in question.replies] == ["busy: map"]
         await asyncio.sleep(1.2)
         assert set(rig.written()) == {STOP_2}
 

@@ -76,6 +76,12 @@ class Commands:
         if not self._robot.ready:
             raise NotReady(session.busy or session.state.value)
 
+    def require_sure(self) -> None:
+        """Raise Refused where the robot is not to be set in motion: what it is told later might not arrive."""
+        session = self._robot.driving
+        if session is not None and session.doubtful is not None:
+            raise NotReady(session.doubtful)
+
     def refuse_all(self, reason: str) -> None:
         """Take nothing but stops from now on."""
         self._closing = reason
@@ -96,6 +102,7 @@ class Commands:
         self.require_ready()
         on_its_own = _moves_by_itself(command)
         if on_its_own:
+            self.require_sure()
             self._authority.require_motion()
         self._show(topic, self._robot.command(topic, command, now), who)
         self._authority.on_its_own = self._authority.on_its_own or on_its_own
@@ -104,6 +111,8 @@ class Commands:
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
         try:
             self.require_ready()
+            if command.moving:
+                self.require_sure()
         except Refused as refusal:
             if command.moving:
                 self._leases.hold_back(str(refusal), stops=False)

@@ -73,6 +73,10 @@ class Robot(ABC):
     def ask(self, topic: Topic) -> None:
         """Ask the robot for what it publishes on ``topic``; raise Refused where it cannot be asked."""
 
+    def known(self, topic: Topic) -> FleetMessage | None:
+        """Give what is answered at once to who asks for ``topic``; None where the robot is to be asked."""
+        return None
+
     @property
     def on_demand(self) -> tuple[Topic, ...]:
         """What the robot publishes only while somebody listens; :meth:`listened` is told."""

@@ -34,6 +34,7 @@ from gateways.tcpudp.messages import (
     read_header,
 )
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
+from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, Malformed, ProtocolError, Unsupported
 from zbridge.session.negotiation import agree, newest, parse_versions
@@ -52,23 +53,11 @@ SILENCE_S = 2.5
 LATE_START = "handshaking"
 AGAIN_S = 0.3
 """Seconds after which what is sent once and matters is sent again to robots that misread a tenth of what they get."""
-FIRST_CLIENT = 2
-"""The id that a robot gives the first client after its start."""
-LOOK_S = 5.0
-"""Seconds in which a connection is expected to show that it works."""
-LOOK_AGAIN_S = 1.0
-MALFORMED, MALFORMED_SHARE = 3, 0.05
-"""Malformed packets, in number and of all that came, that are a sign."""
-LATER_CLIENT = "another program is connected, or the one usable connection is used up"
-UNANSWERED = "no telemetry and no answer to the probe within 5 s"
-MUTE = "no telemetry within 5 s, unlike on the connection before"
-GARBLED = "malformed packets"
 _QUOTED = 80
 _AUTONOMOUS = 3
 _MODE_AGAIN, _LIDAR_AGAIN = "mode again", "lidar again"
 _MISREADING = frozenset({"1.1", "1.2"})
-_ANSWERED = (ClientGetSLAMMap, ClientGetPosition, ClientLidarMode)
-"""What a robot answers."""
+_ANSWERED = (ClientGetSLAMMap, ClientGetPosition)
 
 
 def limits(gap_s: float) -> Limits:
@@ -157,9 +146,6 @@ class HqSession(_TcpUdpSession):
         self.settings: Settings | None = None
         self.autonomous: bool = predecessor is not None and predecessor.autonomous
         """Whether mode 3 was sent, on this connection or one before, and no other mode was commanded since."""
-        self.talks: bool = predecessor is not None and predecessor.talks
-        """Whether the robot sent telemetry unasked soon after it connected, now or on a connection before."""
-        self._talked_before = self.talks
         self._announce = frozenset(announce)
         self._udp = udp and Feature.UDP in self._announce
         self._force = frozenset(force)
@@ -168,14 +154,15 @@ class HqSession(_TcpUdpSession):
         self._agreed = ""
         self._start = Probe(PROBE_S)
         self._probe = Probe(PROBE_S)
-        self._answered = False
+        self._answered: bool | None = None
+        """Whether the robot got our datagram and we its answer; None where none was sent."""
         self._silent_until = math.inf
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
+        self._signs: Signs = Signs(predecessor._signs if predecessor is not None else None)
         self._look_at = math.inf
-        self._looked = self._talked = False
-        self._texts = self._asked = self._heard_before = 0
-        self._silent: str | None = None
+        self._others = 0
+        """Packets that came and are no telemetry."""
 
     def overdue(self) -> str:
         if self.last_malformed is not None:
@@ -195,13 +182,15 @@ class HqSession(_TcpUdpSession):
         elif isinstance(message, ServerUDPConnection):
             self._take_answer(message, now, by_datagram=False)
         else:
-            self._texts += isinstance(message, DebugMessage)
+            self._others += isinstance(message, DebugMessage)
             return True
+        self._others += 1
         return False
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if isinstance(message, ServerUDPConnection):
             self._take_answer(message, now, by_datagram=True)
+            self._others += 1
             return False
         return self.accept(message, now)
 
@@ -249,7 +238,7 @@ class HqSession(_TcpUdpSession):
     def switch_lidar(self, mode: int, now: float) -> None:
         """Send a lidar mode."""
         self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
-        self._asked += 1 + self.outbox.stands(_LIDAR_AGAIN)
+        self._signs.asked(self._heard, 1 + self.outbox.stands(_LIDAR_AGAIN))
 
     def _send_surely(self, frame: bytes, again: str, now: float) -> None:
         """Send a packet, to robots that misread some again; a newer one ends the repetition of an older one."""
@@ -277,7 +266,8 @@ class HqSession(_TcpUdpSession):
 
     def send(self, message: Packet) -> None:
         super().send(message)
-        self._asked += isinstance(message, _ANSWERED)
+        if isinstance(message, _ANSWERED):
+            self._signs.asked(self._heard)
 
     # Handshake
 
@@ -313,6 +303,7 @@ class HqSession(_TcpUdpSession):
         self._silent_until = now + SILENCE_S
         self.outbox.quiet(self._silent_until)
         if offered:
+            self._answered = False
             self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
         self._probe.begin(now)
 
@@ -331,7 +322,7 @@ class HqSession(_TcpUdpSession):
     def _finish(self, now: float) -> None:
         assert self.settings is not None
         self.establish(self._agreed, tuple(feature.value for feature in self.settings.features))
-        self._look_at, self._heard_before = now + LOOK_S, self._heard
+        self._look_at = now + LOOK_S
 
     # Timers
 
@@ -350,7 +341,8 @@ class HqSession(_TcpUdpSession):
             elif self.busy == LATE_START:
                 self.busy = None
         if now >= self._look_at:
-            self._look()
+            self._signs.look(self._heard, unanswered=self._answered is False)
+            self._doubt()
             self._look_at = now + LOOK_AGAIN_S
 
     # Signs of a connection that is not the robot's one usable connection
@@ -361,29 +353,10 @@ class HqSession(_TcpUdpSession):
 
     @property
     def _heard(self) -> int:
-        """Packets that came, without texts: those reach every client of a robot."""
-        return self.traffic.frames_in - self.traffic.malformed - self._texts
-
-    def _look(self) -> None:
-        """See whether the robot sends telemetry; one that may be waiting to be asked must have answered the probe."""
-        heard = self._heard - self._heard_before
-        self._talked = self._talked or heard > self._asked
-        if not self._looked:
-            self._looked, self.talks = True, self.talks or self._talked
-        if self._talked_before and not self._talked:
-            self._silent = MUTE
-        elif self._probe.verdict is Verdict.FAILED and not (self._answered or heard):
-            self._silent = UNANSWERED
-        else:
-            self._silent = None
-        self._doubt()
+        return self.traffic.frames_in - self.traffic.malformed - self._others
 
     def _doubt(self) -> None:
-        """Gather the signs ("One usable connection")."""
-        traffic = self.traffic
-        later = f"client id {self.sender_id}: {LATER_CLIENT}" if self.sender_id > FIRST_CLIENT else None
-        few = traffic.malformed < max(MALFORMED, MALFORMED_SHARE * traffic.frames_in)
-        self.doubts = tuple(filter(None, (later, None if few else GARBLED, self._silent)))
+        self.doubts = self._signs.gather(self.sender_id, self.traffic)
 
 
 _FROM_HQ: dict[int, Decode] = {

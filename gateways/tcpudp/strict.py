@@ -114,6 +114,7 @@ class StrictRobot(Judge):
         self._tasks: asyncio.TaskGroup | None = None
         self._late_s = 0.0
         self._ticked_at = math.inf
+        self._pause_s, self._woke_at = 0.0, -math.inf
         self._wake_at = 0.0
         self._closed_at = 0.0
         self._forget()
@@ -204,12 +205,17 @@ class StrictRobot(Judge):
         """Take what one read gave as one packet: what piled up while this process stood still is lost."""
         received, problem = self._reads.take(data)
         if problem:
-            stood_s = time.monotonic() - self._ticked_at
-            late_s = max(self._late_s, stood_s if stood_s > _LATE_S else 0.0)
+            late_s = max(self._late_s, self._stood_s())
             late = late_s > 0.005 and "packets" in problem  # joined by this process rather than by the HQ?
             self._violate(problem + f" (this process woke {late_s * 1000:.0f} ms late)" * late)
         if received is not None:
             await self._take(received, "tcp")
+
+    def _stood_s(self) -> float:
+        """Tell for how long this process has just stood still; whichever of its tasks runs first may ask."""
+        now = time.monotonic()
+        since_tick_s = now - self._ticked_at
+        return since_tick_s if since_tick_s > _LATE_S else self._pause_s if now - self._woke_at < _LATE_S else 0.0
 
     async def _nap(self) -> None:
         planned = self._sleeps.uniform(0, self._times.read_s)
@@ -426,6 +432,8 @@ class StrictRobot(Judge):
         while True:
             await asyncio.sleep(_TICK_S)
             self._ticked_at = now = time.monotonic()
+            if now - last > _LATE_S:
+                self._pause_s, self._woke_at = now - last, now
             self.machine.step(min(now - last, 0.1))
             last = now
 

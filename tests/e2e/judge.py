@@ -66,7 +66,7 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
     """Run one gateway against one strict robot."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
-        robot = stack.enter_context(_robot(version, udp=udp, seed=seed))
+        robot = stack.enter_context(strict_robot(version, udp=udp, seed=seed))
         assert robot.stdout is not None
         bench.gateway("r1", int(robot.stdout.readline()))
         until(lambda: bench.fleet.state("r1") == "established", what="established")
@@ -84,9 +84,10 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
 
 
 @contextlib.contextmanager
-def _robot(version: str, *, udp: bool, seed: int) -> Any:
+def strict_robot(version: str, *, udp: bool = False, seed: int = 1, **options: Any) -> Any:
+    """Start a strict robot as a process; its first line is its port."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.e2e.strict_robot", version, str(int(udp)), str(seed)],
+        [sys.executable, "-m", "tests.e2e.strict_robot", version, str(int(udp)), str(seed), json.dumps(options)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -189,7 +189,7 @@ class Device:
                 self._publish(topic, message)
         elif busy != self._busy:
             self._leases.hold_back(self._busy or "no longer busy", stops=True)
-        elif self._doubtful and not doubtful:
+        if self._doubtful and not doubtful:
             self._leases.hold_back(self._doubtful, stops=True)
 
     def _pump(self) -> None:

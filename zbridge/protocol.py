@@ -67,7 +67,7 @@ class Robot(ABC):
 
     @abstractmethod
     def stop(self, now: float, until: float) -> None:
-        """Send the robot its stop before anything else, and repeat it until ``until``."""
+        """Send the robot its stop before anything else, and repeat it until ``until``; once if that is ``now``."""
 
     @abstractmethod
     def ask(self, topic: Topic) -> None:

@@ -30,8 +30,6 @@ Tap = Callable[[str, bytes], None]
 
 LINGER_S = 0.5
 """Longest time a closing session waits for its last frames to be written."""
-
-
 DOUBTS = 2
 """Doubts about a connection with which its peer is not set in motion."""
 

@@ -56,6 +56,15 @@ async def test_a_change_of_state_is_told_before_the_messages_of_the_same_read() 
 
 
 @jumping
+async def test_a_doubt_is_told_when_it_comes_and_when_it_goes() -> None:
+    rig = established()
+    for doubts in (("client id 3",), ("client id 3",), ()):
+        rig.session.doubts = doubts
+        rig.conversation.pump()
+    assert rig.happened == [State.ESTABLISHED, State.ESTABLISHED]
+
+
+@jumping
 async def test_a_read_without_a_whole_message_delivers_nothing() -> None:
     rig = established()
     rig.conversation.received(b"\x05ab")

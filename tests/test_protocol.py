@@ -9,6 +9,7 @@ import pytest
 from tests.session.test_session import LIMITS, Toy
 from zbridge import protocol
 from zbridge.errors import ConfigError
+from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
@@ -53,6 +54,10 @@ def test_a_robot_is_ready_while_its_driving_session_is_established() -> None:
     assert robot.ready
     session.close("enough", 1.0)
     assert not robot.ready
+
+
+def test_a_robot_is_asked_for_everything_unless_it_says_otherwise() -> None:
+    assert ToyRobot().known(topics.MAP) is None
 
 
 def test_an_outcome_without_anything_reports_nothing() -> None:

@@ -85,6 +85,12 @@ class Commands:
         if not self._robot.ready:
             raise NotReady(session.busy or session.state.value)
 
+    def require_sure(self) -> None:
+        """Raise Refused where the robot is not to be set in motion: what it is told later might not arrive."""
+        session = self._robot.driving
+        if session is not None and session.doubtful is not None:
+            raise NotReady(session.doubtful)
+
     def refuse_all(self, reason: str) -> None:
         """Take nothing but stops from now on."""
         self._closing = reason
@@ -118,6 +124,7 @@ class Commands:
             raise NotReady(LINK_BLOCKED)
         autonomous = isinstance(command, Mode) and command.mode == "autonomous"
         if autonomous or isinstance(command, Raw):
+            self.require_sure()
             self._authority.require_motion()
         self._show(topic, self._robot.command(topic, command, now), who)
         if isinstance(command, Mode):
@@ -129,6 +136,8 @@ class Commands:
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
         try:
             self.require_ready()
+            if command.moving:
+                self.require_sure()
         except Refused as refusal:
             if command.moving:
                 self._leases.hold_back(str(refusal), stops=False)

@@ -55,7 +55,7 @@ class Conversation:
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
-        self._seen = (session.state, session.busy)
+        self._seen = (session.state, session.busy, session.doubts)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
         self._malformed_logged = 0
@@ -204,7 +204,7 @@ class Conversation:
 
     def _notify(self) -> None:
         """Tell of a change of state, once."""
-        now = (self.session.state, self.session.busy)
+        now = (self.session.state, self.session.busy, self.session.doubts)
         if now != self._seen:
             self._seen = now
             self._changed()

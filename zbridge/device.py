@@ -45,6 +45,7 @@ ATTEND_EVERY = 64
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
+_IN_DOUBT = "connection in doubt"
 _ASKED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
 
@@ -81,9 +82,10 @@ class Device:
         self._publishers: dict[str, Publisher] = {}
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
+        self._doubtful: str | None = None
         self._leaving = False
         self._greeted: Session[Any] | None = None
-        self._questions = Questions(asyncio.get_running_loop(), patient=lambda: self._busy is not None)
+        self._questions = Questions(asyncio.get_running_loop())
         self._standstill = Standstill(
             robot,
             self._conditions,
@@ -185,6 +187,8 @@ class Device:
         if session is not self._robot.driving:
             return
         busy, self._busy = self._busy, session.busy
+        doubtful, self._doubtful = self._doubtful, session.doubtful
+        self._conditions.set(_IN_DOUBT, "; ".join(session.doubts) or None)
         if session.over:
             self._commands.blocked = False
             self._conditions.set("link", None)
@@ -201,6 +205,8 @@ class Device:
                 self._publish(topic, message)
         elif busy != self._busy:
             self._leases.hold_back(self._busy or "no longer busy", stops=True)
+        if self._doubtful and not doubtful:
+            self._leases.hold_back(self._doubtful, stops=True)
 
     def _on_stall(self, name: str, stalled: bool) -> None:
         """Drive no robot whose link takes nothing: it would obey late, or lose its stop with the rest."""
@@ -324,7 +330,10 @@ class Device:
         topic = _ASKED[self._keys.path(question.key)]
         try:
             self._commands.require_ready()
-            if self._questions.add(topic, question):
+            known = self._robot.known(topic)
+            if known is not None:
+                question.answer(payloads.encode(known))
+            elif self._questions.add(topic, question):
                 self._robot.ask(topic)
                 self._pump()
         except Refused as refusal:

@@ -67,11 +67,15 @@ class Robot(ABC):
 
     @abstractmethod
     def stop(self, now: float, until: float) -> None:
-        """Send the robot its stop before anything else, and repeat it until ``until``."""
+        """Send the robot its stop before anything else, and repeat it until ``until``; once if that is ``now``."""
 
     @abstractmethod
     def ask(self, topic: Topic) -> None:
         """Ask the robot for what it publishes on ``topic``; raise Refused where it cannot be asked."""
+
+    def known(self, topic: Topic) -> FleetMessage | None:
+        """Give what is answered at once to who asks for ``topic``; None where the robot is to be asked."""
+        return None
 
     @property
     def on_demand(self) -> tuple[Topic, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
 
 from zbridge.bus import Question
 from zbridge.errors import Code, NotReady
@@ -11,24 +10,14 @@ from zbridge.fleet.topics import Topic
 
 ANSWER_S = 2.0
 """Seconds the robot has to answer."""
-PATIENCE = 15
 WAITING = 64
 """Queries that may wait for one topic; one more is refused."""
 
 
 class Questions:
-    """The queries that wait, by the topic that will answer them.
+    """The queries that wait, by the topic that will answer them."""
 
-    ``patient`` tells whether the robot is busy with an answer: then they wait up to :data:`PATIENCE` times longer.
-    """
-
-    def __init__(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        answer_s: float = ANSWER_S,
-        patient: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self._patient = patient
+    def __init__(self, loop: asyncio.AbstractEventLoop, answer_s: float = ANSWER_S) -> None:
         self._loop = loop
         self._answer_s = answer_s
         self.waiting: dict[str, list[tuple[Question, asyncio.TimerHandle]]] = {}
@@ -69,12 +58,6 @@ class Questions:
                 timer.cancel()
                 question.refuse(NotReady(reason))
 
-    def _expire(self, topic: Topic, question: Question, again: int = PATIENCE) -> None:
-        if self._patient() and again:  # the answer is on its way, in parts
-            waiting = self.waiting[topic.path]
-            place = next(number for number, entry in enumerate(waiting) if entry[0] is question)
-            timer = self._loop.call_later(self._answer_s, self._expire, topic, question, again - 1)
-            waiting[place] = (question, timer)
-            return
+    def _expire(self, topic: Topic, question: Question) -> None:
         self.remove(topic, question)
         question.refuse(NotReady(f"the robot did not answer within {self._answer_s:g} s"))

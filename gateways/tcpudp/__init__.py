@@ -32,6 +32,7 @@ udp = true                              # use datagrams where the robot offers t
 gap_s = 0.01                            # least time between two packets: robots take one read as one packet
 force = []                              # features to use although the robot does not announce them, for
                                         # example ["joystick", "lidar"], and ids of raw packets it knows
+announce = ["udp", "lidar_sim"]         # features the gateway says it has; without "lidar_sim" a 1.4 robot sends no map
 combine = "exclusive"                   # drive that moves and turns: "exclusive" sends the larger, "both" both
 speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale

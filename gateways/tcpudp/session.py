@@ -14,6 +14,10 @@ from gateways.tcpudp.messages import (
     PACKETS,
     SERVER_ID,
     Carrier,
+    ClientControllMode,
+    ClientGetPosition,
+    ClientGetSLAMMap,
+    ClientLidarMode,
     ClientSettings,
     ClientUDPConnection,
     ClientUDPConnectionStatus,
@@ -22,7 +26,6 @@ from gateways.tcpudp.messages import (
     Packet,
     Sender,
     ServerSettings,
-    ServerSLAMMapPart,
     ServerStartUDP,
     ServerUDPConnection,
     decoder,
@@ -31,7 +34,8 @@ from gateways.tcpudp.messages import (
     read_header,
 )
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
-from gateways.tcpudp.versions import LISTED, VERSIONS, announced
+from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
+from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, Malformed, ProtocolError, Unsupported
 from zbridge.session.negotiation import agree, newest, parse_versions
 from zbridge.session.probe import Probe, Verdict
@@ -44,13 +48,16 @@ PROBE_S = 2.0
 """Seconds each end waits for the other's datagram."""
 REPORT_S = 3.0
 """Seconds an HQ has for packet 7: it may wait :data:`PROBE_S` for a 6 that was lost."""
-SILENCE_S = 2.05
-"""Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7."""
-MAP_SILENCE_S = 1.5
-"""Seconds without a map part after which a robot's TCP side is taken to be free again."""
-BUSY_MAP = "busy: map"
+SILENCE_S = 2.5
+"""Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7: it sleeps 2 s, and may be late."""
 LATE_START = "handshaking"
+AGAIN_S = 0.3
+"""Seconds after which what is sent once and matters is sent again to robots that misread a tenth of what they get."""
 _QUOTED = 80
+_AUTONOMOUS = 3
+_MODE_AGAIN, _LIDAR_AGAIN = "mode again", "lidar again"
+_MISREADING = frozenset({"1.1", "1.2"})
+_ANSWERED = (ClientGetSLAMMap, ClientGetPosition)
 
 
 def limits(gap_s: float) -> Limits:
@@ -105,29 +112,57 @@ class _TcpUdpSession(Session[Packet]):
 _OWN = {Role.HQ: Sender.HQ, Role.ROBOT: Sender.ROBOT}
 
 
+class _Chosen(bytes):
+    """A packet 10 that was commanded; the 1 of a stop is none."""
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether the robot's own program is to drive."""
+        return self[HEADER.size] == _AUTONOMOUS
+
+
 class HqSession(_TcpUdpSession):
     """We play HQ towards a robot.
 
     ``udp``: offer datagrams. ``force``: features and packet ids to use although it does not announce them.
+    ``announce``: the features that we announce. ``predecessor``: the session of the connection before.
     """
 
     role = Role.HQ
-    handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, ServerSLAMMapPart})
+    handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, DebugMessage})
     _decoders = decoders(Sender.HQ, (SERVER_ID,))
 
-    def __init__(self, limits: Limits, *, udp: bool = True, force: Iterable[Feature | int] = ()) -> None:
+    def __init__(
+        self,
+        limits: Limits,
+        *,
+        udp: bool = True,
+        force: Iterable[Feature | int] = (),
+        announce: Iterable[Feature] = ANNOUNCED,
+        predecessor: HqSession | None = None,
+    ) -> None:
         super().__init__(limits)
         self.sender_id = 0
         self.settings: Settings | None = None
-        self._udp = udp
+        self.autonomous: bool = predecessor is not None and predecessor.autonomous
+        """Whether mode 3 was sent, on this connection or one before, and no other mode was commanded since."""
+        self._announce = frozenset(announce)
+        self._udp = udp and Feature.UDP in self._announce
         self._force = frozenset(force)
         self._allowed: set[type[Packet]] = set()
         """Classes of packets that this robot's settings were found to allow."""
         self._agreed = ""
         self._start = Probe(PROBE_S)
         self._probe = Probe(PROBE_S)
+        self._answered: bool | None = None
+        """Whether the robot got our datagram and we its answer; None where none was sent."""
         self._silent_until = math.inf
-        self._map_until = math.inf
+        self._chosen: _Chosen | None = None
+        """The mode that was commanded last."""
+        self._signs: Signs = Signs(predecessor._signs if predecessor is not None else None)
+        self._look_at = math.inf
+        self._others = 0
+        """Packets that came and are no telemetry."""
 
     def overdue(self) -> str:
         if self.last_malformed is not None:
@@ -147,14 +182,15 @@ class HqSession(_TcpUdpSession):
         elif isinstance(message, ServerUDPConnection):
             self._take_answer(message, now, by_datagram=False)
         else:
-            if isinstance(message, ServerSLAMMapPart):
-                self._begin_map(now)
+            self._others += isinstance(message, DebugMessage)
             return True
+        self._others += 1
         return False
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if isinstance(message, ServerUDPConnection):
             self._take_answer(message, now, by_datagram=True)
+            self._others += 1
             return False
         return self.accept(message, now)
 
@@ -191,12 +227,55 @@ class HqSession(_TcpUdpSession):
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
 
+    # What is sent once and matters
+
+    def choose_mode(self, mode: int, now: float) -> None:
+        """Send a control mode that was commanded."""
+        frame = _Chosen(self.encode(ClientControllMode(mode)))
+        self._send_surely(frame, _MODE_AGAIN, now)
+        self._chosen = frame
+
+    def switch_lidar(self, mode: int, now: float) -> None:
+        """Send a lidar mode."""
+        self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
+        self._signs.asked(self._heard, 1 + self.outbox.stands(_LIDAR_AGAIN))
+
+    def _send_surely(self, frame: bytes, again: str, now: float) -> None:
+        """Send a packet, to robots that misread some again; a newer one ends the repetition of an older one."""
+        self.outbox.put(frame)
+        if self._agreed in _MISREADING:
+            self.outbox.stand(again, (frame,), now + AGAIN_S)
+
+    def send_nothing_again(self) -> None:
+        """Drop what is still to be repeated: the robot is stopped."""
+        self.outbox.clear(_MODE_AGAIN)
+        self.outbox.clear(_LIDAR_AGAIN)
+
+    def withdraw_autonomous(self) -> None:
+        """Let no mode 3 leave any more, neither for the first time nor again."""
+        if self._chosen is not None and self._chosen.autonomous:
+            self.outbox.withdraw(self._chosen)
+            self.outbox.clear(_MODE_AGAIN)
+
+    def outgoing(self, now: float) -> bytes | None:
+        frame = super().outgoing(now)
+        if type(frame) is _Chosen:
+            # A robot that may have misread another mode is in mode 3 until that was sent again.
+            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.stands(_MODE_AGAIN))
+        return frame
+
+    def send(self, message: Packet) -> None:
+        super().send(message)
+        if isinstance(message, _ANSWERED):
+            self._signs.asked(self._heard)
+
     # Handshake
 
     def _take_settings(self, message: ServerSettings, now: float) -> None:
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
         self.sender_id = message.client_id
+        self._doubt()
         listed = parse_versions(message.versions)
         agreed = agree(VERSIONS, listed)
         if agreed is None:
@@ -206,12 +285,13 @@ class HqSession(_TcpUdpSession):
         self._agreed = agreed
         udp = self._udp and self.settings.udp
         answer = VERSIONS[agreed].answer or message.versions
-        self.send_first(ClientSettings(answer, announced(answer, udp=udp)))
+        features = self._announce if udp else self._announce - {Feature.UDP}
+        self.send_first(ClientSettings(answer, announced(answer, features)))
         if udp:
             self._limit_at = math.inf
             self._start.begin(now)
         else:
-            self._finish()
+            self._finish(now)
 
     def _take_start(self, now: float) -> None:
         """Packet 4: send 5 by UDP at once, and nothing by TCP but one 7 until the silence has ended."""
@@ -223,11 +303,13 @@ class HqSession(_TcpUdpSession):
         self._silent_until = now + SILENCE_S
         self.outbox.quiet(self._silent_until)
         if offered:
+            self._answered = False
             self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
         self._probe.begin(now)
 
     def _take_answer(self, message: ServerUDPConnection, now: float, *, by_datagram: bool) -> None:
         works = message.received and by_datagram
+        self._answered = self._answered or works
         if not self._probe.settle(works=works):
             raise ProtocolError("serverUDPConnection was not due")
         self._report_probe(works=works)
@@ -237,41 +319,44 @@ class HqSession(_TcpUdpSession):
             self.transport = "udp"
         self.send_first(ClientUDPConnectionStatus(works))
 
-    def _finish(self) -> None:
+    def _finish(self, now: float) -> None:
         assert self.settings is not None
         self.establish(self._agreed, tuple(feature.value for feature in self.settings.features))
+        self._look_at = now + LOOK_S
 
     # Timers
 
     def timers(self) -> float:
-        return min(self._start.deadline, self._probe.deadline, self._silent_until, self._map_until)
+        return min(self._start.deadline, self._probe.deadline, self._silent_until, self._look_at)
 
     def on_timer(self, now: float) -> None:
         if self._start.expire(now):
-            self._finish()  # the robot wants no datagrams after all
+            self._finish(now)  # the robot wants no datagrams after all
         if self._probe.expire(now):
             self._report_probe(works=False)
         if now >= self._silent_until:
             self._silent_until = math.inf
             if self.state is State.HANDSHAKING:
-                self._finish()
+                self._finish(now)
             elif self.busy == LATE_START:
                 self.busy = None
-        if now >= self._map_until:
-            self.end_map()
+        if now >= self._look_at:
+            self._signs.look(self._heard, unanswered=self._answered is False)
+            self._doubt()
+            self._look_at = now + LOOK_AGAIN_S
 
-    # A robot that sends its map in parts takes nothing by TCP meanwhile
+    # Signs of a connection that is not the robot's one usable connection
 
-    def _begin_map(self, now: float) -> None:
-        self.busy = BUSY_MAP
-        self.outbox.held = True
-        self._map_until = now + MAP_SILENCE_S
+    def malformed(self, what: str) -> None:
+        super().malformed(what)
+        self._doubt()
 
-    def end_map(self) -> None:
-        """Take note that the last part has come: the robot reads again."""
-        self._map_until = math.inf
-        self.busy = None
-        self.outbox.held = False
+    @property
+    def _heard(self) -> int:
+        return self.traffic.frames_in - self.traffic.malformed - self._others
+
+    def _doubt(self) -> None:
+        self.doubts = self._signs.gather(self.sender_id, self.traffic)
 
 
 _FROM_HQ: dict[int, Decode] = {

@@ -67,7 +67,7 @@ CLIENTS = range(2, 256)
 QUIET_S = 2.0
 """Seconds before a client id is given again ("The gateway as robot")."""
 PARTS = 4
-"""Packets in which a robot of version "1.4" sends its map, one a second."""
+"""Packets in which a robot of version "1.4" sends its map, one a second, again and again; deployed ones make 4096."""
 
 
 def settings_of(version: str, *, udp: bool) -> Settings:
@@ -208,25 +208,22 @@ class Simulator:
     def _deliver(self, conversation: Conversation, messages: list[Packet]) -> None:
         for message in messages:
             if self._parts and isinstance(message, ClientGetSLAMMap):
-                self._send_parts(conversation)
-                continue
+                continue  # an empty handler
             for answer in self.vehicle.take(message):
                 _send(conversation, answer)
 
-    def _send_parts(self, conversation: Conversation) -> None:
-        """Send the map as it is now in parts, one a second."""
+    def _send_part(self, number: int) -> None:
+        """Send a part of the map as deployed robots do: to who announced LidarSim, without asking who knows it."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)
-        for number, start in enumerate(range(0, len(cells), size)):
-            part = ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
-            self._loop.call_later(number * 1.0, self._send_part, conversation, part)
-
-    def _send_part(self, conversation: Conversation, part: ServerSLAMMapPart) -> None:
-        """Send a part as deployed robots do: to whoever asked, without asking whether it knows the packet."""
-        if conversation.session.state is State.ESTABLISHED:
-            with contextlib.suppress(Refused):
-                conversation.session.send(part)
-            conversation.pump()
+        start = number % PARTS * size
+        part = ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
+        for conversation in tuple(self._peers.values()):
+            session = conversation.session
+            if session.state is State.ESTABLISHED and Feature.LIDAR_SIM.value in session.features:
+                with contextlib.suppress(Refused):
+                    session.send(part)
+                conversation.pump()
 
     def _tell_all(self, message: Packet) -> None:
         for conversation in tuple(self._peers.values()):
@@ -247,7 +244,9 @@ class Simulator:
             if steps % _MAP_EVERY == 0:
                 if self.vehicle.lidar:
                     self.vehicle.look()
-                if not self._parts:
+                if self._parts:
+                    self._send_part(steps // _MAP_EVERY)
+                else:
                     self._tell_all(self.vehicle.map())
             if steps % _ASK_EVERY == _ASK_EVERY // 2:
                 self._tell_all(ServerGetSimulatedLidarData())

@@ -30,6 +30,8 @@ _DATAGRAM_BYTES = 65536
 _SEND_S = 5.0
 _BIND_TRIES = 20
 _FROZEN_KEPT = 16
+_LATE_S = 0.1
+"""How late this process may be before what it reads is taken to have piled up."""
 _log = logging.getLogger(__name__)
 
 
@@ -70,8 +72,10 @@ class StrictRobot(Judge):
         client_id: int | None = None,
         times: Times = _DEPLOYED,
         loss: Loss = Loss.NOTHING,
-        parts: int = 4,
+        parts: int = 4096,
         misnamed: float = 0.25,
+        misread: float = 0.0,
+        again: bool = False,
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
@@ -79,7 +83,10 @@ class StrictRobot(Judge):
 
         ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
         announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
-        fraction of positions sent as id 53; ``keep``: bound of every list; ``note``: called with each violation.
+        fraction of positions sent as id 53; ``misread``: the fraction of what is dropped after the handshake, of
+        each packet id in an order of its own; ``again``: take a connection after the first, which loses half of all
+        packets in both directions and gets no telemetry ("One usable connection"); ``keep``: bound of every list;
+        ``note``: called with each violation.
         """
         known = frozenset(list(Feature)[: wire.FLAGS[version]])
         others = known if features is None else frozenset(features)
@@ -90,29 +97,39 @@ class StrictRobot(Judge):
         self.features = (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
         self.client_id = client_id or random.Random(seed).randint(1, 255)
         self.received: list[tuple[float, Channel, int, bytes]] = []
+        self.misread: list[tuple[float, Channel, int, bytes]] = []
         self.machine = wire.Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
         self._sleeps, self._answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
         self._pauses = random.Random(f"{seed} pause")
+        self._misreads = {kind: random.Random(f"{seed} misread {kind}") for kind in range(256)}
+        self._losses = random.Random(f"{seed} loss")
+        self._misread, self._again, self._poor = misread, again, False
         self._phase = _Phase.LISTENING
-        self._reads = wire.Reads()
         self._conn: socket.socket | None = None
         self._broken: ConnectionResetError | None = None
         self._udp: socket.socket | None = None
         self._sending = asyncio.Lock()
         self._tasks: asyncio.TaskGroup | None = None
         self._late_s = 0.0
+        self._ticked_at = math.inf
+        self._pause_s, self._woke_at = 0.0, -math.inf
         self._wake_at = 0.0
-        self._awake = asyncio.Event()
         self._closed_at = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        """Know nothing of an HQ."""
+        self._reads = wire.Reads()
+        self._awake = asyncio.Event()
         self._hq_features: frozenset[Feature] = frozenset()
         self._source: tuple[str, int] | None = None
         self._probes = 0
         self._offered = self._answered = self._asked_map = False
+        self._quiet_until = -math.inf
         self._status: bool | None = None
-        self._map_since: float | None = None
-        self._driven_at = -math.inf
+        self._parts_since = math.inf
 
     def __repr__(self) -> str:
         return f"<StrictRobot {self.version} {self._phase.name} violations={len(self.violations)} alive={self.alive}>"
@@ -138,23 +155,36 @@ class StrictRobot(Judge):
         """Serve the first connection; take all others and say nothing ("One usable connection per start")."""
         assert self._tasks is not None
         loop = asyncio.get_running_loop()
-        self._conn, _ = await loop.sock_accept(tcp)
-        self._conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._tasks.create_task(self._converse(sockets.enter_context(self._conn)))
         frozen: list[socket.socket] = []
         while True:
             conn, peer = await loop.sock_accept(tcp)
+            if self._phase is _Phase.LISTENING or (self._again and self._conn is None):
+                self._begin(conn)
+                self._tasks.create_task(self._converse(sockets.enter_context(conn)))
+                continue
             self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase.name.lower()}")
             frozen.append(sockets.enter_context(conn))
             for old in frozen[:-_FROZEN_KEPT]:
                 old.close()
             del frozen[:-_FROZEN_KEPT]
 
+    def _begin(self, conn: socket.socket) -> None:
+        """Begin with an HQ; with one that is not the first, poorly."""
+        conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._phase is not _Phase.LISTENING:
+            self._poor, self.client_id = True, max(2, self.client_id) % 255 + 1
+            self._forget()
+        self._phase, self._conn = _Phase.GREETED, conn
+
+    def cut(self) -> None:
+        """Break the connection."""
+        if self._conn is not None:
+            self._conn.shutdown(socket.SHUT_RDWR)
+
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
         loop = asyncio.get_running_loop()
         try:
-            self._phase = _Phase.GREETED
             settings = wire.server_settings(self.version, self.client_id, self.features)
             await self._send(wire.SERVER_SETTINGS, settings)
             while data := await loop.sock_recv(conn, wire.READ_BYTES):
@@ -172,12 +202,20 @@ class StrictRobot(Judge):
                 conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
 
     async def _read(self, data: bytes) -> None:
+        """Take what one read gave as one packet: what piled up while this process stood still is lost."""
         received, problem = self._reads.take(data)
         if problem:
-            late = self._late_s > 0.005 and "packets" in problem  # joined by this process rather than by the HQ?
-            self._violate(problem + f" (this process woke {self._late_s * 1000:.0f} ms late)" * late)
+            late_s = max(self._late_s, self._stood_s())
+            late = late_s > 0.005 and "packets" in problem  # joined by this process rather than by the HQ?
+            self._violate(problem + f" (this process woke {late_s * 1000:.0f} ms late)" * late)
         if received is not None:
             await self._take(received, "tcp")
+
+    def _stood_s(self) -> float:
+        """Tell for how long this process has just stood still; whichever of its tasks runs first may ask."""
+        now = time.monotonic()
+        since_tick_s = now - self._ticked_at
+        return since_tick_s if since_tick_s > _LATE_S else self._pause_s if now - self._woke_at < _LATE_S else 0.0
 
     async def _nap(self) -> None:
         planned = self._sleeps.uniform(0, self._times.read_s)
@@ -188,6 +226,8 @@ class StrictRobot(Judge):
     async def _send(self, kind: int, body: bytes = b"") -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
         data = wire.packet(kind, body)
+        if self._phase is _Phase.ESTABLISHED and self._loses():
+            return
         if kind in wire.BY_UDP and self._status:
             self._send_datagram(data)
         elif (conn := self._conn) is not None:
@@ -214,6 +254,8 @@ class StrictRobot(Judge):
 
     async def _datagram(self, data: bytes, source: tuple[str, int]) -> None:
         """Take one datagram ("The gateway as HQ": no UDP before TCP, no wrong length field)."""
+        if self._loses():
+            return
         if self._phase is _Phase.FROZEN:
             if time.monotonic() - self._closed_at > self._times.flight_s:
                 self._violate(f"a datagram after the TCP connection ended: {show(data)}")
@@ -247,7 +289,7 @@ class StrictRobot(Judge):
             self._violate(f"{self._probes} probes 5 by UDP instead of one")
         elif self._phase is not _Phase.ASLEEP:
             self._violate(f"the probe 5 came later than {self._times.probe_s:g} s after the 4")
-        elif self._loss is Loss.NOTHING:
+        elif self._loss is Loss.NOTHING and not self._loses():
             self._answered = True
             self._send_datagram(wire.packet(wire.UDP_ANSWER, b"\x01"))
 
@@ -256,6 +298,12 @@ class StrictRobot(Judge):
     async def _take(self, received: Packet, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
+        if self._phase is _Phase.ESTABLISHED and self._misreads[kind].random() < self._misread:
+            self.misread.append((time.monotonic(), channel, kind, body))
+            del self.misread[: -self._keep]
+            return
+        if self._phase is _Phase.ESTABLISHED and channel == "tcp" and self._loses():
+            return
         self.received.append((time.monotonic(), channel, kind, body))
         del self.received[: -self._keep]
         if kind not in self._registered:
@@ -280,9 +328,10 @@ class StrictRobot(Judge):
             return f"packet {kind} while the robot waits for {' or '.join(map(str, sorted(expected)))}"
         if by_udp != (channel == "udp"):
             return f"packet {kind} by {channel.upper()} instead of {'UDP' if by_udp else 'TCP'}"
-        since = self._map_since
-        if kind in (wire.MOVE, wire.ROTATE) and since and time.monotonic() - since > self._times.flight_s:
-            return "a drive command while map parts are sent"
+        if channel == "tcp" and kind != wire.UDP_STATUS and time.monotonic() < self._quiet_until:
+            return f"packet {kind} by TCP within {self._times.silence_s:g} s of the 4"
+        if kind == wire.GET_MAP and time.monotonic() - self._parts_since > self._times.flight_s:
+            return "packet 52 to a robot that sends its map in parts by itself"
         return wire.body_problem(kind, body)
 
     async def _obey(self, kind: int, body: bytes) -> None:
@@ -292,7 +341,8 @@ class StrictRobot(Judge):
             self._conclude(any(body))
         elif kind in (wire.MOVE, wire.ROTATE, wire.STOP):
             self.machine.steer(body)
-            self._driven_at = time.monotonic()
+        elif kind == wire.MODE:
+            self.machine.choose(body)
         elif kind == wire.LIDAR_MODE:
             self.machine.lidar_on = body[0] == 1
             await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
@@ -326,6 +376,7 @@ class StrictRobot(Judge):
         assert self._tasks is not None
         self._offered, self._phase = True, _Phase.ASLEEP
         self._wake_at = time.monotonic() + self._times.probe_s
+        self._quiet_until = time.monotonic() + self._times.silence_s
         await self._send(wire.START_UDP)
         self._tasks.create_task(self._miss_status())
         await asyncio.sleep(self._times.probe_s)
@@ -362,72 +413,57 @@ class StrictRobot(Judge):
     def _establish(self) -> None:
         assert self._tasks is not None
         self._phase = _Phase.ESTABLISHED
+        if self._poor:
+            return
         if self._times.unasked_s:
-            self._tasks.create_task(self._chatter())
+            self._tasks.create_task(self._chatter(self._conn))
+        if self.version == "1.4" and Feature.LIDAR_SIM in self._hq_features:
+            self._tasks.create_task(self._send_parts(self._conn))
+
+    def _loses(self) -> bool:
+        """Tell whether a poor connection loses the packet."""
+        return self._poor and self._losses.random() < 0.5
 
     # Motion, maps, talk
 
     async def _move(self) -> None:
-        """Move; stop after a second without any of 11, 12, 13 ("Packets")."""
+        """Move as told, for ever: a deployed robot does not stop by itself."""
         last = time.monotonic()
         while True:
             await asyncio.sleep(_TICK_S)
-            now = time.monotonic()
-            if now - self._driven_at <= self._times.silence_s:
-                self.machine.step(min(now - last, 0.1))
+            self._ticked_at = now = time.monotonic()
+            if now - last > _LATE_S:
+                self._pause_s, self._woke_at = now - last, now
+            self.machine.step(min(now - last, 0.1))
             last = now
 
     async def _send_map(self) -> None:
-        """Answer 52: whole, or in parts from a "1.4"; the first answer of a 1.1 robot says no map yet ("Packets")."""
-        if self.version == "1.4":
-            await self._send_parts()
-        elif self.version == "1.1" and not self._asked_map:
+        """Answer 52; the first answer of a 1.1 robot says no map yet, the handler of a "1.4" is empty ("Packets")."""
+        if self.version == "1.1" and not self._asked_map:
             await self._send(wire.MAP)
-        else:
+        elif self.version != "1.4":
             await self._send(wire.MAP, self.machine.body(wire.MAP))
         self._asked_map = True
 
-    async def _send_parts(self) -> None:
-        """Send the map in parts without reading TCP; only stops may come meanwhile ("The gateway as HQ")."""
-        flight = 0
-        for index, body in enumerate(self.machine.parts(self._parts)):
-            if index > 1:
-                await asyncio.sleep(self._times.part_s)
-            elif index:
-                await asyncio.sleep(self._times.flight_s)
-                flight = len(self._waiting(socket.MSG_PEEK) or b"")
-                await asyncio.sleep(self._times.part_s - self._times.flight_s)
-            await self._send(wire.MAP_PART, body)
-            self._map_since = self._map_since or time.monotonic()
-        self._map_since = None
-        if self._parts > 1 and (data := self._waiting()) != b"":
-            await self._joined(data or b"", flight)
+    async def _send_parts(self, conn: socket.socket | None) -> None:
+        """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
+        with contextlib.suppress(OSError):
+            while True:
+                for body in self.machine.parts(self._parts):
+                    if self._conn is not conn:
+                        return
+                    await self._send(wire.MAP_PART, body)
+                    self._parts_since = min(self._parts_since, time.monotonic())
+                    await asyncio.sleep(self._times.part_s)
 
-    async def _joined(self, data: bytes, flight: int) -> None:
-        """Judge what came while parts were sent; the first ``flight`` bytes were sent before the HQ could know."""
-        packets, rest, _ = wire.cut(data)
-        end = 0
-        for packet in packets:
-            end += 6 + len(packet.body)
-            text = f"packet {packet.kind} by TCP while map parts were sent, joined in one read: {show(data)}"
-            if packet.kind != wire.STOP and end > flight:
-                self._violate(text)
-            elif packet.kind != wire.STOP:
-                self._event(f"in flight: {text}")
-        if Feature.JOYSTICK in self.features and wire.STOP not in {packet.kind for packet in packets}:
-            self._violate(f"no stop 13 while map parts were sent: {show(data)}")
-        if rest or len(packets) == 1:
-            await self._read(data)
-
-    async def _chatter(self) -> None:
+    async def _chatter(self, conn: socket.socket | None) -> None:
         mean = self._times.unasked_s
         with contextlib.suppress(OSError):
             for kind, body in self.machine.unasked(self.version, self.features, self._hq_features):
                 await asyncio.sleep(self._pauses.uniform(0.5 * mean, 1.5 * mean))
-                if self._conn is None:
+                if self._conn is not conn:
                     return
-                if self._map_since is None:
-                    await self._send(kind, body or self.machine.body(kind))
+                await self._send(kind, body or self.machine.body(kind))
 
     def _waiting(self, flags: int = 0) -> bytes | None:
         """Read what is there without waiting: none where nothing is, empty at the end of the stream."""

@@ -35,6 +35,8 @@ MAP_CM, CELL_CM = 1000, 10
 _TAIL_BYTES = 1 << 20
 _SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
 _RANGE_M = 8.0
+_PROGRAM = (0.2, 0.0, 0.3)
+"""How the robot's own program drives: m/s forward and left, rad/s."""
 
 
 class Feature(enum.IntEnum):
@@ -73,8 +75,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest sleep between two reads."""
     probe_s: float = 2.0
     """Sleep after packet 4, and the time a probe 5 may take."""
-    silence_s: float = 1.0
-    """Silence after which the robot stops by itself."""
+    silence_s: float = 2.5
+    """Time after packet 4 in which nothing but the 7 may come by TCP: a loaded robot sleeps longer than it wants."""
     part_s: float = 1.0
     """Time from one map part to the next."""
     unasked_s: float = 0.4
@@ -358,19 +360,38 @@ class Machine:
         self.lidar_on = self.camera_on = False
         self._random = random
         self._drive = (0.0, 0.0, 0.0)
+        self._on_its_own = False
         grid, angles = Grid(MAP_CM // CELL_CM, CELL_CM / 100), np.radians(np.arange(360.0))
         grid.see(0.0, 0.0, angles, cast(0.0, 0.0, angles, _RANGE_M), _RANGE_M)
         self._map = grid.cells.tobytes()
 
     def steer(self, body: bytes) -> None:
         """Take the body of 11 (12 bytes), 12 (4 bytes) or 13 (none): y forward, x right, + right ("Packets")."""
+        if self._on_its_own:
+            return
         x, y, speed = struct.unpack("<3f", body) if len(body) == 12 else (0.0, 0.0, 0.0)
         turn = struct.unpack("<f", body)[0] if len(body) == 4 else 0.0
         speed, turn = (min(max(value, -1.0), 1.0) for value in (speed, turn))
         self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
 
+    def choose(self, body: bytes) -> None:
+        """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
+
+        When it ends, the motors go on as they went: only a 13 after it stops them.
+        """
+        self._on_its_own = body[0] == 3
+        if self._on_its_own:
+            self._drive = _PROGRAM
+
+    @property
+    def moving(self) -> bool:
+        """Whether the robot moves, and will go on: it never stops by itself."""
+        return any(self._drive)
+
     def step(self, dt: float) -> None:
-        """Move for ``dt`` seconds as steered."""
+        """Move for ``dt`` seconds as steered, in mode 3 as the robot's own program wants."""
+        if self._on_its_own:
+            self._drive = _PROGRAM
         self.place.step(*self._drive, dt)
 
     def body(self, kind: int) -> bytes:

@@ -7,7 +7,7 @@ forward, lengths in its own unit (centimetres), headings in degrees; the fleet's
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -23,7 +23,6 @@ from gateways.tcpudp.messages import (
     ClientJoystickMove,
     ClientJoystickRotate,
     ClientJoystickStop,
-    ClientLidarMode,
     ClientMoveAI,
     ClientSimulatedLidarData,
     DebugMessage,
@@ -38,7 +37,8 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
-from zbridge.errors import Malformed, NotReady, ProtocolError, Unsupported
+from gateways.tcpudp.versions import ANNOUNCED
+from zbridge.errors import Malformed, NotReady, ProtocolError, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
@@ -55,12 +55,14 @@ SCAN_POINTS = 360
 """Points deployed robots take in simulated lidar data, one a degree."""
 MAX_SIDE = 2048
 """Cells along a side of the largest map that is put together from parts."""
+AUTONOMOUS = "autonomous"
+_MODES = {"none": 1, "manual": 2, AUTONOMOUS: 3}
 _MOTION = "motion"
 _NOTHING = Outcome()
 _OCCUPIED = 2
 _RADIANS = math.pi / 180
 
-ForcedFeature = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
+FeatureName = Literal["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
 PacketId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Angle = Annotated[float, msgspec.Meta(ge=-7, le=7)]
@@ -72,7 +74,8 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     udp: bool = True
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
-    force: tuple[ForcedFeature | PacketId, ...] = ()
+    force: tuple[FeatureName | PacketId, ...] = ()
+    announce: tuple[FeatureName, ...] = tuple(feature.value for feature in ANNOUNCED)
     combine: Literal["exclusive", "both"] = "exclusive"
     speed_full: Scale = 1.0
     turn_full: Scale = 1.0
@@ -89,8 +92,17 @@ class TcpUdpRobot(Robot):
         self.options = options
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
+        self._announce = tuple(Feature(name) for name in options.announce)
         self._session: HqSession | None = None
+        self._chosen: str | None = None
+        """The mode that was commanded last."""
+        self._paired_until = self._rests_until = -math.inf
+        """How long a stop stands, and how long as a pair."""
         self._parts: bytearray | None = None
+        self._parts_ns = 0
+        self._parts_from: str | None = None
+        """The version of the robot, if it sends its map in parts."""
+        self._map_awaited = False
         self._unit_m = options.length_unit_m
         self._heading_offset = options.heading_offset
 
@@ -99,7 +111,14 @@ class TcpUdpRobot(Robot):
         return self._session
 
     def session(self, link: int, peer: str) -> HqSession:
-        self._session = HqSession(limits(self.options.gap_s), udp=self.options.udp, force=self._force)
+        self._session = HqSession(
+            limits(self.options.gap_s),
+            udp=self.options.udp,
+            force=self._force,
+            announce=self._announce,
+            predecessor=self._session,
+        )
+        self._paired_until = self._rests_until = -math.inf
         self._parts = None
         return self._session
 
@@ -124,6 +143,7 @@ class TcpUdpRobot(Robot):
 
     def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn the x-major cells (index = x * side + y) into rows of y, cells that are not 0, 1, 2 into unknown."""
+        self._map_awaited = False
         settings = self._session.settings if self._session is not None else None
         values = message.cells or b""
         side = _side(len(values), settings)
@@ -134,8 +154,9 @@ class TcpUdpRobot(Robot):
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
 
     def _map_part(self, message: ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Put a part in its place, cut where the map ends; the last one makes a map."""
+        """Put a part in its place, cut where the map ends; the last one makes a map, and one that is waited for."""
         session = self._connected()
+        self._parts_from = session.version
         side = announced_side(session.settings)
         if side == 0:
             raise ProtocolError("map part of a robot that announces no map size")
@@ -143,9 +164,9 @@ class TcpUdpRobot(Robot):
             self._parts = bytearray(side * side)
         cells = message.cells[: max(0, len(self._parts) - message.start)]
         self._parts[message.start : message.start + len(cells)] = cells
-        if message.end < len(self._parts):
+        self._parts_ns = stamp_ns
+        if message.end < len(self._parts) and not self._map_awaited:
             return ()
-        session.end_map()
         return self._map(ServerSLAMMap(bytes(self._parts)), stamp_ns)
 
     def _cell_m(self, settings: Settings | None) -> float:
@@ -181,15 +202,36 @@ class TcpUdpRobot(Robot):
         return carry_out(self, command, now) or _NOTHING
 
     def stop(self, now: float, until: float) -> None:
-        self._stand((ClientJoystickStop(),), now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+        """Send packet 13, in mode 3 the pair 1, 13; what was still to be sent again is not, unless this is routine."""
+        session = self._connected()
+        session.withdraw_autonomous()
+        if until > now:
+            session.send_nothing_again()
+        self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
+
+    def known(self, topic: Topic) -> FleetMessage | None:
+        """Give the map as far as it has come in parts; later cells replace those of the map before."""
+        if topic is not topics.MAP or self._parts is None:
+            return None
+        ((_, shown),) = self._map(ServerSLAMMap(bytes(self._parts)), self._parts_ns)
+        return shown
 
     def ask(self, topic: Topic) -> None:
-        self._send(ClientGetSLAMMap() if topic is topics.MAP else ClientGetPosition())
+        if topic is not topics.MAP:
+            self._send(ClientGetPosition())
+            return
+        if self._parts_from is None or self._parts_from != self._connected().version:
+            self._send(ClientGetSLAMMap())
+        self._map_awaited = True  # of a robot that sends parts the next one is the answer: its handler of 52 is empty
 
     def _drive(self, command: Drive, now: float) -> Outcome:
         left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
         if not command.moving:
-            self._stand((ClientJoystickStop(),), now, period_s=REPEAT_S, until=now + 1.0, urgent=False)
+            session, on_its_own = self._connected(), self._chosen == AUTONOMOUS
+            if on_its_own:
+                session.withdraw_autonomous()
+            paired = on_its_own and session.autonomous
+            self._rest(now, period_s=REPEAT_S, until=now + 1.0, paired=paired, urgent=paired)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
         packets: list[Packet] = []
@@ -202,14 +244,24 @@ class TcpUdpRobot(Robot):
             rotates = abs(command.turn) > translation
             packets = packets[1:] if rotates else packets[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
-        self._stand(tuple(packets), now, period_s=REPEAT_S, until=math.inf, urgent=False)
+        session = self._connected()
+        frames = tuple(session.encode(packet) for packet in packets)
+        session.outbox.stand(_MOTION, frames, now, period_s=REPEAT_S)
+        self._rests_until = self._paired_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _mode(self, command: Mode, now: float) -> None:
-        self._send(ClientControllMode({"none": 1, "manual": 2, "autonomous": 3}[command.mode]))
+        """Send the mode; a stop that stands ends where the robot is to move by itself, and is no pair in any other."""
+        self._connected().choose_mode(_MODES[command.mode], now)
+        self._chosen = command.mode
+        if command.mode == AUTONOMOUS:
+            if now < self._rests_until:
+                self._connected().outbox.clear(_MOTION)
+        elif now < self._paired_until:
+            self._rest(now, period_s=STOP_REPEAT_S, until=self._paired_until, paired=False, urgent=False)
 
     def _switch_lidar(self, command: Switch, now: float) -> None:
-        self._send(ClientLidarMode(ON if command.on else OFF))
+        self._connected().switch_lidar(ON if command.on else OFF, now)
 
     def _switch_camera(self, command: Switch, now: float) -> None:
         raise Unsupported("no packet turns a camera on or off")
@@ -229,15 +281,30 @@ class TcpUdpRobot(Robot):
     def _send(self, message: Packet) -> None:
         self._connected().send(message)
 
-    def _stand(self, packets: tuple[Packet, ...], now: float, *, period_s: float, until: float, urgent: bool) -> None:
+    def _rest(self, now: float, *, period_s: float, until: float, paired: bool, urgent: bool) -> None:
+        """Let packet 13 stand, ``paired`` with a mode 1 before it; raise Refused where it may not be sent."""
         session = self._connected()
-        frames = tuple(session.encode(packet) for packet in packets)
-        session.outbox.stand(_MOTION, frames, now, period_s=period_s, until=until, urgent=urgent)
+        packets = (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
+        session.outbox.stand(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
+        self._rests_until, self._paired_until = until, until if paired else -math.inf
 
     def _connected(self) -> HqSession:
         if self._session is None:
             raise NotReady("offline")
         return self._session
+
+
+def _sendable(session: HqSession, packets: Iterable[Packet]) -> tuple[bytes, ...]:
+    """Write the packets that the robot may be sent; raise Refused where it may be sent none of them."""
+    frames, refusal = [], None
+    for packet in packets:
+        try:
+            frames.append(session.encode(packet))
+        except Refused as refused:
+            refusal = refused
+    if refusal is not None and not frames:
+        raise refusal
+    return tuple(frames)
 
 
 @np.errstate(all="ignore")  # absurd numbers are points the scan does not have

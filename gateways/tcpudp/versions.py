@@ -5,9 +5,11 @@ Source: "Settings and version negotiation" and "The gateway as robot" of the pro
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import msgspec
 
-from gateways.tcpudp.settings import HQ_BLOCKS, Settings, Settings12
+from gateways.tcpudp.settings import HQ_BLOCKS, Feature
 from zbridge.session.negotiation import newest, parse_versions
 
 LISTED = ("1.1", "1.2", "1.3")
@@ -37,10 +39,11 @@ VERSIONS = {
 }
 
 
-def announced(listed: str, *, udp: bool) -> bytes:
-    """Write the settings block of an HQ that lists these versions: what deployed HQ programs announce."""
+ANNOUNCED = (Feature.UDP, Feature.LIDAR_SIM)
+"""What deployed HQ programs announce."""
+
+
+def announced(listed: str, features: Collection[Feature]) -> bytes:
+    """Write the settings block of an HQ that lists these versions, as far as the block has flags for the features."""
     block = HQ_BLOCKS[newest(parse_versions(listed), known=HQ_BLOCKS) or "1.1"]
-    flags: dict[str, bool] = {"udp": udp}
-    if issubclass(block, Settings12):
-        flags["lidar_sim"] = True
-    return block(**flags).encode() if block is not Settings else Settings(udp=udp).encode()
+    return block(**{feature.value: True for feature in features if hasattr(block, feature.value)}).encode()

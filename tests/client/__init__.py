@@ -47,7 +47,7 @@ class Machine(Robot):
 
     @property
     def driving(self) -> Any:
-        return SimpleNamespace(over=False, busy=None, state=State.ESTABLISHED)
+        return SimpleNamespace(over=False, busy=None, doubtful=None, state=State.ESTABLISHED)
 
     def translator(self, kind: type) -> Any:
         raise NotImplementedError

@@ -1,7 +1,8 @@
 """The strict robot as a process of its own, so that nothing but the machine makes it late.
 
-``python -m tests.e2e.strict_robot VERSION UDP SEED``: prints its port; a line on stdin ends it, and it prints what
-it received and what was violated as one JSON object.
+``python -m tests.e2e.strict_robot VERSION UDP SEED [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its
+connection; any other ends it, and it prints what it received and what was violated as one JSON object. OPTIONS: more
+arguments of :class:`StrictRobot`, and ``times``, as a JSON object.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ from gateways.tcpudp.strict_parser import Times
 
 async def main() -> None:
     version, udp, seed = sys.argv[1], sys.argv[2] == "1", int(sys.argv[3])
-    robot = StrictRobot(version=version, udp=udp, seed=seed, times=Times(part_s=0.2))
+    options = json.loads(sys.argv[4]) if len(sys.argv) > 4 else {}
+    times = Times(**{"part_s": 0.2, **options.pop("times", {})})
+    robot = StrictRobot(version=version, udp=udp, seed=seed, times=times, **options)
     serving = asyncio.create_task(robot.serve("127.0.0.1", 0, lambda port: print(port, flush=True)))
-    await asyncio.to_thread(sys.stdin.readline)
+    while await asyncio.to_thread(sys.stdin.readline) == "cut\n":
+        robot.cut()
     serving.cancel()
     await asyncio.wait([serving])
     print(
@@ -27,7 +31,9 @@ async def main() -> None:
                 "violations": robot.violations,
                 "events": robot.events,
                 "alive": robot.alive,
+                "moving": robot.machine.moving,
                 "received": [(channel, packet_id, body.hex()) for _, channel, packet_id, body in robot.received],
+                "misread": [(channel, packet_id, body.hex()) for _, channel, packet_id, body in robot.misread],
             }
         )
     )

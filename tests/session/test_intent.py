@@ -36,6 +36,33 @@ def on_its_own() -> Intent:
     return intent
 
 
+# A robot that drives itself
+
+
+def test_neutral_does_not_stop_a_robot_that_drives_itself() -> None:
+    """Deployed programs say it every half second while nobody touches the stick, in mode 3 too."""
+    intent = ready(modes=True)
+    assert intent.choose("autonomous", 0.0) is Do.ACQUIRE
+    assert intent.neutral(0.1) is Do.NOTHING
+    intent.granted(LEASE_S)
+    for step in range(1, 100):
+        assert intent.neutral(0.5 * step) is Do.NOTHING
+
+
+def test_neutral_after_motion_by_the_stick_stops_a_robot_that_drives_itself() -> None:
+    intent = on_its_own()
+    assert intent.motion(1.0) is Do.SEND
+    assert intent.neutral(1.5) is Do.SEND
+    assert intent.neutral(2.0) is Do.NOTHING
+
+
+def test_a_neutral_that_is_owed_is_sent_in_mode_3_too() -> None:
+    intent = on_its_own()
+    intent.refused("robot lost")
+    assert intent.neutral(1.0) is Do.SEND
+    assert intent.neutral(1.5) is Do.NOTHING
+
+
 # Neutral first
 
 
@@ -409,7 +436,9 @@ class Program(RuleBasedStateMachine):
     def let_go(self, whole: bool) -> None:
         self._age()
         held, asking = self.intent.held, self.intent.asking
-        assert self.intent.neutral(self.now, whole=whole) is (Do.SEND if held else Do.WAIT if asking else Do.NOTHING)
+        drives_itself = self.mode == "autonomous" and not self.owed and self.moving_until == math.inf
+        do = Do.NOTHING if drives_itself and whole else Do.SEND if held else Do.WAIT if asking else Do.NOTHING
+        assert self.intent.neutral(self.now, whole=whole) is do
         assert self.intent.asking is asking, "neutral asks for nothing"
         if whole:
             self.owed, self.moving_until = False, math.inf

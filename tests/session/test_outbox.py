@@ -218,6 +218,69 @@ def test_an_urgent_frame_is_the_first_of_its_repetitions() -> None:
     assert outbox.deadline() is None
 
 
+@pytest.mark.parametrize("group", [(b"stop",), (b"none", b"stop")])
+def test_an_urgent_group_that_stands_until_now_is_sent_exactly_once(group: tuple[bytes, ...]) -> None:
+    outbox = Outbox(0.01)
+    for now in (1.0, 2.0):
+        outbox.stand("motion", group, now, period_s=0.1, until=now, urgent=True)
+        assert drained(outbox, now, now + 0.9) == [(now + 0.01 * place, frame) for place, frame in enumerate(group)]
+        assert outbox.idle
+        assert outbox.deadline() is None
+
+
+def test_an_urgent_group_ends_what_stood_in_its_slot() -> None:
+    outbox = Outbox(0.01)
+    outbox.stand("motion", (b"drive",), 0.0, period_s=0.25)
+    outbox.stand("motion", (b"none", b"stop"), 0.0, period_s=0.1, until=0.0, urgent=True)
+    assert frames(drained(outbox, 0.0, 9.0)) == [b"none", b"stop"]
+
+
+def test_an_urgent_group_keeps_its_order_whatever_waits_already() -> None:
+    outbox = Outbox(0.01)
+    outbox.stand("motion", (b"stop",), 0.0, urgent=True)
+    for _ in range(10):
+        outbox.stand("motion", (b"none", b"stop"), 0.0, urgent=True)
+    assert frames(drained(outbox, 0.0, 9.0)) == [b"stop", b"none", b"stop"]
+
+
+def test_a_flood_of_urgent_groups_leaves_group_by_group() -> None:
+    """Neither does the second frame starve, nor does the flood grow."""
+    outbox = Outbox(0.01)
+    taken = []
+    for step in range(1000):
+        now = step / 1000
+        outbox.stand("motion", (b"none", b"stop"), now, period_s=0.1, until=now + 1.0, urgent=True)
+        if (frame := outbox.take(now)) is not None:
+            taken.append(frame)
+        assert len(outbox) <= 4
+    assert taken == ([b"none", b"stop"] * 50)[: len(taken)]
+    assert len(taken) >= 90
+
+
+def test_a_repeated_group_is_whole_at_its_end() -> None:
+    outbox = Outbox(0.01)
+    outbox.stand("motion", (b"none", b"stop"), 1.0, period_s=0.1, until=1.25, urgent=True)
+    assert frames(drained(outbox, 1.0, 9.0)) == [b"none", b"stop"] * 3
+
+
+def test_a_frame_that_waits_can_be_withdrawn_and_one_that_does_not_is_no_error() -> None:
+    outbox = Outbox(0.01)
+    for frame in (b"a", b"b", b"a", b"c"):
+        outbox.put(frame)
+    outbox.withdraw(b"a")
+    outbox.withdraw(b"d")
+    assert frames(drained(outbox, 0.0, 1.0)) == [b"b", b"c"]
+
+
+def test_an_outbox_tells_whether_anything_stands_in_a_slot() -> None:
+    outbox = Outbox(0.01)
+    assert not outbox.stands("again")
+    outbox.stand("again", (b"m",), 0.3)
+    assert outbox.stands("again")
+    assert drained(outbox, 0.0, 1.0) == [(0.3, b"m")]
+    assert not outbox.stands("again")
+
+
 def test_every_place_of_a_group_has_its_turn_although_the_group_is_renewed_all_the_time() -> None:
     outbox = Outbox(0.01)
     taken = []

@@ -312,10 +312,29 @@ def test_the_snapshot_does_not_change_with_the_session(established: Toy) -> None
 def test_a_snapshot_says_why_a_session_takes_no_commands_or_has_ended(session: Toy) -> None:
     session.open(0.0)
     session.establish("", ())
-    session.busy = "busy: map"
-    assert (session.snapshot().reason, session.snapshot().version) == ("busy: map", None)
+    session.busy = "handshaking"
+    assert (session.snapshot().reason, session.snapshot().version) == ("handshaking", None)
     session.lost("closed by peer")
     assert (session.snapshot().state, session.snapshot().reason) == ("closed", "closed by peer")
+
+
+def test_two_doubts_and_not_one_are_a_reason_not_to_move_the_peer(session: Toy) -> None:
+    session.open(0.0)
+    session.establish("", ())
+    assert session.doubtful is None
+    session.doubts = ("client id 3",)
+    assert session.doubtful is None
+    session.doubts = ("client id 3", "malformed packets")
+    assert session.doubtful == "connection in doubt: client id 3; malformed packets"
+    session.close("enough", 1.0)
+    assert (session.doubts, session.doubtful) == ((), None)
+
+
+def test_a_lost_session_is_in_no_doubt(session: Toy) -> None:
+    session.open(0.0)
+    session.doubts = ("client id 3", "malformed packets")
+    session.lost("closed by peer")
+    assert session.doubts == ()
 
 
 # The peer's rate

@@ -82,8 +82,13 @@ class Intent:
         return self._act()
 
     def neutral(self, now: float, *, whole: bool = True) -> Do:
-        """Take neutral; of a part only, where the program still says motion of another: that ends nothing."""
+        """Take neutral; of a part only, where the program still says motion of another: that ends nothing.
+
+        Programs say neutral all the time while nobody touches the stick: it is no stop for a robot that drives itself.
+        """
         self.expire(now)
+        if self.mode == "autonomous" and whole and self.held_back is None and not self._moving:
+            return Do.NOTHING
         if whole:
             self.held_back, self._moving = None, False
         return Do.SEND if self.held else Do.WAIT if self.asking else Do.NOTHING

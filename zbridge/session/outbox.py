@@ -41,7 +41,7 @@ class _Standing:
 
     @property
     def over(self) -> bool:
-        return self.due > self.until or self.due == math.inf
+        return self.position == 0 and (self.due > self.until or self.due == math.inf)
 
 
 class Outbox:
@@ -55,8 +55,6 @@ class Outbox:
         self._standing: dict[str, _Standing] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False
-        self.held = False
-        """While set, only what is urgent or stands is given out."""
         self._exempt: deque[bytes] = deque()
         self._quiet_until = -math.inf
 
@@ -100,13 +98,14 @@ class Outbox:
         """Let ``frames`` stand in ``slot``: sent as soon as may be, then every ``period_s`` until ``until``.
 
         What stood there is forgotten, sent or not; of two groups of the same length the newer goes on where
-        the older was, so that every place of the group has its turn. Urgent frames go before all others, and
-        once whatever replaces them.
+        the older was, so that every place of the group has its turn. An urgent group goes before all others, whole and
+        in its order, and once whatever replaces it; with ``until`` not after ``now`` it goes just once.
         """
         old = self._standing.get(slot)
         new = self._standing[slot] = _Standing(frames, now, period_s, until)
         if urgent:
-            self._urgent.extend(frame for frame in frames if frame not in self._urgent)
+            if not self._hurries(frames):
+                self._urgent.extend(frames)
             new.due = now + period_s
             if new.over:
                 del self._standing[slot]
@@ -116,6 +115,15 @@ class Outbox:
     def clear(self, slot: str) -> None:
         """Forget what stands in ``slot``."""
         self._standing.pop(slot, None)
+
+    def withdraw(self, frame: bytes) -> None:
+        """Forget a frame that was to be sent once, as far as it still waits."""
+        while frame in self._queue:
+            self._queue.remove(frame)
+
+    def stands(self, slot: str) -> bool:
+        """Tell whether anything stands in ``slot``."""
+        return slot in self._standing
 
     def take(self, now: float) -> bytes | None:
         """Take the frame to write now, None when there is none or the gap has not passed."""
@@ -139,7 +147,7 @@ class Outbox:
         slot = self._due_slot(now)
         if slot is None:
             self._turn_of_queue = False
-            return self._queue.popleft() if self._queue and not self.held else None
+            return self._queue.popleft() if self._queue else None
         standing = self._standing[slot]
         frame = standing.step(now)
         if standing.over:
@@ -154,11 +162,16 @@ class Outbox:
         if self._exempt:
             return self._free_at
         free_at = max(self._free_at, self._quiet_until)
-        if self._urgent or (self._queue and not self.held):
+        if self._urgent or self._queue:
             return free_at
-        if not self._standing:
-            return None
         return max(free_at, min(standing.due for standing in self._standing.values()))
+
+    def _hurries(self, group: tuple[bytes, ...]) -> bool:
+        """Tell whether an urgent group still waits, whole and in its order."""
+        if len(group) == 1:
+            return group[0] in self._urgent
+        urgent = tuple(self._urgent)
+        return any(urgent[start : start + len(group)] == group for start in range(len(urgent) - len(group) + 1))
 
     def _due_slot(self, now: float) -> str | None:
         """Pick a due slot; slots take turns with the queue."""
@@ -168,6 +181,6 @@ class Outbox:
             slot, standing = next(iter(self._standing.items()))
             return slot if standing.due <= now else None
         due = [slot for slot, standing in self._standing.items() if standing.due <= now]
-        if not due or (self._queue and self._turn_of_queue and not self.held):
+        if not due or (self._queue and self._turn_of_queue):
             return None
         return due[0] if len(due) == 1 else min(due, key=lambda slot: self._standing[slot].due)

@@ -30,6 +30,8 @@ Tap = Callable[[str, bytes], None]
 
 LINGER_S = 0.5
 """Longest time a closing session waits for its last frames to be written."""
+DOUBTS = 2
+"""Doubts about a connection with which its peer is not set in motion."""
 
 
 class Role(Enum):
@@ -101,6 +103,8 @@ class Session(ABC, Generic[M]):
         self.reason: str | None = None
         self.busy: str | None = None
         """Why the peer takes no commands for now, although the session is established."""
+        self.doubts: tuple[str, ...] = ()
+        """Signs that the connection does not carry what is said on it."""
         self.version: str | None = None
         self.features: tuple[str, ...] = ()
         self.transport = "tcp"
@@ -282,7 +286,7 @@ class Session(ABC, Generic[M]):
     def close(self, reason: str, now: float) -> None:
         """End the conversation from our side once the frames that wait are written."""
         if not self.over:
-            self.state, self.reason, self.busy = State.CLOSING, reason, None
+            self.state, self.reason, self.busy, self.doubts = State.CLOSING, reason, None, ()
             self._limit_at = now + LINGER_S
 
     def lost(self, reason: str) -> None:
@@ -293,7 +297,7 @@ class Session(ABC, Generic[M]):
         """End the conversation at once."""
         if self.state is not State.CLOSED:
             self.reason = self.reason or reason
-            self.state, self.busy = State.CLOSED, None
+            self.state, self.busy, self.doubts = State.CLOSED, None, ()
 
     # What a protocol's own code calls
 
@@ -301,6 +305,11 @@ class Session(ABC, Generic[M]):
     def over(self) -> bool:
         """Whether nothing more is to be expected of this session."""
         return self.state is _CLOSED or self.state is _CLOSING
+
+    @property
+    def doubtful(self) -> str | None:
+        """Why the peer is not to be set in motion on this connection; one doubt alone is no reason."""
+        return f"connection in doubt: {'; '.join(self.doubts)}" if len(self.doubts) >= DOUBTS else None
 
     def establish(self, version: str, features: tuple[str, ...]) -> None:
         """End the handshake with what was agreed."""

@@ -1,17 +1,18 @@
-"""Map parts of "1.4" robots: a robot that takes nothing meanwhile, and the map they make."""
+"""Map parts of "1.4" robots, which send them all the time and read meanwhile: the map they make, and queries for it."""
 
 import asyncio
 from collections.abc import Iterable
 
+import msgpack
 import numpy as np
 import pytest
 
-from gateways.tcpudp.messages import ServerSLAMMapPart
+from gateways.tcpudp.messages import ClientControllMode, ServerSLAMMapPart
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import jumping
-from tests.gateways.tcpudp.frames import POSITION, STOP, Timed, framed, server_settings
-from tests.test_device import Rig, serving
+from tests.gateways.tcpudp.frames import STOP, Timed, framed, server_settings
+from tests.test_device import serving
 from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map
@@ -21,7 +22,6 @@ LISTED_14 = b"1.1,1.2,1.3,1.4"
 SIZE_30_10 = "1e000000 0a000000"
 SETTINGS = server_settings(LISTED_14, "00010101010101" + SIZE_30_10)  # nine cells
 UNSIZED = server_settings(LISTED_14, "00010101010101" + "00000000 00000000")
-NO_JOYSTICK = server_settings(LISTED_14, "00000000000001" + SIZE_30_10)
 DRIVE_LEFT = {"left": 1.0}
 
 
@@ -44,34 +44,17 @@ def hq(settings: bytes = SETTINGS) -> Timed:
 
 
 @pytest.mark.parametrize("by", ["tcp", "udp"])
-def test_a_robot_is_busy_from_the_first_part_to_one_and_a_half_seconds_of_silence(by: str) -> None:
+def test_parts_never_make_a_robot_busy(by: str) -> None:
     timed = hq()
     take = timed.stream if by == "tcp" else timed.datagram
-    assert timed.session.busy is None
     assert take(FIRST, 1.0) == [ServerSLAMMapPart(0, 3, b"\x00\x00\x01")]
-    assert timed.session.busy == "busy: map"
-    assert timed.session.state is State.ESTABLISHED
-    take(SECOND, 2.0)
-    timed.until(3.49)
-    assert timed.session.busy == "busy: map"
-    timed.until(3.51)
-    assert timed.session.busy is None
-
-
-def test_other_packets_do_not_lengthen_the_silence() -> None:
-    timed = hq()
-    timed.stream(FIRST, 1.0)
-    timed.stream(POSITION, 2.0)
-    timed.until(2.51)
-    assert timed.session.busy is None
-
-
-def test_a_part_after_the_silence_makes_the_robot_busy_again() -> None:
-    timed = hq()
-    timed.stream(FIRST, 1.0)
-    timed.until(3.0)
-    timed.stream(SECOND, 3.1)
-    assert timed.session.busy == "busy: map"
+    for second in range(2, 20):
+        take(SECOND, float(second))
+        timed.session.send(ClientControllMode(2))
+        timed.until(second + 0.5)
+        assert timed.frames("tcp", second, second + 0.1) == [bytes.fromhex("06000000 05 0a 02000000")]
+        assert timed.session.busy is None
+        assert timed.session.state is State.ESTABLISHED
 
 
 @pytest.mark.parametrize(
@@ -84,11 +67,10 @@ def test_a_part_after_the_silence_makes_the_robot_busy_again() -> None:
         framed(1, 56, bytes(7)),
     ],
 )
-def test_a_malformed_part_is_counted_and_makes_nobody_busy(malformed: bytes) -> None:
+def test_a_malformed_part_is_counted(malformed: bytes) -> None:
     timed = hq()
     assert timed.stream(malformed, 1.0) == []
     assert timed.session.traffic.malformed == 1
-    assert timed.session.busy is None
 
 
 def test_a_lost_robot_is_not_waited_for() -> None:
@@ -133,12 +115,10 @@ def test_the_last_part_makes_a_map_index_x_times_side_plus_y() -> None:
     drawn = Drawn()
     assert drawn.take(FIRST) is None
     assert drawn.take(SECOND) is None
-    assert drawn.session.busy == "busy: map"
     shown = drawn.take(LAST)
     assert rows(shown) == WHOLE
     assert shown is not None
     assert shown.cell == pytest.approx(0.1)
-    assert drawn.session.busy is None, "the last part ends it"
 
 
 def test_a_part_that_did_not_come_is_unknown() -> None:
@@ -157,7 +137,6 @@ def test_parts_before_the_last_may_come_in_any_order() -> None:
 def test_a_part_that_runs_past_the_end_is_cut() -> None:
     drawn = Drawn()
     assert rows(drawn.take(part(7, (1, 2, 1, 1, 1, 1)))) == [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
-    assert drawn.session.busy is None
 
 
 def test_one_part_may_be_the_whole_map_and_more() -> None:
@@ -169,14 +148,12 @@ def test_a_part_that_begins_behind_the_map_changes_nothing_in_it(start: int) -> 
     drawn = Drawn()
     drawn.take(FIRST)
     assert rows(drawn.take(part(start, (2, 2)))) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
-    assert drawn.session.busy is None
 
 
 def test_an_empty_part_changes_nothing() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
     assert drawn.take(part(3, ())) is None
-    assert drawn.session.busy == "busy: map"
     assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [1, 0, 1]]
 
 
@@ -184,13 +161,11 @@ def test_cells_that_are_none_are_unknown() -> None:
     assert rows(Drawn().take(part(0, (3, 255, 1, 0, 4, 0, 0, 0, 128)))) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
 
 
-def test_parts_of_a_robot_that_announces_no_size_have_no_place_and_end_by_silence() -> None:
+def test_parts_of_a_robot_that_announces_no_size_have_no_place() -> None:
     drawn = Drawn(UNSIZED)
     with pytest.raises(ProtocolError, match="announces no map size"):
         drawn.take(FIRST)
-    assert drawn.session.busy == "busy: map"
-    drawn.session.expire(2.51)
-    assert drawn.session.busy is None
+    assert drawn.robot.known(topics.MAP) is None
 
 
 def test_a_shown_map_does_not_change_with_later_parts() -> None:
@@ -212,9 +187,79 @@ def test_a_new_connection_begins_with_an_empty_map() -> None:
     assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
 
 
-# The device: a stop at both ends, and no motion in between
+# Queries: a robot that sends parts is never asked
+
+GET_MAP = bytes.fromhex("02000000 05 34")
+
+
+def known(drawn: Drawn) -> Map | None:
+    shown = drawn.robot.known(topics.MAP)
+    assert shown is None or isinstance(shown, Map)
+    return shown
+
+
+def test_nothing_is_known_before_the_first_part_and_the_robot_is_asked() -> None:
+    drawn = Drawn()
+    assert known(drawn) is None
+    drawn.session.outgoing(1.0)
+    drawn.robot.ask(topics.MAP)
+    assert drawn.session.outgoing(2.0) == GET_MAP
+
+
+def test_a_map_is_known_as_far_as_its_parts_have_come() -> None:
+    drawn = Drawn()
+    drawn.take(FIRST)
+    assert rows(known(drawn)) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
+    drawn.take(SECOND)
+    drawn.take(LAST)
+    assert rows(known(drawn)) == WHOLE
+    drawn.take(part(0, (2, 2, 2)))
+    assert rows(known(drawn)) == [[2, 0, 0], [2, 2, 0], [2, 2, 1]], "what was seen later replaces what was before"
+    assert drawn.robot.known(topics.POSE) is None
+
+
+def test_the_part_after_a_question_answers_it() -> None:
+    drawn = Drawn()
+    drawn.robot.ask(topics.MAP)
+    assert rows(drawn.take(FIRST)) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
+    assert drawn.take(SECOND) is None
+
+
+def test_a_robot_that_sends_parts_is_never_asked_for_its_map_on_no_later_connection_either() -> None:
+    drawn = Drawn()
+    drawn.take(FIRST)
+    asked_for_all(drawn)
+    drawn.session = drawn.robot.session(0, "tcp://robot.test:1")
+    drawn.session.open(0.0)
+    drawn.session.receive(SETTINGS, 0.1)
+    assert known(drawn) is None, "the map of a new connection is another one"
+    asked_for_all(drawn)
+    assert rows(drawn.take(SECOND)) == [[0, 0, 0], [0, 2, 0], [0, 2, 0]]
+
+
+def asked_for_all(drawn: Drawn) -> None:
+    """Ask for map and pose: one packet less than there are questions leaves."""
+    drawn.session.outgoing(0.2)
+    drawn.robot.ask(topics.MAP)
+    drawn.robot.ask(topics.POSE)
+    assert [drawn.session.outgoing(now) for now in (1.0, 2.0)] == [bytes.fromhex("02000000 05 36"), None]
+
+
+def test_a_robot_that_is_another_one_after_a_reconnection_is_asked() -> None:
+    drawn = Drawn()
+    drawn.take(FIRST)
+    session = drawn.robot.session(0, "tcp://robot.test:1")
+    session.open(0.0)
+    session.receive(server_settings(b"1.1,1.2,1.3", "00010101010101" + SIZE_30_10), 0.1)
+    session.outgoing(0.1)
+    drawn.robot.ask(topics.MAP)
+    assert session.outgoing(1.0) == GET_MAP
+
+
+# The device: a robot that sends parts all the time is driven like any other
 
 STOP_2 = STOP[:4] + b"\x02" + STOP[5:]
+MOVE_2 = bytes.fromhex("0e000000 02 0b 000080bf 00000000 0000803f")
 
 
 def for_2(settings: bytes) -> bytes:
@@ -223,113 +268,44 @@ def for_2(settings: bytes) -> bytes:
 
 
 @jumping
-async def test_the_first_part_stops_the_robot_and_commands_are_refused_until_the_last() -> None:
+async def test_a_robot_is_driven_stopped_and_asked_while_its_parts_come() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.sends(FIRST)
-        assert rig.written() == [STOP_2]
-        status = rig.last("status")
-        assert (status["state"], status["reason"]) == ("established", "busy: map")
-        assert rig.last("control")["state"] == "held"
-        for name, fields in (("drive", {}), ("mode", {"mode": "manual"}), ("drive", DRIVE_LEFT)):
-            rig.command(name, fields)
-        refusals = await rig.refusals()
-        assert ("drive", "busy: map", 2) in refusals
-        assert ("mode", "busy: map", 1) in refusals
-        question = rig.ask("pose")
-        assert [str(answer.error) for answer in question.replies] == ["busy: map"]
-        await asyncio.sleep(1.2)
-        assert set(rig.written()) == {STOP_2}
+        for number in range(20):
+            rig.sends((FIRST, SECOND, LAST)[number % 3])
+            rig.command("drive", DRIVE_LEFT)
+            await asyncio.sleep(0.5)
+            assert set(rig.written()) == {MOVE_2}
+            assert rig.last("status")["reason"] is None
+            rig.command("drive", {})
+            await asyncio.sleep(0.5)
+            assert set(rig.written()) == {STOP_2}
+            (answer,) = rig.ask("map").replies
+            assert answer.payload is not None
+        assert await rig.refusals() == []
+        assert [shown["columns"] for shown in rig.values("map")] == [3] * 6
 
 
 @jumping
-async def test_the_stop_is_repeated_after_the_last_part_and_motion_needs_neutral() -> None:
+async def test_a_question_before_the_first_part_is_answered_by_it() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))
-        rig.sends(FIRST)
-        await asyncio.sleep(1.2)
-        rig.sends(SECOND)
-        await asyncio.sleep(1.2)
-        rig.forget_written()
-        rig.sends(LAST)
-        assert rig.written() == [STOP_2]
-        assert rig.last("status")["reason"] is None
-        await assert_motion_needs_neutral(rig)
-        assert [shown["columns"] for shown in rig.values("map")] == [3]
-
-
-@jumping
-async def test_the_stop_is_repeated_after_one_and_a_half_seconds_of_silence() -> None:
-    async with serving() as rig:
-        await rig.establish(for_2(SETTINGS))
-        rig.sends(FIRST)
-        await asyncio.sleep(1.45)
-        rig.forget_written()
-        assert rig.last("status")["reason"] == "busy: map"
+        question = rig.ask("map")
         await asyncio.sleep(0.1)
-        assert rig.written() == [STOP_2]
-        assert rig.last("status")["reason"] is None
-        await assert_motion_needs_neutral(rig)
-
-
-async def assert_motion_needs_neutral(rig: Rig) -> None:
-    rig.command("drive", DRIVE_LEFT)
-    await asyncio.sleep(0.1)
-    assert {frame[5] for frame in rig.written()} <= {13}
-    assert rig.last("control")["state"] == "held"
-    rig.command("drive", {})
-    rig.command("drive", DRIVE_LEFT)
-    await asyncio.sleep(0.1)
-    assert rig.written()[-1][5] == 11
-
-
-@jumping
-async def test_a_map_in_one_part_stops_the_robot_too() -> None:
-    async with serving() as rig:
-        await rig.establish(for_2(SETTINGS))
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.sends(part(0, [1] * 9))
-        await asyncio.sleep(0.1)
-        assert set(rig.written()) == {STOP_2}
-        assert rig.last("status")["reason"] is None
-
-
-@jumping
-async def test_a_robot_that_cannot_be_stopped_is_not_lost_for_its_map() -> None:
-    """Many robots announce no joystick: the stop is refused, the map is shown all the same."""
-    async with serving() as rig:
-        await rig.establish(for_2(NO_JOYSTICK))
+        assert rig.written() == [bytes.fromhex("02000000 02 34")]
         rig.sends(FIRST)
+        ((payload, error),) = [(reply.payload, reply.error) for reply in question.replies]
+        assert error is None
+        assert msgpack.unpackb(payload)["cells"] == bytes([0, 0, 0, 0, 0, 0, 1, 0, 0])
+        later = rig.ask("map")
+        assert len(later.replies) == 1
         assert rig.written() == []
-        assert rig.last("status")["state"] == "established"
-        rig.sends(LAST)
-        assert len(rig.values("map")) == 1
-        rig.sends(FIRST)
-        await asyncio.sleep(2.0)
-        assert (
-            rig.last("status")["reason"]
-            == "cannot be stopped: clientJoystickStop: the robot does not announce joystick"
-        )
 
 
 @jumping
-async def test_a_robot_that_is_lost_while_its_map_comes_is_offline_and_not_busy() -> None:
+async def test_a_question_that_no_part_answers_is_refused() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))
-        rig.sends(FIRST)
-        rig.goes("closed by peer")
-        await rig.settle()
-        offline = [status["reason"] for status in rig.values("status") if status["state"] == "offline"]
-        assert offline[1:] == ["closed by peer"]
-        rig.command("drive", DRIVE_LEFT)
-        assert ("drive", "offline", 1) in await rig.refusals()
-        await asyncio.sleep(2.0)
-        await rig.establish(for_2(SETTINGS))
-        await asyncio.sleep(0.1)
-        assert rig.written() == []
-        assert rig.last("status")["reason"] is None
+        question = rig.ask("map")
+        await asyncio.sleep(2.1)
+        assert [str(reply.error) for reply in question.replies] == ["the robot did not answer within 2 s"]

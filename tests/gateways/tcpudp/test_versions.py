@@ -2,6 +2,7 @@
 
 import contextlib
 
+import msgspec
 import pytest
 
 from gateways.tcpudp.messages import (
@@ -14,7 +15,17 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.session import HqSession, RobotSession, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
-from tests.gateways.tcpudp.frames import LISTED, SIZE_100_10, Timed, client_settings, counted, framed, server_settings
+from gateways.tcpudp.translate import Options, TcpUdpRobot
+from tests.gateways.tcpudp.frames import (
+    ALL,
+    LISTED,
+    SIZE_100_10,
+    Timed,
+    client_settings,
+    counted,
+    framed,
+    server_settings,
+)
 from zbridge.errors import Refused
 from zbridge.session.session import State
 
@@ -117,6 +128,50 @@ def test_a_settings_block_that_is_too_short_for_its_version_is_malformed(listed:
     assert timed.session.traffic.malformed == 1
     assert timed.sent == []
     assert timed.session.state is State.HANDSHAKING
+
+
+# What is announced, as far as the block that the robot understands has a flag for it
+
+
+@pytest.mark.parametrize(
+    ("announce", "listed", "answered"),
+    [
+        ((), LISTED, "00000000000000"),
+        (("udp",), LISTED, "01000000000000"),
+        (("lidar_sim",), LISTED, "00000000000100"),
+        (("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"), LISTED, "01010101010101"),
+        (("cam", "slam_map"), LISTED_14, "00010000000001"),
+        (("cam", "lidar_sim", "slam_map"), b"1.2", "000100000001"),
+        (("chat", "lidar_sim", "slam_map"), b"1.1", "0000000100"),
+    ],
+)
+def test_the_gateway_announces_what_it_is_told(announce: tuple[str, ...], listed: bytes, answered: str) -> None:
+    session = TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session(0, "")
+    timed = Timed(session)
+    block = {b"1.1": ALL[:10], b"1.2": ALL[:12]}.get(listed, ALL + SIZE_100_10)
+    timed.stream(server_settings(listed, block), 0.1)
+    answer = LISTED if listed == LISTED_14 else listed
+    assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
+
+
+def test_a_gateway_that_does_not_announce_datagrams_neither_waits_for_them_nor_sends_any() -> None:
+    timed = Timed(TcpUdpRobot(Options(announce=("lidar_sim",))).session(0, ""))
+    timed.stream(server_settings(LISTED, ALL + SIZE_100_10), 0.1)
+    assert timed.session.state is State.ESTABLISHED
+    timed.until(10.0)
+    assert timed.frames("udp") == []
+
+
+def test_a_robot_without_datagrams_is_not_told_of_ours() -> None:
+    timed = Timed(TcpUdpRobot(Options(announce=("udp", "chat"))).session(0, ""))
+    timed.stream(server_settings(LISTED, "00" + ALL[2:] + SIZE_100_10), 0.1)
+    assert timed.frames("tcp") == [framed(5, 3, counted(LISTED) + bytes.fromhex("00000001000000"))]
+
+
+@pytest.mark.parametrize("announce", [["lidarsim"], [50], "udp"])
+def test_a_feature_nobody_knows_cannot_be_announced(announce: object) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"announce": announce}, Options)
 
 
 # 52 and 54 go by SLAMMap where the version has the flag, else by Lidar; 61 by LidarSim, which 1.1 has not

@@ -724,6 +724,15 @@ def test_a_stop_is_repeated_for_a_second(car: Wire) -> None:
     assert 5 <= rounds <= 60
 
 
+def test_a_routine_stop_is_sent_to_every_motor_exactly_once(car: Wire) -> None:
+    for _ in range(3):
+        car.robot.stop(car.now, car.now)
+        assert car.values() == {0: 0.0, 1: 0.0, 2: 0.0, 3: 0.0}
+        for _ in range(20):
+            car.later(0.05)
+            assert car.frames() == []
+
+
 def test_a_stop_goes_before_what_waits_and_the_waiting_drive_is_forgotten(car: Wire) -> None:
     car.drive(forward=1.0)
     car.robot.stop(car.now, car.now + 1.0)

@@ -45,7 +45,6 @@ ATTEND_EVERY = 64
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
-_IN_DOUBT = "connection in doubt"
 _ASKED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 
 
@@ -83,6 +82,7 @@ class Device:
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
         self._doubtful: str | None = None
+        self._shown_doubts: tuple[str, ...] = ()
         self._leaving = False
         self._greeted: Session[Any] | None = None
         self._questions = Questions(asyncio.get_running_loop())
@@ -188,7 +188,6 @@ class Device:
             return
         busy, self._busy = self._busy, session.busy
         doubtful, self._doubtful = self._doubtful, session.doubtful
-        self._conditions.set(_IN_DOUBT, "; ".join(session.doubts) or None)
         if session.over:
             self._commands.blocked = False
             self._conditions.set("link", None)
@@ -207,6 +206,8 @@ class Device:
             self._leases.hold_back(self._busy or "no longer busy", stops=True)
         if self._doubtful and not doubtful:
             self._leases.hold_back(self._doubtful, stops=True)
+        if session.doubts != self._shown_doubts and not session.over and self._endpoints[0].state == "established":
+            self._publish_status()
 
     def _on_stall(self, name: str, stalled: bool) -> None:
         """Drive no robot whose link takes nothing: it would obey late, or lose its stop with the rest."""
@@ -304,12 +305,13 @@ class Device:
         first = self._endpoints[0]
         session = self._robot.driving
         agreed = session if session is not None and first.state == "established" else None
+        self._shown_doubts = agreed.doubts if agreed is not None else ()
         self._publish(
             topics.STATUS,
             Status(
                 stamp_ns=self._clock_ns(),
                 state=first.state,
-                reason="; ".join(filter(None, (first.reason, *self._conditions.texts))) or None,
+                reason="; ".join(filter(None, (first.reason, *self._shown_doubts, *self._conditions.texts))) or None,
                 protocol=self._protocol,
                 dialect=self._robot.dialect,
                 version=(agreed.version or None) if agreed is not None else None,

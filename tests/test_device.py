@@ -25,7 +25,7 @@ from zbridge.bus.fake import FakeBus, FakeQuestion, meet
 from zbridge.bus.interface import LaneOf
 from zbridge.conversation import Conversation
 from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
-from zbridge.errors import LinkError, Malformed, NotReady, Unsupported
+from zbridge.errors import LinkError, Malformed, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.link import Address, FakeLink
@@ -1833,6 +1833,82 @@ async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
 
 
 # Refusals
+
+
+def telling(*refusals: dict[str, Any]) -> bytes:
+    """What a listener tells: refusals of a program of its own, with what is said otherwise."""
+    whole = {"who": "hq.desk.3", "command": "drive", "code": "neutral_first", "reason": "let go first", "count": 1}
+    return packed({"refusals": [{**whole, **refusal} for refusal in refusals]})
+
+
+@jumping
+async def test_what_a_listener_refused_its_programs_is_shown_with_who_command_code_reason_and_by_whom() -> None:
+    async with established() as rig:
+        (reply,) = rig.ask("control/refused/hq.desk", telling({"count": 7}, {"who": "hq.desk.4"})).replies
+        assert (reply.error, msgpack.unpackb(reply.payload)) == (None, {})
+        rig.ask("control/refused/hq.desk", telling({"count": 5}))
+        await asyncio.sleep(0.06)
+        told = {"command": "drive", "code": "neutral_first", "reason": "let go first", "by": "hq.desk"}
+        assert rig.last("control")["refusals"] == [
+            {"who": "hq.desk.4", "count": 1, **told},
+            {"who": "hq.desk.3", "count": 12, **told},
+        ]
+        assert rig.control["holder"] == "driver", "and nothing else comes of it"
+        rig.command("drive", DRIVE_LEFT)
+        assert rig.written() == [MOVE_LEFT]
+
+
+@pytest.mark.parametrize(
+    ("at", "refusal"),
+    [
+        ("driver", {"who": "driver"}),
+        ("hq", {"who": "hq.desk.3"}),
+        ("hq.desk", {"who": "driver"}),
+        ("hq.desk", {"who": "hq.desk2.3"}),
+        ("hq.desk", {"who": "hq.other.3"}),
+        ("hq.desk", {"who": None}),
+        ("hq.desk", {"who": ""}),
+    ],
+)
+@jumping
+async def test_nobody_tells_of_refusals_in_anybody_elses_name(at: str, refusal: dict[str, Any]) -> None:
+    async with established() as rig:
+        (reply,) = rig.ask(f"control/refused/{at}", telling({}, refusal)).replies
+        assert isinstance(reply.error, Malformed)
+        ((who, command, _, _),) = await rig.refused()
+        assert (who, command) == (None, "refused"), "neither that one nor what came with it"
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xc1", packed({}), packed({"refusals": 5}), packed({"refusals": [{"who": "hq.desk.3"}]}), telling(*17 * [{}])],
+)
+@jumping
+async def test_a_telling_that_cannot_be_read_or_is_too_long_is_refused(payload: bytes) -> None:
+    async with established() as rig:
+        (reply,) = rig.ask("control/refused/hq.desk", payload).replies
+        assert isinstance(reply.error, Malformed)
+
+
+@jumping
+async def test_tellings_are_bounded_and_so_is_what_they_say() -> None:
+    async with established() as rig:
+        rig.ask("control/refused/hq.desk", telling({"reason": "r" * 10_000, "command": "c" * 10_000, "count": 2**60}))
+        rig.ask("control/refused/hq.desk", telling({"code": "of tomorrow", "count": -5}))
+        await asyncio.sleep(0.06)
+        long, unknown = rig.last("control")["refusals"]
+        assert (len(long["reason"]), len(long["command"]), long["count"]) == (200, 64, 1_000_000)
+        assert (unknown["code"], unknown["count"]) == ("unsupported", 1)
+        for number in range(200):
+            last = rig.ask("control/refused/hq.desk", telling({"reason": f"reason {number}"}))
+        assert isinstance(last.replies[0].error, TooFast)
+        await asyncio.sleep(0.06)
+        shown_now = rig.last("control")["refusals"]
+        assert len(shown_now) == 16
+        assert len([entry for entry in shown_now if entry["code"] == "rate"]) == 1
+        await asyncio.sleep(1.0)
+        (reply,) = rig.ask("control/refused/hq.desk", telling({})).replies
+        assert reply.error is None
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
+import msgspec
 import pytest
 
 from tests.proofs import numbered
@@ -733,6 +734,20 @@ async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lea
     assert scene.gateway.report().refusals[-1].code == "out_of_order"
     assert helm.intent.held
     assert scene.told == []
+
+
+@pytest.mark.parametrize("code", [Code.NEUTRAL_FIRST, Code.LEASE_ENDED, Code.NOT_READY])
+async def test_what_listeners_tell_of_refusals_is_nothing_to_a_program_whoever_they_name(code: Code) -> None:
+    scene = Scene()
+    helm = await scene.driving()
+    renewals = scene.gateway.asked.count("renew")
+    told = Refusal(who="hq.toy.1", command="drive", code=code, reason="somebody said so", count=1, by="hq.toy")
+    helm.look(msgspec.structs.replace(scene.gateway.report(), refusals=(told,)))
+    await scene.settle()
+    assert scene.told == []
+    assert scene.gateway.asked.count("renew") == renewals
+    helm.command(topics.CMD_DRIVE, GO)
+    assert scene.gateway.taken() == [("drive", GO)]
 
 
 async def test_a_takeover_is_noticed_and_told_once() -> None:

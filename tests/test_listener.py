@@ -23,7 +23,7 @@ from zbridge.audience import Audience
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Answer, Question
 from zbridge.config import HqSettings, ListenerPlan
-from zbridge.errors import BusError, EncodeError, ProtocolError
+from zbridge.errors import BusError, EncodeError, NotReady, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -33,6 +33,8 @@ from zbridge.fleet.messages import (
     Map,
     Pose,
     Query,
+    Refusal,
+    Refusals,
     Scan,
     Status,
     Stop,
@@ -692,6 +694,82 @@ async def test_nothing_is_encoded_for_nobody() -> None:
         assert scene.side.encoded == 0
 
 
+# What is refused
+
+
+class Told:
+    """What the robot's gateway was told that the listener refused."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.refusals: list[Refusal] = []
+        scene.gateway.bus.answer(KEYS.key("@rpc/control/refused/hq.toy"), self._hear)
+
+    def _hear(self, question: Question) -> None:
+        self.refusals += payloads.decode(Refusals, question.payload).refusals
+        question.answer(payloads.encode(Query()))
+
+    def shown(self) -> list[tuple[str | None, str, str, str, int]]:
+        """Who, command, code, reason, and how often."""
+        return [(each.who, each.command, each.code, each.reason, each.count) for each in self.refusals]
+
+
+@jumping
+async def test_what_a_client_may_not_is_told_to_the_gateway() -> None:
+    async with serving() as scene:
+        told, program = Told(scene), scene.connect().greeted()
+        program.say(b"go", b"go", b"go")
+        await asyncio.sleep(2.0)
+        reason = "connected: let go of the stick first"
+        assert told.shown() == [
+            ("hq.toy.2", "drive", "neutral_first", reason, 1),
+            ("hq.toy.2", "drive", "neutral_first", reason, 2),
+        ]
+        assert scene.count("hq_refused") == 3
+
+
+@jumping
+async def test_a_robot_that_is_missing_is_a_reason_where_it_has_a_gateway_to_be_told() -> None:
+    async with serving() as scene:
+        told, program = Told(scene), scene.connect().greeted()
+        program.say(b"stand")
+        scene.status.put(payloads.encode(Status(state="connecting", protocol="toy")))
+        program.say(b"go")
+        await soon()
+        assert told.shown() == [("hq.toy.2", "drive", "not_ready", "robot connecting", 1)]
+        scene.go()
+        for _ in range(3):
+            program.say(b"go")
+        await asyncio.sleep(2.0)
+        assert len(told.refusals) == 1, "there is nobody to be told"
+
+
+@jumping
+async def test_what_the_gateway_refuses_by_itself_is_not_told_a_second_time() -> None:
+    async with serving() as scene:
+        told, program = Told(scene), scene.connect().greeted()
+        scene.gateway.authority.acquire(Acquire(who="operator"), scene.now)
+        program.say(b"stand", b"go")
+        await soon()
+        assert program.heard()[-1] == b"! not driving: held by operator (priority 0)"
+        assert told.shown() == []
+        program.say(b"go")
+        await soon()
+        assert told.shown() == [
+            ("hq.toy.2", "drive", "neutral_first", "held by operator (priority 0): let go of the stick first", 1)
+        ]
+
+
+@jumping
+async def test_a_listener_that_ends_does_not_wait_to_tell() -> None:
+    async with serving() as scene:
+        told, program = Told(scene), scene.connect().greeted()
+        program.say(b"go", b"go")
+        await soon()
+        ended_at = scene.now
+    assert scene.now - ended_at < 0.5
+    assert len(told.refusals) == 1
+
+
 # Control
 
 
@@ -949,7 +1027,7 @@ async def test_a_question_of_many_is_asked_once_and_answered_to_each() -> None:
     "answer",
     [
         lambda question: None,
-        lambda question: question.refuse("robot: busy"),
+        lambda question: question.refuse(NotReady("robot: busy")),
         lambda question: question.answer(b"\xc1"),
         lambda question: question.answer(payloads.pack({"rows": 7})),
     ],

@@ -9,13 +9,15 @@ from collections.abc import Callable
 
 from zbridge.audit import Audit
 from zbridge.bus import Bus, Handle, Lane, Look, Question
-from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused
+from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
+from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, FleetMessage
+from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot
+from zbridge.session.allowance import Allowance
 from zbridge.session.control import Authority, What
 from zbridge.session.motion import MotionLimits
 from zbridge.session.proof import read
@@ -24,6 +26,10 @@ from zbridge.standstill import Standstill
 
 log = logging.getLogger("zbridge.control")
 
+TELLINGS_HZ = 20.0
+"""Times a second that listeners, all together, may tell what they refused."""
+_LISTENER = "hq."
+_COUNTED = 1_000_000
 _NAMED = 64
 """Characters of a name that are repeated to whoever uses it wrongly."""
 _CONTROL_S = 0.05
@@ -96,6 +102,7 @@ class Leases:
         self._timer_at = math.inf
         self._control_due: asyncio.TimerHandle | None = None
         self._closing: str | None = None
+        self._tellings = Allowance(TELLINGS_HZ)
         self._refused = metrics.count("refused")
 
     def __repr__(self) -> str:
@@ -109,6 +116,7 @@ class Leases:
             self._answer(bus, "takeover/*", self._take_over),
             self._answer(bus, "renew", self._renew, gate),
             self._answer(bus, "release", self._release, gate),
+            self._answer(bus, "refused/*", self._take_told),
             bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
         ]
 
@@ -243,6 +251,24 @@ class Leases:
 
     def _release(self, question: Question) -> FleetMessage:
         return self.authority.release(read(question.payload), question.asked, self._clock())
+
+    def _take_told(self, question: Question) -> FleetMessage:
+        """Show what a listener refused its HQ programs.
+
+        Their names begin with ``hq.``, so that nobody can be told of a refusal in the name of any other program.
+        """
+        name = question.asked.rpartition("/")[2]
+        if not name.startswith(_LISTENER):
+            raise Malformed(f"its name does not begin with {_LISTENER!r}: only listeners tell what they refused")
+        told = payloads.decode(Refusals, question.payload).refusals
+        for each in told:
+            _require_own_name(question, each.who or "")
+        if not self._tellings.take(self._clock()):
+            raise TooFast(f"more than {TELLINGS_HZ:g} tellings a second")
+        for each in told:
+            count = min(max(each.count, 1), _COUNTED)
+            self.authority.refuse(each.command, refused(each.code, each.reason), each.who, by=name, count=count)
+        return Query()
 
 
 def _request(question: Question) -> Acquire:

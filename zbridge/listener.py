@@ -26,6 +26,7 @@ from zbridge.helm import REPEAT_S, Bridge, Helm
 from zbridge.link import Link, listen
 from zbridge.metrics import Metrics
 from zbridge.protocol import HqSide, Send
+from zbridge.refusals import Teller
 from zbridge.session.allowance import Allowance
 from zbridge.session.intent import Intent
 from zbridge.session.manager import ClientIds, SessionManager
@@ -109,6 +110,8 @@ class Listener:
         self._tasks: set[asyncio.Task[None]] = set()
         self._bridge = Bridge(bus, keys, audience.view, self._spawn)
         self._bus = bus
+        untold = metrics.count("hq_refusals_untold", listener=name)
+        self._teller = Teller(bus, keys, f"hq.{name}", self._spawn, untold)
         numbers = self._side.numbers
         self._ids = ClientIds(numbers if self._side.quiet_s else numbers[: plan.settings.clients], self._side.quiet_s)
         self._asked: dict[str, list[Client]] = {}
@@ -180,6 +183,7 @@ class Listener:
         for client in clients:
             client.helm.close()
             client.conversation.close("gateway stopped")
+        self._teller.close()
         waiting = {client.conversation.ended for client in clients} | self._tasks
         if waiting:
             await asyncio.wait(waiting, timeout=LEAVE_S)
@@ -393,9 +397,15 @@ class Listener:
             else:
                 client.helm.command(topic, command)
         except Refused as refusal:
-            client.session.traffic.refused += 1
-            self._refused.value += 1
-            self._tell(client, str(refusal))
+            self._refuse(client, topic, refusal)
+
+    def _refuse(self, client: Client, topic: Topic, refusal: Refused) -> None:
+        """Count what a client may not, and tell its people, and everybody by way of ``control``."""
+        client.session.traffic.refused += 1
+        self._refused.value += 1
+        self._tell(client, str(refusal))
+        if self._audience.view.alive:
+            self._teller.note(client.helm.who, topic.path.partition("/")[2], refusal)
 
     def _ask(self, client: Client, topic: Topic) -> None:
         """Ask the robot for a client; who asks the same meanwhile gets the same answer."""

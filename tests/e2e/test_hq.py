@@ -119,6 +119,33 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         assert not _charges(one.violations)
 
 
+async def test_what_a_listener_refuses_shows_on_control_of_the_robot_whose_process_is_another(
+    bench: Bench, stack: contextlib.ExitStack
+) -> None:
+    robot, tcp = ports(2)
+    bench.simulator(robot)
+    hq = gateway(bench, stack, listener("tcp", "tcpudp", tcp), name="hq")
+    gateway(bench, stack, device("tcpudp", robot))
+    await soon(lambda: bench.fleet.state("r1") == "established", "the robot")
+    await soon(lambda: hq.listens(1), "the listener")
+    program = TcpHq()
+    async with playing(program.run(HOST, tcp)):
+        await soon(lambda: program.position, "position")
+        program.move(0.0, 1.0, 0.5)
+        no_mode = await soon(lambda: _refusal(bench, "no_lease"), "motion without a control mode refused")
+        assert (no_mode["who"], no_mode["command"], no_mode["by"]) == ("hq.tcp.2", "drive", "hq.tcp")
+        assert no_mode["reason"] == "control mode is none"
+        stuck = await soon(lambda: _refusal(bench, "neutral_first"), "the stick that was pushed all the time refused")
+        assert (stuck["who"], stuck["reason"]) == ("hq.tcp.2", "control mode is none: let go of the stick first")
+        await soon(lambda: (_refusal(bench, "neutral_first") or stuck)["count"] > 2, "and counted")
+        assert bench.fleet.last("r1/control")["state"] == "free"
+
+
+def _refusal(bench: Bench, code: str) -> dict[str, Any] | None:
+    refusals = bench.fleet.last("r1/control").get("refusals", [])
+    return next((entry for entry in refusals if entry["code"] == code), None)
+
+
 async def _drives(bench: Bench, program: TcpHq, who: str) -> None:
     """Drive until the robot moves; the stick stays pushed."""
     before = bench.fleet.last("r1/pose")

@@ -34,6 +34,7 @@ from zbridge.fleet.messages import (
     Raw,
     Reading,
     Refusal,
+    Refusals,
     Scan,
     Scanner,
     SensorSetting,
@@ -157,6 +158,21 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
             "holder": "hq 1",
             "reason": "held by hq 1",
             "code": "held",
+        },
+    ),
+    (
+        Refusals(refusals=(Refusal(who="hq.desk.3", command="drive", code="not_ready", reason="offline", count=2),)),
+        {
+            "refusals": [
+                {
+                    "who": "hq.desk.3",
+                    "command": "drive",
+                    "code": "not_ready",
+                    "reason": "offline",
+                    "count": 2,
+                    "by": None,
+                }
+            ]
         },
     ),
     (Denied(code="closing", reason="gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
@@ -404,6 +420,7 @@ def test_unknown_fields_are_ignored() -> None:
         (Authorization, {"lease": LEASE, "seq": -1, "proof": PROOF}, "seq"),
         (Authorization, {"lease": LEASE, "proof": PROOF}, "seq"),
         (Authorization, {"lease": LEASE, "seq": 1, "proof": "text"}, "proof"),
+        (Refusals, {"refusals": 17 * [{"who": None, "command": "drive", "reason": "", "count": 1}]}, "refusals"),
         (Lease, {"ok": True, "lease": LEASE, "token": TOKEN[:16]}, "token"),
     ],
 )

@@ -47,6 +47,7 @@ TABLE = [
     ("@rpc/pose", messages.Query, Delivery.QUERY),
     ("@rpc/control/acquire/op1", messages.Acquire, Delivery.QUERY),
     ("@rpc/control/takeover/user%40host", messages.Acquire, Delivery.QUERY),
+    ("@rpc/control/refused/hq.desk", messages.Refusals, Delivery.QUERY),
     ("@rpc/control/renew", messages.Authorization, Delivery.QUERY),
     ("@rpc/control/release", messages.Authorization, Delivery.QUERY),
 ]

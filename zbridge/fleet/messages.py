@@ -18,6 +18,8 @@ Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 LeaseId = Annotated[bytes, msgspec.Meta(min_length=8, max_length=8)]
 Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
 Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+TOLD = 16
+"""Different refusals that are told at a time."""
 Floats = npt.NDArray[np.float32]
 Cells = npt.NDArray[np.uint8]
 
@@ -180,6 +182,12 @@ class Control(FleetMessage, frozen=True):
     priority: int | None = None
     expires_in_s: float | None = None
     refusals: tuple[Refusal, ...] = ()
+
+
+class Refusals(FleetMessage, frozen=True):
+    """What a listener refused its HQ programs: for the robot's gateway, which shows it on ``control``."""
+
+    refusals: Annotated[tuple[Refusal, ...], msgspec.Meta(max_length=TOLD)]
 
 
 class Drive(FleetMessage, frozen=True):

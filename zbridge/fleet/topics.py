@@ -28,6 +28,7 @@ from zbridge.fleet.messages import (
     Query,
     Raw,
     Reading,
+    Refusals,
     Scan,
     Scanner,
     SensorSetting,
@@ -170,6 +171,7 @@ RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
 RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
 RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY)
 RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY)
+RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY)
 RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY)
 RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY)
 
@@ -190,6 +192,7 @@ _FAMILIES = {
     "@rpc/sessions": RPC_SESSIONS,
     "@rpc/control/acquire": RPC_ACQUIRE,
     "@rpc/control/takeover": RPC_TAKEOVER,
+    "@rpc/control/refused": RPC_REFUSED,
 }
 
 

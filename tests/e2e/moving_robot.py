@@ -3,9 +3,6 @@
 ``python -m tests.e2e.moving_robot ROBOT HOST SEED``: prints its port, then a line ``AT SPEED`` (monotonic seconds,
 fraction of full scale) for each change of what it last obeyed. A line on stdin, or its end, ends it; it then prints
 what it noted as one JSON object. ROBOT is a name of :data:`ROBOTS`.
-
-A robot of the TCP/UDP package protocol does here what deployed robots do and deployed simulators do not: it drives on
-when nobody says anything more.
 """
 
 from __future__ import annotations
@@ -40,7 +37,6 @@ HELD_UP_S = 0.1
 GOES_ON = "on"
 """The word after the time at which such a program goes on."""
 
-_TCPUDP = tcpudp_wire.Times(silence_s=math.inf)
 _ALF = alf_wire.Times(send_s=SEND_S)
 _WC2EC = wc2ec_wire.Times(send_s=SEND_S)
 
@@ -95,7 +91,7 @@ class _Wheels(wc2ec_wire.Robot):
 
 def _package(version: str, udp: bool) -> Callable[[Tell, int], tuple[Judge, Serve]]:
     def make(tell: Tell, seed: int) -> tuple[Judge, Serve]:
-        robot = StrictRobot(version=version, udp=udp, seed=seed, times=_TCPUDP)
+        robot = StrictRobot(version=version, udp=udp, seed=seed)
         robot.machine = _Package(tell, seed)
         return robot, robot.serve
 

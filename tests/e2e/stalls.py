@@ -465,14 +465,17 @@ class Repetition:
                 raise RuntimeError(f"the gateway ended with {self._gateway.returncode}")
             await asyncio.sleep(0.02)
 
-    async def _link_stalls(self) -> int:
-        """Read the gateway's counter, summed over its labels."""
+    async def _counters(self) -> list[str]:
+        """Read the gateway's counters, a line each."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self._metrics)
         with contextlib.closing(writer):
             writer.write(b"GET /metrics HTTP/1.0\r\n\r\n")
             page = await asyncio.wait_for(reader.read(), 5)
-        found = [line for line in page.decode().splitlines() if line.startswith(LINK_STALLS)]
-        return sum(int(line.split()[-1]) for line in found)
+        return [line for line in page.decode().splitlines() if not line.startswith("#")]
+
+    async def _link_stalls(self) -> int:
+        """Give the gateway's count of links that took nothing."""
+        return sum(int(line.split()[-1]) for line in await self._counters() if line.startswith(LINK_STALLS))
 
     # What is measured
 
@@ -484,7 +487,8 @@ class Repetition:
         outcome, robot = self.outcome, self._robot
         await self._drive(stack, FIRST)
         if not await robot.moving(FIRST, START_S):
-            raise RuntimeError(f"the robot was never driven; status {self._statuses[-1:]}")
+            counted = [line for line in await self._counters() if not line.endswith(" 0")]
+            raise RuntimeError(f"the robot was never driven; status {self._statuses[-1:]}; counters {counted}")
         await asyncio.sleep(self._rng.uniform(0.3, 0.8))
         before, stalls = self._reason, await self._link_stalls()
         went, ended, on = await self._disturb()

@@ -259,6 +259,20 @@ async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so() -> None:
 
 
 @jumping
+async def test_who_tells_that_a_listener_refused_a_stop_makes_no_stop_fail() -> None:
+    world = World("r1")
+
+    def tell(_: Sample) -> None:
+        world.gateway.authority.refuse("stop", NotReady("somebody said so"), "hq.x.1", by="hq.x")
+
+    subscribers = world.bus._shared.subscribers
+    world.bus.subscribe("fleet/r1/@cmd/stop", tell)
+    subscribers.insert(0, subscribers.pop())
+    await world.robot.stop()
+    assert world.gateway.control.refusals[0].command == "stop"
+
+
+@jumping
 async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_time() -> None:
     world = World("r1")
     world.gateway.machine.unstoppable = "this version knows no stop"

@@ -114,3 +114,79 @@ async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
     go.set()
     monkeypatch.undo()
     await bus.flush()
+
+
+class Busy:
+    """An entity of Zenoh's whose callback runs for a while: so long taking it back fails as the library does."""
+
+    def __init__(self, times: int) -> None:
+        self.asked: list[str] = []
+        self.undeclared = threading.Event()
+        self._times = times
+
+    def undeclare(self) -> None:
+        self.asked.append(threading.current_thread().name)
+        if len(self.asked) <= self._times:
+            raise RuntimeError("Already borrowed")
+        self.undeclared.set()
+
+
+def test_what_meets_its_own_callback_is_taken_back_again_at_once() -> None:
+    entity = Busy(2)
+    declared = module._Declared(entity)
+    declared.close()
+    assert entity.asked == 3 * [threading.current_thread().name]
+    assert entity.undeclared.is_set()
+    declared.close()
+    assert len(entity.asked) == 3, "taken back once"
+
+
+def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it() -> None:
+    entity = Busy(30)
+    module._Declared(entity).close()
+    assert 0 < entity.asked.count(threading.current_thread().name) < 10
+    assert entity.undeclared.wait(SOON_S)
+    assert len(entity.asked) == 31
+
+
+def test_a_callback_that_never_ends_is_given_up_and_said_so(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "UNDECLARE_S", 0.05)
+    entity = Busy(10**9)
+    module._Declared(entity).close()
+    for thread in threading.enumerate():
+        if thread.name == "zbridge-undeclare":
+            thread.join(SOON_S)
+    assert "not taken back: Already borrowed" in caplog.text
+    assert not entity.undeclared.is_set()
+
+
+def test_other_errors_are_not_tried_again() -> None:
+    class Broken:
+        def undeclare(self) -> None:
+            raise RuntimeError("no such thing")
+
+    with pytest.raises(RuntimeError, match="no such thing"):
+        module._Declared(Broken()).close()
+
+
+async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_back_again(bus: ZenohBus) -> None:
+    handles = [
+        bus.subscribe("k/*", lambda sample: None),
+        bus.answer("k/q", lambda question: None),
+        bus.announce("k/@alive/x"),
+        bus.publisher("k/stream", topics.POSE),
+        bus.publisher("k/state", topics.STATUS),
+        bus.publisher("k/command", topics.CMD_MODE),
+        bus.frames("k/@wire", lambda anybody: None),
+    ]
+    for handle in handles:
+        assert isinstance(handle, module._Declared)
+        stubborn = [Busy(2) for _ in handle._entities]
+        real, handle._entities = handle._entities, tuple(stubborn)
+        handle.close()
+        assert handle.closed
+        assert all(entity.undeclared.is_set() for entity in stubborn)
+        for entity in real:
+            entity.undeclare()

@@ -10,9 +10,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import re
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -30,6 +32,8 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
 from zbridge.metrics import Metrics
 
+log = logging.getLogger("zbridge.bus")
+
 H = TypeVar("H", bound=Handle)
 
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
@@ -43,6 +47,11 @@ FLUSH_S = 2.0
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
+UNDECLARE_S = 1.0
+"""Longest time an entity is tried to be taken back whose callback runs on."""
+
+_AT_ONCE, _PAUSE_S = 4, 0.0005
+"""How often, and at what distance, that is tried by the thread that asks: it may be the event loop's."""
 _TIDY = 64
 
 _PRIORITIES = {
@@ -357,21 +366,51 @@ def _read_reply(reply: zenoh.Reply) -> Answer:
     return Answer("", b"", error.payload.to_bytes().decode("utf-8", "replace") if error else "no answer")
 
 
-class _Declared:
-    """Anything of Zenoh's that is undeclared to end it."""
+def _undeclare(entity: Any) -> bool:
+    """Take an entity back; False where that meets its own running callback and must be tried again."""
+    try:
+        entity.undeclare()
+    except RuntimeError as error:
+        if "borrowed" not in str(error):
+            raise
+        return False
+    return True
 
-    def __init__(self, entity: Any) -> None:
-        self._entity = entity
+
+def _undeclare_soon(entity: Any) -> None:
+    """Take an entity back, here within 2 ms or else by a thread of its own within :data:`UNDECLARE_S`."""
+    for attempt in range(_AT_ONCE):
+        if attempt:
+            time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    threading.Thread(target=_undeclare_later, args=(entity,), name="zbridge-undeclare", daemon=True).start()
+
+
+def _undeclare_later(entity: Any) -> None:
+    give_up_at = time.monotonic() + UNDECLARE_S
+    while time.monotonic() < give_up_at:
+        time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    log.error("%s was not taken back: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+
+
+class _Declared:
+    """Entities of Zenoh's that are undeclared to end them."""
+
+    def __init__(self, *entities: Any) -> None:
+        self._entities = entities
 
     @property
     def closed(self) -> bool:
-        """Whether it was taken back."""
-        return self._entity is None
+        """Whether they were taken back."""
+        return not self._entities
 
     def close(self) -> None:
-        entity, self._entity = self._entity, None
-        if entity is not None:
-            entity.undeclare()
+        entities, self._entities = self._entities, ()
+        for entity in entities:
+            _undeclare_soon(entity)
 
 
 class _PlainPublisher(_Declared):
@@ -390,7 +429,7 @@ class _PlainPublisher(_Declared):
         return True
 
 
-class _StreamPublisher:
+class _StreamPublisher(_Declared):
     """Writes a stream key, plain or express: express is what makes a batch leave at once."""
 
     def __init__(
@@ -400,23 +439,17 @@ class _StreamPublisher:
         self._writer = writer
         if blocks:
             options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
-        self._publishers = (
-            session.declare_publisher(key, **options),
-            session.declare_publisher(key, express=True, **options),
-        )
-        self.put_plain = self._publishers[0].put
-        self.put_express = self._publishers[1].put
+        plain = session.declare_publisher(key, **options)
+        express = session.declare_publisher(key, express=True, **options)
+        super().__init__(plain, express)
+        self.put_plain = plain.put
+        self.put_express = express.put
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         return self._writer.put(lambda: self.put_express(payload, attachment=attachment))
 
-    def close(self) -> None:
-        publishers, self._publishers = self._publishers, ()  # type: ignore[assignment]
-        for publisher in publishers:
-            publisher.undeclare()  # type: ignore[no-untyped-call]
 
-
-class _StatePublisher:
+class _StatePublisher(_Declared):
     """Writes a state key: cached for late joiners, and answered to a plain get."""
 
     def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
@@ -432,17 +465,13 @@ class _StatePublisher:
             publisher_detection=True,
             **options,
         )
-        self._queryable = session.declare_queryable(key, self._reply)
+        super().__init__(session.declare_queryable(key, self._reply), self._publisher)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last = payload
         return self._writer.replace(
             self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 256
         )
-
-    def close(self) -> None:
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
 
     def _reply(self, query: zenoh.Query) -> None:
         last = self._last

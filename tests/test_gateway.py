@@ -99,13 +99,38 @@ async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
 async def test_the_audit_log_is_rotated_as_the_configuration_says(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2)
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=0)
     async with serving(gateway, monkeypatch) as bus:
-        for _ in range(50):
-            await asked(bus, "takeover", who="hq")
+        for number in range(50):
+            await asked(bus, "takeover", who=f"hq{number}")
     sizes = sizes_in(tmp_path)
     assert sorted(sizes) == ["r1.jsonl", "r1.jsonl.1", "r1.jsonl.2"]
     assert max(sizes.values()) <= 1000
+
+
+@jumping
+async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=1)
+    async with serving(gateway, monkeypatch) as bus:
+        for number in range(50):
+            await asked(bus, "takeover", who=f"hq{number}")
+    written = "".join(file.read_text() for file in tmp_path.iterdir())
+    takers = {json.loads(line)["who"] for line in written.splitlines()}
+    assert takers >= {f"hq{number}" for number in range(50)}
+
+
+@jumping
+async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "r1.jsonl"
+    async with serving(configured(audit=str(file)), monkeypatch) as bus:
+        for _ in range(10):
+            await asked(bus, "takeover", who="hq")
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert sum(line.get("count", 1) for line in lines if line["event"] == "taken over") == 10
 
 
 @jumping

@@ -162,6 +162,7 @@ class Device:
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 await self._bus.flush()
+        self._conditions.changed = lambda: None
         for handle in (*declared, *self._publishers.values()):
             handle.close()
 

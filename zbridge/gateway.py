@@ -153,10 +153,25 @@ class Gateway:
         if control.audit is None or self._plan.device is None:
             yield Audit(name, logging.getLogger("zbridge.audit").debug)
             return
-        file = AuditFile(Path(control.audit), self.metrics, file_bytes=control.audit_bytes, files=control.audit_files)
+        loop = asyncio.get_running_loop()
+
+        def tell(text: str | None) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self.conditions.set, "audit", text)
+
+        file = AuditFile(
+            Path(control.audit),
+            self.metrics,
+            file_bytes=control.audit_bytes,
+            files=control.audit_files,
+            days=control.audit_days,
+            tell=tell,
+        )
+        audit = Audit(name, file.write)
         try:
-            yield Audit(name, file.write)
+            yield audit
         finally:
+            audit.close()
             file.close()
 
     async def _open_bus(self) -> Bus:

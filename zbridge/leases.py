@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Callable
 
@@ -19,8 +18,6 @@ from zbridge.protocol import Robot
 from zbridge.session.control import Authority, What
 from zbridge.session.motion import MotionLimits
 from zbridge.session.session import State
-
-log = logging.getLogger("zbridge.control")
 
 STOP_REPEAT_S = 1.0
 """Seconds for which a stop is repeated."""
@@ -131,7 +128,6 @@ class Leases:
                     if event.what is not What.ACQUIRED:
                         self.limits.stands()
                     self._metrics.count("control", what=event.what.value).value += 1
-                    log.info("%s: %s", self._keys.robot, event)
                 if event.stops:
                     self._send_stop()
                 self._audit.write(event)

@@ -148,6 +148,16 @@ class Device:
             finally:  # the links' tasks still run: the group ends them only after this
                 await asyncio.shield(self._shut_down(declared))
 
+    @property
+    def reached(self) -> bool:
+        """Whether the robot was ever reached."""
+        return self._greeted is not None
+
+    def refuse(self, command: str, refusal: Refused, who: str) -> None:
+        """Show on ``control`` what was refused to somebody."""
+        self._leases.authority.refuse(command, refusal, who)
+        self._leases.settle()
+
     async def _shut_down(self, declared: list[Handle]) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._leaving = True

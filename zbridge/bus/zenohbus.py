@@ -15,6 +15,7 @@ import os
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -30,7 +31,7 @@ from zbridge.bus.writer import Writer
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
-from zbridge.metrics import Metrics
+from zbridge.metrics import Count, Metrics
 
 log = logging.getLogger("zbridge.bus")
 
@@ -52,6 +53,10 @@ UNDECLARE_S = 1.0
 
 _AT_ONCE, _PAUSE_S = 4, 0.0005
 """How often, and at what distance, that is tried by the thread that asks: it may be the event loop's."""
+REPLIES = 10_000
+"""Most replies to one query."""
+_EACH = 16
+"""Most replies of one session to a query for one key."""
 _TIDY = 64
 
 _PRIORITIES = {
@@ -121,6 +126,7 @@ class ZenohBus:
         self._session = session
         self._loop = loop
         self._inbox = Inbox(loop, metrics)
+        self._replies_dropped = metrics.count("bus_replies_dropped")
         self._relief: list[Callable[[], None]] = []
         self._lossless = stream == "block"
         self._writer = Writer("states", metrics, lossless=self._lossless, relieved=self._relieve)
@@ -197,8 +203,9 @@ class ZenohBus:
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
+        """Query ``key_expr`` and collect the replies that come within ``timeout_s``, as far as they are no flood."""
         replies = await self._collect(
+            key_expr,
             lambda handler: self._session.get(
                 key_expr,
                 handler,
@@ -224,7 +231,7 @@ class ZenohBus:
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         """List the liveliness tokens that exist."""
         replies = await self._collect(
-            lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
+            key_expr, lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
         )
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
@@ -320,16 +327,16 @@ class ZenohBus:
             self._tidy_at = 2 * len(self._handles) + _TIDY
         return handle
 
-    async def _collect(self, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
+    async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
         """Run a get whose replies are stored as they come; the last one's handler being dropped ends it."""
-        loop, replies = self._loop, list[Any]()
+        loop, replies = self._loop, _Replies(key_expr, self._replies_dropped)
         done = loop.create_future()
 
         def finish() -> None:
             if not done.done():
                 done.set_result(None)
 
-        handler = zenoh.handlers.Callback(replies.append, lambda: loop.call_soon_threadsafe(finish))
+        handler = zenoh.handlers.Callback(replies.take, lambda: loop.call_soon_threadsafe(finish))
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
@@ -361,9 +368,37 @@ def _read_change(raw: zenoh.Sample) -> tuple[str, bool]:
 
 def _read_reply(reply: zenoh.Reply) -> Answer:
     if reply.ok is not None:
-        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), replier=_replier(reply))
     error = reply.err
-    return Answer("", b"", error.payload.to_bytes().decode("utf-8", "replace") if error else "no answer")
+    text = error.payload.to_bytes().decode("utf-8", "replace") if error else "no answer"
+    return Answer("", b"", text, _replier(reply))
+
+
+def _replier(reply: zenoh.Reply) -> str | None:
+    return str(reply.replier_id.zid) if reply.replier_id is not None else None
+
+
+class _Replies(list[zenoh.Reply]):
+    """What replied to one query, within bounds; taken on Zenoh's threads.
+
+    A flood of one session's replies must not hide another's. Who answers for one key has little to say, who answers
+    for many may answer for a whole fleet.
+    """
+
+    def __init__(self, key_expr: str, dropped: Count) -> None:
+        super().__init__()
+        self._dropped = dropped
+        self._each = REPLIES if "*" in key_expr else _EACH
+        self._counts: Counter[str | None] = Counter()
+
+    def take(self, reply: zenoh.Reply) -> None:
+        """Keep a reply, if there is room."""
+        replier = _replier(reply)
+        if len(self) < REPLIES and self._counts[replier] < self._each:
+            self._counts[replier] += 1
+            self.append(reply)
+        else:
+            self._dropped.value += 1
 
 
 def _undeclare(entity: Any) -> bool:

@@ -190,3 +190,50 @@ async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_bac
         assert all(entity.undeclared.is_set() for entity in stubborn)
         for entity in real:
             entity.undeclare()
+
+
+async def test_streams_above_the_first_ones_are_published_all_the_same_and_leave_nothing_behind(
+    bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    seen = Seen()
+    bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.key, sample.payload))
+    names = [f"s{number}" for number in range(5)]
+    publishers = [bus.publisher(f"fleet/r1/sensor/{name}", topics.SENSOR(name)) for name in names]
+    kinds = [type(publisher).__name__ for publisher in publishers]
+    assert kinds == 2 * ["_StreamPublisher"] + 3 * ["_StreamKey"]
+    bus.put_all([(publisher, [b"1", b"2"]) for publisher in publishers])
+    publishers[-1].put(b"3")
+    await seen.until(lambda: len(seen) == 11)
+    expected = {(f"fleet/r1/sensor/{name}", payload) for name in names for payload in (b"1", b"2")}
+    assert set(seen) == expected | {("fleet/r1/sensor/s4", b"3")}
+    for publisher in publishers:
+        publisher.close()
+        publisher.close()
+        assert publisher.closed  # type: ignore[attr-defined]
+    again = bus.publisher("fleet/r1/sensor/s0", topics.SENSOR("s0"))
+    assert type(again).__name__ == "_StreamPublisher", "one that had a publisher is given one again"
+
+
+async def test_what_waits_to_be_written_without_loss_is_written_before_its_key_is_given_up() -> None:
+    bus = await open_zenoh(BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",), stream="block"), Metrics())
+    try:
+        seen, go = Seen(), threading.Event()
+        bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.payload))
+        publisher = bus.publisher("fleet/r1/sensor/s", topics.SENSOR("s"))
+        bus._streams.put(lambda: go.wait(SOON_S))
+        bus.put_all([(publisher, [b"1", b"2"])])
+        publisher.close()
+        go.set()
+        await seen.until(lambda: seen == [b"1", b"2"])
+    finally:
+        await bus.close()
+
+
+async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    for number in range(1000):
+        bus.publisher(f"fleet/r1/sensor/s{number}", topics.SENSOR(f"s{number}")).close()
+        bus.publisher(f"fleet/r1/state{number}", topics.STATUS).close()
+    assert len(bus._handles) < 200
+    assert len(bus._published) == 2

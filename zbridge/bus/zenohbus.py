@@ -17,11 +17,13 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 # One thread that receives instead of several that wake one another for each message; read when zenoh is imported.
 os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), acc: (handover: rx))")
 
+import msgspec
 import zenoh
 import zenoh.ext
 
@@ -53,6 +55,9 @@ UNDECLARE_S = 1.0
 
 _AT_ONCE, _PAUSE_S = 4, 0.0005
 """How often, and at what distance, that is tried by the thread that asks: it may be the event loop's."""
+PUBLISHERS = 300
+"""Different stream keys that are given publishers: Zenoh keeps 1.5 kB of each for ever, here and in every router, and
+finds others more slowly. Later ones are declared as keys only: that takes 0.5 us more for each message."""
 REPLIES = 10_000
 """Most replies to one query."""
 _EACH = 16
@@ -133,6 +138,8 @@ class ZenohBus:
         self._streams = Writer("streams", metrics, lossless=self._lossless, relieved=self._relieve)
         self._handles: list[Handle] = []
         self._tidy_at = _TIDY
+        self._published: set[str] = set()
+        """Stream keys that were ever given publishers."""
 
     def __repr__(self) -> str:
         return f"<ZenohBus {self._session.zid()}>"
@@ -149,7 +156,11 @@ class ZenohBus:
         if qos.keeps_last:
             return self._keep(_StatePublisher(self._session, key, options, self._writer))
         if topic.delivery is Delivery.STREAM:
-            return self._keep(_StreamPublisher(self._session, key, options, self._streams, blocks=self._lossless))
+            known = len(self._published) < PUBLISHERS or key in self._published
+            if known:
+                self._published.add(key)
+            kind = _StreamPublisher if known else _StreamKey
+            return self._keep(kind(self._session, key, options, self._streams, blocks=self._lossless))
         plain = self._session.declare_publisher(key, express=qos.express, **options)
         blocks = qos.congestion is Congestion.BLOCK
         return self._keep(_PlainPublisher(key, plain, self._writer if blocks else None))
@@ -472,16 +483,44 @@ class _StreamPublisher(_Declared):
     ) -> None:
         self.key = key
         self._writer = writer
+        self._blocks = blocks
         if blocks:
             options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
+        super().__init__(*self._declare(session, key, options))
+
+    put_plain: Callable[..., object]
+    put_express: Callable[..., object]
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
         plain = session.declare_publisher(key, **options)
         express = session.declare_publisher(key, express=True, **options)
-        super().__init__(plain, express)
-        self.put_plain = plain.put
-        self.put_express = express.put
+        self.put_plain, self.put_express = plain.put, express.put
+        return plain, express
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        return self._writer.put(lambda: self.put_express(payload, attachment=attachment))
+        return self._writer.put(partial(self.put_express, payload, attachment=attachment))
+
+    def close(self) -> None:
+        if self._blocks:  # what waits to be written is not lost
+            self._writer.put(super().close)
+        else:
+            super().close()
+
+
+class _StreamKey(_StreamPublisher):
+    """Writes a stream key that Zenoh is to forget when it is closed."""
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
+        expression = session.declare_keyexpr(key)
+        self.put_plain = partial(session.put, expression, **options)
+        self.put_express = partial(session.put, expression, express=True, **options)
+        return (_Undeclared(lambda: session.undeclare(expression)),)
+
+
+class _Undeclared(msgspec.Struct):
+    """Something that is undeclared by a call."""
+
+    undeclare: Callable[[], object]
 
 
 class _StatePublisher(_Declared):

@@ -202,3 +202,13 @@ def test_a_closed_audience_leaves_nothing_on_the_bus(scene: Scene) -> None:
 def test_an_audience_that_was_never_opened_can_be_closed(scene: Scene) -> None:
     scene.audience.close()
     assert repr(scene.audience) == "<Audience of r1, []>"
+
+
+def test_names_that_a_robot_makes_up_for_ever_are_not_all_remembered(scene: Scene) -> None:
+    follower = Follower()
+    scene.audience.follow(("sensor/*",), follower.message, follower.gateway)
+    for number in range(3000):
+        scene.say(topics.SENSOR(f"s{number}"), Reading(value=1.0))
+    assert len(follower.heard) == 3000
+    assert len(scene.audience._topics) <= 1024
+    assert KEYS.key("sensor/s2999") in scene.audience._topics, "and the newest are known"

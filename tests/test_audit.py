@@ -1,13 +1,16 @@
 """The audit log: what a line says, what is counted instead of repeated, and what becomes of it on the disk."""
 
 import contextlib
+import errno
 import json
+import logging
 import os
 import select
 import stat
 import threading
+import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +18,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zbridge.audit import KINDS, WAITING, Audit, AuditFile
+from zbridge.audit import COUNTS, COUNTS_HZ, KINDS, MOST, WAITING, Audit, AuditFile
 from zbridge.errors import ConfigError
+from zbridge.fleet.messages import Acquire
 from zbridge.metrics import Metrics
-from zbridge.session.control import Event, What
+from zbridge.session.control import Authority, Event, What
 
 EPOCH_NS = 1_767_225_600_000_000_000
 """The first second of 2026, UTC."""
@@ -204,12 +208,18 @@ def test_different_refusals_are_counted_apart(log: Log, other: Event) -> None:
 
 
 @pytest.mark.parametrize("event", [event for event, _ in WRITTEN if event.who and event.what is not What.REFUSED])
-def test_what_happens_to_a_holder_is_written_every_time(log: Log, event: Event) -> None:
+def test_what_happens_to_a_holder_again_and_again_is_counted_too(log: Log, event: Event) -> None:
     for _ in range(3):
         log.audit.write(event)
-    assert [line["event"] for line in log.lines()] == [event.what.value] * 3
+    assert [(line["event"], line.get("count")) for line in log.lines()] == [(event.what.value, None)]
     log.audit.flush()
-    assert log.lines() == []
+    assert [(line["event"], line.get("count")) for line in log.lines()] == [(event.what.value, 2)]
+    log.audit.write(event)
+    log.audit.flush()
+    log.audit.flush()
+    log.lines()
+    log.audit.write(event)
+    assert len(log.lines()) == 1, "a second later it is news again"
 
 
 def test_stops_of_a_robot_that_nobody_holds_are_counted_too(log: Log) -> None:
@@ -241,6 +251,147 @@ def test_a_flood_of_refusals_hides_no_stop(log: Log) -> None:
     log.audit.flush()
     stops = [(line["reason"], line["stops"]) for line in log.lines() if line["event"] == "stopped"]
     assert stops == [("stop", True)]
+
+
+# Floods
+
+
+ANN = [
+    Event(What.ACQUIRED, "ann", priority=0),
+    Event(What.STOPPED, "ann", "stop", stops=True),
+    Event(What.TAKEN_OVER, "ann", priority=0),
+]
+"""What another actor did, and must still be found."""
+PER_S = 3000
+
+
+def takeovers(names: Iterable[str]) -> list[Event]:
+    """What a robot's authority tells when one after the other takes the robot from the one before."""
+    authority = Authority(3.0, 2.0, os.urandom)
+    for name in names:
+        authority.takeover(Acquire(name), 0.0)
+    return authority.events()
+
+
+def one_name() -> list[Event]:
+    return takeovers(["mallory"] * PER_S)
+
+
+def random_names() -> list[Event]:
+    return takeovers([os.urandom(8).hex() for _ in range(PER_S)])
+
+
+def stops() -> list[Event]:
+    authority = Authority(3.0, 2.0, os.urandom)
+    for _ in range(PER_S):
+        authority.stop("stop")
+    return authority.events()
+
+
+def varied_refusals() -> list[Event]:
+    return [refused("mallory", f"command {number}", os.urandom(8).hex()) for number in range(PER_S)]
+
+
+def comings_and_goings() -> list[Event]:
+    names = [os.urandom(8).hex() for _ in range(PER_S // 2)]
+    return [event for who in names for event in (Event(What.ACQUIRED, who), Event(What.RELEASED, who, "released"))]
+
+
+FLOODS = [one_name, random_names, stops, varied_refusals, comings_and_goings]
+
+
+@pytest.mark.parametrize("flood", FLOODS)
+def test_a_flood_pushes_nothing_out_that_was_there_before(
+    tmp_path: Path, metrics: Metrics, flood: Callable[[], list[Event]], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    file = opened(tmp_path / "audit.jsonl", metrics, file_bytes=100_000, files=1)
+    audit = Audit("r1", file.write)
+    for event in ANN:
+        audit.write(event)
+    for _ in range(7):
+        for event in flood():
+            audit.write(event)
+        audit.flush()
+    audit.close()
+    file.close()
+    written = "".join(each.read_text() for each in tmp_path.iterdir()).splitlines()
+    lines = [json.loads(line) for line in written]
+    assert {line["event"] for line in lines if line.get("who") == "ann"} >= {event.what.value for event in ANN}
+    assert sum(line.get("count", 1) for line in lines) >= 7 * PER_S, "and the flood itself is counted"
+    assert len(lines) < 400
+    assert len(caplog.records) < 400
+    assert metrics.count("audit_dropped").value == 0
+
+
+@pytest.mark.parametrize("flood", [one_name, random_names, varied_refusals])
+def test_what_another_does_amid_a_flood_has_lines_of_its_own(log: Log, flood: Callable[[], list[Event]]) -> None:
+    for second in range(20):
+        for event in flood():
+            log.audit.write(event)
+        if second == 10:
+            log.lines()
+            for event in ANN[:2]:
+                log.audit.write(event)
+            assert [(line["event"], line["who"]) for line in log.lines()] == [("acquired", "ann"), ("stopped", "ann")]
+        log.audit.flush()
+
+
+def test_an_actor_that_was_there_before_keeps_its_lines_when_strangers_do_the_same(log: Log) -> None:
+    log.audit.write(ANN[2])
+    for _ in range(20):
+        for event in random_names():
+            log.audit.write(event)
+        log.audit.flush()
+    log.lines()
+    log.audit.write(Event(What.TAKEN_OVER, "ann", "again", priority=0))
+    assert [(line["event"], line["who"]) for line in log.lines()] == [("taken over", "ann")]
+
+
+def test_a_day_of_a_flood_fills_no_disk(log: Log) -> None:
+    size = 0
+    for second in range(600):
+        for event in takeovers(os.urandom(8).hex() for _ in range(100)):
+            log.audit.write(event)
+        log.audit.flush()
+        if second >= 60:
+            size += sum(len(line) + 1 for line in log.raw)
+        log.raw.clear()
+    assert size / 540 * 86_400 < 50e6
+
+
+def test_what_has_to_wait_to_be_counted_is_written_in_turn_and_at_the_end(log: Log) -> None:
+    for _ in range(1000):
+        for number in range(10):
+            for _ in range(2):
+                log.audit.write(refused(reason=f"reason {number}"))
+        log.audit.flush()
+    log.audit.close()
+    lines = log.lines()
+    assert len(lines) < 10 + COUNTS + 1000 * COUNTS_HZ + 10
+    assert sum(line.get("count", 1) for line in lines) == 1000 * 10 * 2
+    per_reason = Counter(line["reason"] for line in lines)
+    assert max(per_reason.values()) - min(per_reason.values()) <= 1
+
+
+def test_what_is_left_to_count_is_written_at_the_end(log: Log) -> None:
+    for event in (refused(), refused(), refused(), Event(What.STOPPED, None, "stop", stops=True)):
+        log.audit.write(event)
+    log.lines()
+    log.audit.close()
+    assert [line["count"] for line in log.lines()] == [2]
+
+
+def test_the_gateways_log_has_the_same_but_for_refusals(log: Log, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "zbridge.control")
+    for event in (ANN[0], refused(), ANN[1], ANN[1], ANN[1]):
+        log.audit.write(event)
+    log.audit.flush()
+    assert [record.getMessage() for record in caplog.records] == [
+        "r1: acquired ann",
+        "r1: stopped ann (stop)",
+        "r1: stopped ann (stop), 2 times",
+    ]
 
 
 events = st.builds(
@@ -315,8 +466,10 @@ def disk(tmp_path: Path, metrics: Metrics) -> Iterator[Disk]:
         yield disk
 
 
-def opened(path: Path, metrics: Metrics | None = None, *, file_bytes: int = 1_000_000, files: int = 2) -> AuditFile:
-    return AuditFile(path, metrics or Metrics(), file_bytes=file_bytes, files=files)
+def opened(
+    path: Path, metrics: Metrics | None = None, *, file_bytes: int = 1_000_000, files: int = 2, **more: Any
+) -> AuditFile:
+    return AuditFile(path, metrics or Metrics(), file_bytes=file_bytes, files=files, **more)
 
 
 def fill(file: AuditFile) -> list[bytes]:
@@ -375,6 +528,156 @@ def test_files_are_rotated_and_the_oldest_are_dropped(tmp_path: Path) -> None:
     written = "".join(each.read_text() for each in kept).splitlines()
     assert written == lines[-len(written) :]
     assert len(written) > 200
+
+
+def rotated(path: Path, lines: int, **more: Any) -> list[str]:
+    """Write lines of which one fills a file; name the files there are then."""
+    file = opened(path, file_bytes=1000, **more)
+    for number in range(lines):
+        file.write(f"{number:0999}")
+    file.close()
+    return sorted(each.name for each in path.parent.iterdir())
+
+
+def test_a_file_that_is_young_is_kept_though_there_are_many(tmp_path: Path) -> None:
+    path = tmp_path / "audit"
+    assert rotated(path, 6, files=2, days=1.0) == ["audit", *(f"audit.{number}" for number in range(1, 6))]
+    assert path.with_name("audit.5").read_text() == f"{0:0999}\n", "nothing was lost"
+    long_ago = time.time() - 2 * 86_400
+    for number in (3, 4, 5):
+        os.utime(path.with_name(f"audit.{number}"), (long_ago, long_ago))
+    assert rotated(path, 1, files=2, days=1.0) == ["audit", "audit.1", "audit.2", "audit.3"]
+    assert path.with_name("audit.3").read_text() == f"{3:0999}\n"
+
+
+def test_an_old_file_is_kept_where_there_are_few(tmp_path: Path) -> None:
+    path = tmp_path / "audit"
+    rotated(path, 3, files=2, days=1.0)
+    os.utime(path.with_name("audit.2"), (0, 0))
+    os.utime(path.with_name("audit.1"), (0, 0))
+    assert rotated(path, 1, files=3, days=1.0) == ["audit", "audit.1", "audit.2", "audit.3"]
+
+
+def test_there_is_a_limit_to_how_many_young_files_there_are(tmp_path: Path) -> None:
+    names = rotated(tmp_path / "audit", MOST + 5, files=1, days=365.0)
+    assert len(names) == 1 + MOST
+
+
+class Told(list[str | None]):
+    """What people are told of the audit log, and a way to wait for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._changed = threading.Condition()
+
+    def tell(self, text: str | None) -> None:
+        with self._changed:
+            self.append(text)
+            self._changed.notify_all()
+
+    def until(self, count: int) -> list[str | None]:
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self) >= count, JOIN_S)
+            return list(self)
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch) -> Told:
+    monkeypatch.setattr("zbridge.audit.RETRY_S", 0.01)
+    return Told()
+
+
+def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_again(
+    tmp_path: Path, metrics: Metrics, told: Told, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    path.symlink_to("/dev/full")
+    file = opened(path, metrics, tell=told.tell)
+    lines = [f"line {number}" for number in range(100)]
+    for line in lines:
+        file.write(line)
+    assert told.until(1) == ["the audit log is not written: No space left on device"]
+    failed = metrics.count("audit_failed")
+    seen = failed.value
+    assert seen >= 1
+    room = tmp_path / "room"
+    (tmp_path / "link").symlink_to(room)
+    os.replace(tmp_path / "link", path)
+    assert told.until(2)[1:] == [None]
+    file.close()
+    assert room.read_text().splitlines() == lines
+    assert metrics.count("audit_dropped").value == 0
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert errors == [f"the audit log is not written: No space left on device ({path})"]
+
+
+def test_a_disk_that_stays_full_keeps_nobody_from_ending_and_what_is_lost_is_counted(
+    tmp_path: Path, metrics: Metrics, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "audit.jsonl"
+    path.symlink_to("/dev/full")
+    file = opened(path, metrics)
+    for number in range(100):
+        file.write(f"line {number}")
+    file.close()
+    assert not file._writer.is_alive()
+    assert metrics.count("audit_dropped").value == 100
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_line_that_was_half_written_is_finished(tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, write, full = tmp_path / "audit.jsonl", os.write, threading.Event()
+    file = opened(path, tell=told.tell)
+
+    def short_of_room(descriptor: int, data: bytes) -> int:
+        if descriptor != file._file._descriptor:
+            return write(descriptor, data)
+        if full.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+        full.set()
+        return write(descriptor, data[:4])
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", short_of_room)
+        file.write("a whole line")
+        told.until(1)
+    file.write("and another")
+    told.until(2)
+    file.close()
+    assert path.read_text() == "a whole line\nand another\n"
+
+
+def test_a_pipe_that_nobody_reads_is_waited_for_by_nobody(
+    tmp_path: Path, metrics: Metrics, told: Told, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    file = opened(path, metrics, tell=told.tell)
+    file.write("line")
+    assert told.until(1) == ["the audit log is not written: No such device or address"]
+    file.close()
+    assert not file._writer.is_alive()
+    assert metrics.count("audit_dropped").value == 1
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+
+
+def test_a_pipe_is_written_when_somebody_reads_it_and_again_when_somebody_else_does(
+    tmp_path: Path, metrics: Metrics, told: Told
+) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    file = opened(path, metrics, tell=told.tell)
+    file.write("one")
+    told.until(1)
+    with path.open() as reader:
+        assert reader.readline() == "one\n"
+    assert told.until(2)[1:] == [None]
+    file.write("two")
+    assert told.until(3)[2:] == ["the audit log is not written: Broken pipe"]
+    with path.open() as reader:
+        assert reader.readline() == "two\n"
+        file.close()
+    assert metrics.count("audit_dropped").value == 0
 
 
 def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written(disk: Disk, metrics: Metrics) -> None:

@@ -94,6 +94,52 @@ async def test_a_client_that_goes_at_once_does_no_harm(address: Address, metrics
         assert b"200 OK" in await asked(address, b"GET / HTTP/1.0\r\n\r\n")
 
 
+async def connected(address: Address) -> socket.socket:
+    """Connect and say nothing."""
+    client = socket.socket()
+    client.setblocking(False)
+    await asyncio.get_running_loop().sock_connect(client, (address.host, address.port))
+    return client
+
+
+async def test_few_clients_are_served_at_a_time_and_the_next_when_one_has_gone(
+    address: Address, metrics: Metrics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporter, "REQUEST_S", 60.0)
+    async with serve_metrics(address, metrics):
+        silent = [await connected(address) for _ in range(exporter.CLIENTS)]
+        asking = asyncio.create_task(asked(address, b"GET / HTTP/1.0\r\n\r\n"))
+        for _ in range(100):  # whatever is ready runs
+            await asyncio.sleep(0)
+        assert not asking.done()
+        silent.pop().close()
+        assert b"200 OK" in await asking
+    for client in silent:  # who says nothing does not keep the gateway from ending
+        client.close()
+
+
+async def test_a_crowd_of_clients_takes_no_more_than_a_few_places(address: Address, metrics: Metrics) -> None:
+    async with serve_metrics(address, metrics):
+        crowd = [socket.socket() for _ in range(exporter.WAITING)]
+        for client in crowd:
+            client.setblocking(False)
+            client.connect_ex((address.host, address.port))
+        taken = 0
+        for _ in range(100):
+            await asyncio.sleep(0)
+            tasks = [task.get_coro().__name__ for task in asyncio.all_tasks()]  # type: ignore[union-attr]
+            taken = max(taken, tasks.count("_serve"))
+    for client in crowd:
+        client.close()
+    assert taken == exporter.CLIENTS
+
+
+async def test_everybody_of_a_crowd_that_asks_is_answered_in_turn(address: Address, metrics: Metrics) -> None:
+    async with serve_metrics(address, metrics):
+        crowd = [asked(address, b"GET / HTTP/1.0\r\n\r\n") for _ in range(3 * exporter.CLIENTS)]
+        assert all(b"200 OK" in page for page in await asyncio.gather(*crowd))
+
+
 async def test_the_page_is_gone_with_the_context(address: Address, metrics: Metrics) -> None:
     async with serve_metrics(address, metrics):
         pass

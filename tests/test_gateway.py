@@ -63,6 +63,15 @@ async def asked(bus: FakeBus, name: str, payload: bytes = b"", **fields: Any) ->
     return lease
 
 
+def last(bus: FakeBus, path: str) -> dict[str, Any]:
+    fields: dict[str, Any] = msgpack.unpackb(bus.values(f"fleet/r1/{path}")[-1])
+    return fields
+
+
+def lines_in(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for file in folder.iterdir() for line in file.read_text().splitlines()]
+
+
 def sizes_in(folder: Path) -> dict[str, int]:
     return {file.name: file.stat().st_size for file in folder.iterdir()}
 
@@ -102,13 +111,36 @@ async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
 async def test_the_audit_log_is_rotated_as_the_configuration_says(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2)
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=0)
     async with serving(gateway, monkeypatch) as bus:
-        for _ in range(50):
-            await asked(bus, "takeover", who="hq")
+        for number in range(50):
+            await asked(bus, "takeover", who=f"hq{number}")
     sizes = sizes_in(tmp_path)
     assert sorted(sizes) == ["r1.jsonl", "r1.jsonl.1", "r1.jsonl.2"]
     assert max(sizes.values()) <= 1000
+
+
+@jumping
+async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=1)
+    async with serving(gateway, monkeypatch) as bus:
+        for number in range(50):
+            await asked(bus, "takeover", who=f"hq{number}")
+    assert {line["who"] for line in lines_in(tmp_path)} >= {f"hq{number}" for number in range(50)}
+
+
+@jumping
+async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "r1.jsonl"
+    async with serving(configured(audit=str(file)), monkeypatch) as bus:
+        for _ in range(10):
+            await asked(bus, "takeover", who="hq")
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert sum(line.get("count", 1) for line in lines if line["event"] == "taken over") == 10
 
 
 @jumping
@@ -117,6 +149,52 @@ async def test_an_audit_log_that_cannot_be_written_keeps_the_gateway_from_starti
     file.touch()
     with pytest.raises(ConfigError, match=r"control\.audit = '.*/file/r1\.jsonl': "):
         await configured(audit=str(file / "r1.jsonl")).run()
+
+
+@jumping
+async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("zbridge.device.Device.reached", True)
+    text = "another gateway serves this robot too: beef"
+    async with serving(configured(), monkeypatch) as bus:
+        forged = bus.join("beef").answer(
+            "fleet/r1/@rpc/claim/gateway",
+            lambda question: question.answer(msgpack.packb({"held_s": 3600.0, "has": True})),
+        )
+        await asyncio.sleep(20.0)
+        assert last(bus, "status")["reason"].endswith(f"; {text}")
+        (refused,) = last(bus, "control")["refusals"]
+        assert refused == {
+            "who": "beef",
+            "command": "claim",
+            "code": "held",
+            "reason": "this gateway serves the robot",
+            "count": 1,
+            "by": None,
+        }
+        forged.close()
+        await asyncio.sleep(10.0)
+        assert text not in last(bus, "status")["reason"]
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"r1: {text}"]
+
+
+@jumping
+async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(configured(), monkeypatch) as bus:
+        bus.join("beef").answer(
+            "fleet/r1/@rpc/claim/gateway",
+            lambda question: question.answer(msgpack.packb({"held_s": 1e-3, "has": True})),
+        )
+        bus.join("beef").announce("fleet/r1/@alive/gateway")
+        await asyncio.sleep(10.0)
+        shown = len(bus.values("fleet/r1/status"))
+        await asyncio.sleep(10.0)
+        assert len(bus.values("fleet/r1/status")) == shown, "nothing more is said of the robot"
+        assert last(bus, "status")["reason"] == "gateway stopped"
+    assert "another gateway served r1 before this one: leaving it alone" in caplog.text
 
 
 class Work:

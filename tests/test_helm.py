@@ -32,7 +32,7 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import KeySpace
 from zbridge.fleet.view import RobotView
-from zbridge.helm import REPEAT_S, WAITING, Bridge, Helm
+from zbridge.helm import PUBLISHERS, REPEAT_S, WAITING, Bridge, Helm
 from zbridge.session.control import Authority
 from zbridge.session.intent import LEASE_S, Intent
 from zbridge.session.proof import Signer, read
@@ -1207,3 +1207,11 @@ async def test_many_programs_come_and_go_and_leave_nothing() -> None:
     scene.bridge.close()
     assert "Bridge to r1" in repr(scene.bridge)
     assert repr(helm).startswith("<Helm hq.toy.299 <Intent")
+
+
+async def test_keys_that_are_commanded_one_after_the_other_do_not_add_up() -> None:
+    scene = Scene()
+    for number in range(2 * PUBLISHERS):
+        scene.bridge.put(topics.CMD_SENSOR(f"s{number}"), SensorSetting(value=1.0))
+    assert len(scene.bridge._publishers) == PUBLISHERS
+    assert len(scene.bus.values("fleet/r1/@cmd/sensor/*")) == 2 * PUBLISHERS

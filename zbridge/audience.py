@@ -17,6 +17,8 @@ from zbridge.metrics import Metrics
 log = logging.getLogger("zbridge.hq")
 
 Follow = Callable[[Topic, FleetMessage], None]
+_KNOWN = 1024
+"""Keys whose topics are known at a time."""
 _STATES = (topics.STATUS.path, topics.CONTROL.path)
 
 
@@ -95,7 +97,9 @@ class Audience:
 
     def _topic(self, key: str) -> Topic | None:
         topic = topics.find(self._keys.path(key))
-        if topic is not None and len(self._topics) < 1024:
+        if topic is not None:
+            if len(self._topics) >= _KNOWN:  # a robot may make up new names for ever
+                self._topics.clear()
             self._topics[key] = topic
         return topic
 

@@ -79,7 +79,8 @@ idle_stop_s = 1.0                       # a stop so often while nobody drives: i
                                         # 0: only when motion ends
 audit = "{name}.audit.jsonl"                # who drove, was refused, stopped it: a file in the working directory,
 audit_bytes = 1000000                   # rotated at this size,
-audit_files = 5                         # with so many older ones kept
+audit_files = 5                         # with so many older ones kept,
+audit_days = 30.0                       # and more of them, up to 20 times as many, that are younger than this
 
 """
     + METRICS_TEMPLATE
@@ -132,7 +133,8 @@ class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     rate_hz: drives a second that are carried out. slew_per_s: change of each part of a drive, full scales a second.
     idle_stop_s: seconds between two stops while nobody drives; 0: only when motion ends.
-    audit: the file of the audit log, rotated at ``audit_bytes``, with ``audit_files`` older ones kept.
+    audit: the file of the audit log, rotated at ``audit_bytes``, with ``audit_files`` older ones kept, and more of them
+    that are younger than ``audit_days``.
     """
 
     lease_s: Seconds = 3.0
@@ -143,6 +145,7 @@ class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     audit: Annotated[str, msgspec.Meta(min_length=1)] | None = None
     audit_bytes: Annotated[int, msgspec.Meta(ge=1000)] = 1_000_000
     audit_files: Annotated[int, msgspec.Meta(ge=1)] = 5
+    audit_days: Annotated[float, msgspec.Meta(ge=0)] = 30.0
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -26,6 +26,7 @@ from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.leases import Leases
 from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
+from zbridge.names import NAMES, Names
 from zbridge.protocol import Robot, Translate
 from zbridge.questions import Questions
 from zbridge.session.control import Authority
@@ -79,6 +80,8 @@ class Device:
         self._conditions = conditions or Conditions()
         self._conditions.changed = self._publish_status
         self._publishers: dict[str, Publisher] = {}
+        self._names = Names()
+        self._clock = clock
         self._translators: dict[type, Translate] = {}
         self._busy: str | None = None
         self._doubtful: str | None = None
@@ -112,13 +115,14 @@ class Device:
         self._lost = metrics.count("commands_lost")
         self._untranslatable = metrics.count("untranslatable")
         self._stalls = metrics.count("link_stalls")
+        self._unnamed = metrics.count("names_dropped")
         self._endpoints = [
             Endpoint(
                 name,
                 f"{keys.robot} {name}",
                 address,
                 Hooks(
-                    session=partial(robot.session, index, str(address)),
+                    session=partial(self._session, index, str(address)),
                     deliver=self._deliver,
                     session_changed=self._on_session,
                     state_changed=self._publish_status,
@@ -163,6 +167,16 @@ class Device:
             finally:  # the links' tasks still run: the group ends them only after this
                 await asyncio.shield(self._shut_down(declared))
 
+    @property
+    def reached(self) -> bool:
+        """Whether the robot was ever reached."""
+        return self._greeted is not None
+
+    def refuse(self, command: str, refusal: Refused, who: str) -> None:
+        """Show on ``control`` what was refused to somebody."""
+        self._leases.authority.refuse(command, refusal, who)
+        self._leases.settle()
+
     async def _shut_down(self, declared: list[Handle]) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._leaving = True
@@ -178,10 +192,18 @@ class Device:
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 await self._bus.flush()
+        self._conditions.changed = lambda: None
         for handle in (*declared, *self._publishers.values()):
             handle.close()
 
     # Links
+
+    def _session(self, index: int, address: str) -> Session[Any]:
+        """Make the session of a new connection; the names of the one before it are given up."""
+        if not index:
+            for path in [path for path in self._publishers if _is_named(path)]:
+                self._publishers.pop(path).close()
+        return self._robot.session(index, address)
 
     def _on_session(self, session: Session[Any]) -> None:
         if session is not self._robot.driving:
@@ -251,11 +273,12 @@ class Device:
                     stream = streams.get(topic.path)
                     if stream is not None:
                         stream.append(payload)
+                    elif (publisher := self._publisher(topic)) is None:
+                        self._unnamed.value += 1
                     elif topic.delivery is Delivery.STREAM:
                         streams[topic.path] = [payload]
-                        self._publisher(topic)
                     else:
-                        flowing = self._publisher(topic).put(payload) and flowing
+                        flowing = publisher.put(payload) and flowing
                         states += 1
                     if waiting:
                         self._questions.answer(topic, payload)
@@ -275,13 +298,24 @@ class Device:
         return translate
 
     def _publish(self, topic: Topic, message: FleetMessage) -> None:
-        self._publisher(topic).put(payloads.encode(message))
+        publisher = self._publisher(topic)
+        if publisher is not None:
+            publisher.put(payloads.encode(message))
 
-    def _publisher(self, topic: Topic) -> Publisher:
-        publisher = self._publishers.get(topic.path)
+    def _publisher(self, topic: Topic) -> Publisher | None:
+        """Give the publisher of a topic; None where the robot has too many names."""
+        path = topic.path
+        publisher = self._publishers.get(path)
         if publisher is None:
-            publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
+            if _is_named(path) and not self._names.admit(path, self._clock()):
+                self._tell_names()
+                return None
+            publisher = self._publishers[path] = self._bus.publisher(self._keys.key(path), topic)
         return publisher
+
+    def _tell_names(self) -> None:
+        text = f"more than {NAMES} different names within an hour: the others are not published"
+        self._conditions.set("names", text if self._names.over else None)
 
     def _watch_frames(self, endpoint: Endpoint, direction: str) -> None:
         """Publish the raw frames of one direction while somebody listens."""
@@ -323,6 +357,8 @@ class Device:
     async def _beat(self) -> None:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
+            self._names.expire(self._clock())
+            self._tell_names()
             self._publish_status()
             self._leases.beat()
 
@@ -341,3 +377,8 @@ class Device:
         except Refused as refusal:
             self._questions.remove(topic, question)
             question.refuse(refusal)
+
+
+def _is_named(path: str) -> bool:
+    """Tell a topic of a family, whose last chunk the robot chooses: ``sensor/front``."""
+    return "/" in path

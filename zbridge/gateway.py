@@ -9,7 +9,7 @@ import math
 import secrets
 import signal
 import time
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from zbridge.claim import Claim
 from zbridge.conditions import Conditions
 from zbridge.config import DevicePlan, Plan
 from zbridge.device import Device
-from zbridge.errors import BusError
+from zbridge.errors import BusError, Held
 from zbridge.exporter import serve_metrics
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -38,6 +38,11 @@ _ZID = 6
 """Characters of the session id that tell listeners of different processes apart."""
 RETRY_S = 1.0
 """Seconds between attempts to open the bus."""
+TELL_S = 60.0
+"""Seconds between two lines of the log about other gateways that serve the robot."""
+_NAMED = 3
+"""Other gateways that are named."""
+_RIVALS = "rivals"
 
 
 class Gateway:
@@ -101,7 +106,7 @@ class Gateway:
                     shown.close()
                 shown = self._show_sessions(bus, "gateway")
                 try:
-                    await self._serve(bus, claim, self._device(bus, audit, plan))
+                    await self._serve(claim, self._device(bus, audit, plan))
                 finally:
                     shown.close()
         finally:
@@ -115,18 +120,37 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, bus: Bus, claim: Claim, device: Device) -> None:
-        """Serve the robot until another gateway turns out to have the better claim."""
+    async def _serve(self, claim: Claim, device: Device) -> None:
+        """Serve the robot until it has to be left to another gateway."""
         serving = asyncio.ensure_future(device.run())
-        losing = asyncio.ensure_future(claim.lost())
+        watching = asyncio.ensure_future(claim.watch(lambda: device.reached, self._rival_teller(device)))
         try:
-            await asyncio.wait((serving, losing), return_when=asyncio.FIRST_COMPLETED)
-            if serving.done():
-                serving.result()
+            await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
+            for task in (serving, watching):
+                if task.done():
+                    task.result()
         finally:
-            for task in (serving, losing):
+            for task in (serving, watching):
                 task.cancel()
-            await asyncio.shield(asyncio.gather(serving, losing, return_exceptions=True))
+            await asyncio.shield(asyncio.gather(serving, watching, return_exceptions=True))
+            self.conditions.set(_RIVALS, None)
+
+    def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:
+        """Make the function that tells of other gateways: ``status`` always, ``control`` and the log once a while."""
+        robot, told_at = self._plan.config.robot.name, -math.inf
+
+        def tell(zids: tuple[str, ...]) -> None:
+            nonlocal told_at
+            more = f" and {len(zids) - _NAMED} more" if len(zids) > _NAMED else ""
+            text = f"another gateway serves this robot too: {', '.join(zids[:_NAMED])}{more}"
+            self.conditions.set(_RIVALS, text if zids else None)
+            if zids and time.monotonic() - told_at >= TELL_S:
+                told_at = time.monotonic()
+                log.error("%s: %s", robot, text)
+                for zid in zids[:_NAMED]:
+                    device.refuse("claim", Held("this gateway serves the robot"), zid)
+
+        return tell
 
     def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
         control = self._plan.config.control
@@ -153,10 +177,25 @@ class Gateway:
         if control.audit is None or self._plan.device is None:
             yield Audit(name, logging.getLogger("zbridge.audit").debug)
             return
-        file = AuditFile(Path(control.audit), self.metrics, file_bytes=control.audit_bytes, files=control.audit_files)
+        loop = asyncio.get_running_loop()
+
+        def tell(text: str | None) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self.conditions.set, "audit", text)
+
+        file = AuditFile(
+            Path(control.audit),
+            self.metrics,
+            file_bytes=control.audit_bytes,
+            files=control.audit_files,
+            days=control.audit_days,
+            tell=tell,
+        )
+        audit = Audit(name, file.write)
         try:
-            yield Audit(name, file.write)
+            yield audit
         finally:
+            audit.close()
             file.close()
 
     async def _open_bus(self) -> Bus:

@@ -32,6 +32,8 @@ WAITING = 64
 """Commands of one client that may wait for the bus besides motion; one more is refused."""
 OPEN_HZ = 50.0
 """Commands a second of one client that need no lease: they share the robot's queue with everybody's."""
+PUBLISHERS = 512
+"""Keys that the clients of a listener command at a time; the oldest makes room."""
 OURS_S = 1.0
 """Seconds within which a refusal that bears no name is taken for that of a client's command."""
 
@@ -55,6 +57,8 @@ class Bridge:
         """Put a command on the bus; one that needs the lease is signed."""
         publisher = self._publishers.get(topic.path)
         if publisher is None:
+            if len(self._publishers) >= PUBLISHERS:
+                self._publishers.pop(next(iter(self._publishers))).close()
             publisher = self._publishers[topic.path] = self.bus.publisher(self.keys.key(topic.path), topic)
         payload = payloads.encode(message)
         publisher.put(payload, signer.command(publisher.key, payload) if signer is not None else None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 from collections.abc import Callable
 
@@ -23,8 +22,6 @@ from zbridge.session.motion import MotionLimits
 from zbridge.session.proof import read
 from zbridge.session.session import State
 from zbridge.standstill import Standstill
-
-log = logging.getLogger("zbridge.control")
 
 TELLINGS_HZ = 20.0
 """Times a second that listeners, all together, may tell what they refused."""
@@ -155,7 +152,6 @@ class Leases:
                     if event.what is not What.ACQUIRED:
                         self.limits.stands()
                     self._metrics.count("control", what=event.what.value).value += 1
-                    log.info("%s: %s", self._keys.robot, event)
                 if event.stops:
                     self._send_stop()
                 self._audit.write(event)

@@ -31,7 +31,7 @@ from gateways.wc2ec.session import ControllerSession
 from gateways.wc2ec.translate import NAME, Byte, DeviceOption, Positive
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Devices, Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Status
+from zbridge.fleet.messages import Device, Devices, Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
@@ -105,7 +105,8 @@ class HqClient(ControllerSession):
 
 
 class Wc2EcHq(HqSide):
-    """One listener. Its devices keep their names and numbers for as long as it lives."""
+    """One listener. Its devices keep their names and numbers; only where no number is left, those that are gone give
+    theirs up."""
 
     name = NAME
     deadman_s = DEADMAN_S
@@ -164,6 +165,8 @@ class Wc2EcHq(HqSide):
         if self._draft or self.view.protocol is None:
             return
         devices = self.view.devices.devices if self.view.devices is not None else None
+        if len(self._by_number) >= NUMBERS:
+            self._forget_gone(devices or ())
         for device in devices or ():
             self._enter(_name(device.name), device.number, device.kind)
         if self.view.protocol != NAME or devices is not None:
@@ -172,6 +175,14 @@ class Wc2EcHq(HqSide):
             if self._complete and not any(device.motor for device in self._by_name.values()):
                 self._enter(LEFT, None, ROTATIONAL)
                 self._enter(RIGHT, None, ROTATIONAL)
+
+    def _forget_gone(self, devices: Iterable[Device]) -> None:
+        """Give up the numbers of devices that the robot had once, and that no controller knows."""
+        there = {LEFT, RIGHT, *self.view.readings, *self._sectors, *(_name(device.name) for device in devices)}
+        known = set[int]().union(*(session.registered for session in self._sessions if not session.over))
+        for name, device in tuple(self._by_name.items()):
+            if name not in there and device.number not in known:
+                del self._by_name[name], self._by_number[device.number], self._registrations[device.number]
 
     @property
     def _complete(self) -> bool:

@@ -154,10 +154,10 @@ async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> No
 
     bus.answer("fleet/r1/@rpc/map", answer)
     offline = NotReady("offline")
-    handle = bus.answer("fleet/r2/@rpc/map", lambda question: question.refuse(offline))
+    handle = bus.join("2").answer("fleet/r2/@rpc/map", lambda question: question.refuse(offline))
     assert await bus.ask("fleet/*/@rpc/map", b"hi") == [
-        Answer("fleet/r1/@rpc/map", b"hi!"),
-        Answer("fleet/r2/@rpc/map", b"", offline),
+        Answer("fleet/r1/@rpc/map", b"hi!", replier="1"),
+        Answer("fleet/r2/@rpc/map", b"", offline, replier="2"),
     ]
     handle.close()
     assert await bus.ask("fleet/r2/@rpc/map") == []

@@ -191,3 +191,126 @@ async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
     go.set()
     monkeypatch.undo()
     await bus.flush()
+
+
+class Busy:
+    """An entity of Zenoh's whose callback runs for a while: so long taking it back fails as the library does."""
+
+    def __init__(self, times: int) -> None:
+        self.asked: list[str] = []
+        self.undeclared = threading.Event()
+        self._times = times
+
+    def undeclare(self) -> None:
+        self.asked.append(threading.current_thread().name)
+        if len(self.asked) <= self._times:
+            raise RuntimeError("Already borrowed")
+        self.undeclared.set()
+
+
+def test_what_meets_its_own_callback_is_taken_back_again_at_once() -> None:
+    entity = Busy(2)
+    declared = module._Declared(entity)
+    declared.close()
+    assert entity.asked == 3 * [threading.current_thread().name]
+    assert entity.undeclared.is_set()
+    declared.close()
+    assert len(entity.asked) == 3, "taken back once"
+
+
+def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it() -> None:
+    entity = Busy(30)
+    module._Declared(entity).close()
+    assert 0 < entity.asked.count(threading.current_thread().name) < 10
+    assert entity.undeclared.wait(SOON_S)
+    assert len(entity.asked) == 31
+
+
+def test_a_callback_that_never_ends_is_given_up_and_said_so(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "UNDECLARE_S", 0.05)
+    entity = Busy(10**9)
+    module._Declared(entity).close()
+    for thread in threading.enumerate():
+        if thread.name == "zbridge-undeclare":
+            thread.join(SOON_S)
+    assert "not taken back: Already borrowed" in caplog.text
+    assert not entity.undeclared.is_set()
+
+
+def test_other_errors_are_not_tried_again() -> None:
+    class Broken:
+        def undeclare(self) -> None:
+            raise RuntimeError("no such thing")
+
+    with pytest.raises(RuntimeError, match="no such thing"):
+        module._Declared(Broken()).close()
+
+
+async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_back_again(bus: ZenohBus) -> None:
+    handles = [
+        bus.subscribe("k/*", lambda sample: None),
+        bus.answer("k/q", lambda question: None),
+        bus.announce("k/@alive/x"),
+        bus.publisher("k/stream", topics.POSE),
+        bus.publisher("k/state", topics.STATUS),
+        bus.publisher("k/command", topics.CMD_MODE),
+        bus.frames("k/@wire", lambda anybody: None),
+    ]
+    for handle in handles:
+        assert isinstance(handle, module._Declared)
+        stubborn = [Busy(2) for _ in handle._entities]
+        real, handle._entities = handle._entities, tuple(stubborn)
+        handle.close()
+        assert handle.closed
+        assert all(entity.undeclared.is_set() for entity in stubborn)
+        for entity in real:
+            entity.undeclare()
+
+
+async def test_streams_above_the_first_ones_are_published_all_the_same_and_leave_nothing_behind(
+    bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    seen = Seen()
+    bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.key, sample.payload))
+    names = [f"s{number}" for number in range(5)]
+    publishers = [bus.publisher(f"fleet/r1/sensor/{name}", topics.SENSOR(name)) for name in names]
+    kinds = [type(publisher).__name__ for publisher in publishers]
+    assert kinds == 2 * ["_StreamPublisher"] + 3 * ["_StreamKey"]
+    bus.put_all([(publisher, [b"1", b"2"]) for publisher in publishers])
+    publishers[-1].put(b"3")
+    await seen.until(lambda: len(seen) == 11)
+    expected = {(f"fleet/r1/sensor/{name}", payload) for name in names for payload in (b"1", b"2")}
+    assert set(seen) == expected | {("fleet/r1/sensor/s4", b"3")}
+    for publisher in publishers:
+        publisher.close()
+        publisher.close()
+        assert publisher.closed  # type: ignore[attr-defined]
+    again = bus.publisher("fleet/r1/sensor/s0", topics.SENSOR("s0"))
+    assert type(again).__name__ == "_StreamPublisher", "one that had a publisher is given one again"
+
+
+async def test_what_waits_to_be_written_without_loss_is_written_before_its_key_is_given_up() -> None:
+    bus = await open_zenoh(BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",), stream="block"), Metrics())
+    try:
+        seen, go = Seen(), threading.Event()
+        bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.payload))
+        publisher = bus.publisher("fleet/r1/sensor/s", topics.SENSOR("s"))
+        bus._streams.put(lambda: go.wait(SOON_S))
+        bus.put_all([(publisher, [b"1", b"2"])])
+        publisher.close()
+        go.set()
+        await seen.until(lambda: seen == [b"1", b"2"])
+    finally:
+        await bus.close()
+
+
+async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    for number in range(1000):
+        bus.publisher(f"fleet/r1/sensor/s{number}", topics.SENSOR(f"s{number}")).close()
+        bus.publisher(f"fleet/r1/state{number}", topics.STATUS).close()
+    assert len(bus._handles) < 200
+    assert len(bus._published) == 2

@@ -144,7 +144,7 @@ class Gateway:
 
     def answer_first(self, question: Any) -> None:
         """Answer what somebody else asks before anything else."""
-        handlers = [answer for key, answer in self._bus._shared.queryables if key == question.key]
+        handlers = [answer for key, answer, _ in self._bus._shared.queryables if key == question.key]
         handlers[-1](question)
 
     def refuse(self, command: str, reason: str, who: str | None) -> None:

@@ -153,3 +153,15 @@ def test_a_view_prints_the_robots_protocol_and_what_is_missing() -> None:
     assert repr(view) == "<RobotView toy established>"
     view.alive = False
     assert repr(view) == "<RobotView toy no gateway serves the robot>"
+
+
+@pytest.mark.parametrize("state", ["offline", "connecting", "handshaking", "closing"])
+def test_readings_of_a_connection_that_is_gone_make_room_for_those_of_the_next(state: str) -> None:
+    view = established()
+    for number in range(READINGS + 10):
+        view.note(topics.SENSOR(f"old {number}"), Reading(1.0))
+    view.note(topics.STATUS, Status(state=state, protocol="toy"))  # type: ignore[arg-type]
+    assert view.readings == {}
+    view.note(topics.STATUS, ESTABLISHED)
+    view.note(topics.SENSOR("new"), Reading(2.0))
+    assert view.readings == {"new": Reading(2.0)}

@@ -9,6 +9,8 @@ import asyncio
 from collections.abc import Callable
 from typing import TypeVar
 
+import msgspec
+
 from zbridge.bus.interface import Answer, Batch, Handle, Lane, LaneOf, Publisher, Question, Sample
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete
@@ -122,19 +124,20 @@ class FakeBus:
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
     def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
-        entry = (key, handler)
+        entry = (key, handler, self._zid)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         questions = []
-        for key, handler in tuple(self._shared.queryables):
+        for key, handler, zid in tuple(self._shared.queryables):
             if meet(key_expr, key):
                 concrete = key if is_concrete(key) else key_expr
-                questions.append(question := FakeQuestion(concrete, payload, asked=key_expr))
+                questions.append((question := FakeQuestion(concrete, payload, asked=key_expr), zid))
                 handler(question)
         kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
-        return [reply for question in questions for reply in question.replies] + kept
+        replies = [(reply, zid) for question, zid in questions for reply in question.replies]
+        return [msgspec.structs.replace(reply, replier=zid) for reply, zid in replies] + kept
 
     def attend(self) -> None:
         """Do nothing: handlers are called on the spot."""
@@ -193,7 +196,7 @@ class _Shared:
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
-        self.queryables: list[tuple[str, Callable[[Question], None]]] = []
+        self.queryables: list[tuple[str, Callable[[Question], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self.last: dict[str, bytes] = {}

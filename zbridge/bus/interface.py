@@ -69,11 +69,13 @@ class Answer(msgspec.Struct, frozen=True):
     """One reply to a query; ``error`` instead of a payload.
 
     It is Refused as whoever was asked refused it, or BusError with what else came instead of an answer.
+    replier: the id of the session that replied, as the bus says; None where it does not say.
     """
 
     key: str
     payload: bytes
     error: Refused | BusError | None = None
+    replier: str | None = None
 
 
 class Publisher(Protocol):
@@ -143,7 +145,7 @@ class Bus(Protocol):
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
+        """Query ``key_expr`` and collect the replies that come within ``timeout_s``, as far as they are no flood."""
 
     def attend(self) -> None:
         """Hand over the stops and the holder's commands that wait: to be called in the midst of long work."""

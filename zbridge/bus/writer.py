@@ -15,7 +15,7 @@ log = logging.getLogger("zbridge.bus")
 BACKLOG = 4096
 """How much may wait: each message counts one, and one more for every 256 bytes of a state."""
 
-Call = Callable[[], None]
+Call = Callable[[], object]
 
 
 class Writer:

@@ -10,15 +10,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import re
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 # One thread that receives instead of several that wake one another for each message; read when zenoh is imported.
 os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), acc: (handover: rx))")
 
+import msgspec
 import zenoh
 import zenoh.ext
 
@@ -29,7 +34,9 @@ from zbridge.errors import BusError, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Denied
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic, is_concrete
-from zbridge.metrics import Metrics
+from zbridge.metrics import Count, Metrics
+
+log = logging.getLogger("zbridge.bus")
 
 H = TypeVar("H", bound=Handle)
 
@@ -44,6 +51,18 @@ FLUSH_S = 2.0
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 
+UNDECLARE_S = 1.0
+"""Longest time an entity is tried to be taken back whose callback runs on."""
+
+_AT_ONCE, _PAUSE_S = 4, 0.0005
+"""How often, and at what distance, that is tried by the thread that asks: it may be the event loop's."""
+PUBLISHERS = 300
+"""Different stream keys that are given publishers: Zenoh keeps 1.5 kB of each for ever, here and in every router, and
+finds others more slowly. Later ones are declared as keys only: that takes 0.5 us more for each message."""
+REPLIES = 10_000
+"""Most replies to one query."""
+_EACH = 16
+"""Most replies of one session to a query for one key."""
 _TIDY = 64
 _DENIED = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(Denied))
 
@@ -114,12 +133,15 @@ class ZenohBus:
         self._session = session
         self._loop = loop
         self._inbox = Inbox(loop, metrics)
+        self._replies_dropped = metrics.count("bus_replies_dropped")
         self._relief: list[Callable[[], None]] = []
         self._lossless = stream == "block"
         self._writer = Writer("states", metrics, lossless=self._lossless, relieved=self._relieve)
         self._streams = Writer("streams", metrics, lossless=self._lossless, relieved=self._relieve)
         self._handles: list[Handle] = []
         self._tidy_at = _TIDY
+        self._published: set[str] = set()
+        """Stream keys that were ever given publishers."""
 
     def __repr__(self) -> str:
         return f"<ZenohBus {self._session.zid()}>"
@@ -136,7 +158,11 @@ class ZenohBus:
         if qos.keeps_last:
             return self._keep(_StatePublisher(self._session, key, options, self._writer))
         if topic.delivery is Delivery.STREAM:
-            return self._keep(_StreamPublisher(self._session, key, options, self._streams, blocks=self._lossless))
+            known = len(self._published) < PUBLISHERS or key in self._published
+            if known:
+                self._published.add(key)
+            kind = _StreamPublisher if known else _StreamKey
+            return self._keep(kind(self._session, key, options, self._streams, blocks=self._lossless))
         plain = self._session.declare_publisher(key, express=qos.express, **options)
         blocks = qos.congestion is Congestion.BLOCK
         return self._keep(_PlainPublisher(key, plain, self._writer if blocks else None))
@@ -198,8 +224,9 @@ class ZenohBus:
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect all replies that come within ``timeout_s``."""
+        """Query ``key_expr`` and collect the replies that come within ``timeout_s``, as far as they are no flood."""
         replies = await self._collect(
+            key_expr,
             lambda handler: self._session.get(
                 key_expr,
                 handler,
@@ -225,7 +252,7 @@ class ZenohBus:
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         """List the liveliness tokens that exist."""
         replies = await self._collect(
-            lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
+            key_expr, lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
         )
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
@@ -321,16 +348,16 @@ class ZenohBus:
             self._tidy_at = 2 * len(self._handles) + _TIDY
         return handle
 
-    async def _collect(self, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
+    async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
         """Run a get whose replies are stored as they come; the last one's handler being dropped ends it."""
-        loop, replies = self._loop, list[Any]()
+        loop, replies = self._loop, _Replies(key_expr, self._replies_dropped)
         done = loop.create_future()
 
         def finish() -> None:
             if not done.done():
                 done.set_result(None)
 
-        handler = zenoh.handlers.Callback(replies.append, lambda: loop.call_soon_threadsafe(finish))
+        handler = zenoh.handlers.Callback(replies.take, lambda: loop.call_soon_threadsafe(finish))
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
@@ -362,8 +389,9 @@ def _read_change(raw: zenoh.Sample) -> tuple[str, bool]:
 
 def _read_reply(reply: zenoh.Reply) -> Answer:
     if reply.ok is not None:
-        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes())
-    return Answer("", b"", _read_error(reply.err.payload.to_bytes() if reply.err is not None else b"no answer"))
+        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), replier=_replier(reply))
+    error = _read_error(reply.err.payload.to_bytes() if reply.err is not None else b"no answer")
+    return Answer("", b"", error, _replier(reply))
 
 
 def _read_error(payload: bytes) -> Refused | BusError:
@@ -375,21 +403,78 @@ def _read_error(payload: bytes) -> Refused | BusError:
     return refusal(denied.code, denied.reason)
 
 
-class _Declared:
-    """Anything of Zenoh's that is undeclared to end it."""
+def _replier(reply: zenoh.Reply) -> str | None:
+    return str(reply.replier_id.zid) if reply.replier_id is not None else None
 
-    def __init__(self, entity: Any) -> None:
-        self._entity = entity
+
+class _Replies(list[zenoh.Reply]):
+    """What replied to one query, within bounds; taken on Zenoh's threads.
+
+    A flood of one session's replies must not hide another's. Who answers for one key has little to say, who answers
+    for many may answer for a whole fleet.
+    """
+
+    def __init__(self, key_expr: str, dropped: Count) -> None:
+        super().__init__()
+        self._dropped = dropped
+        self._each = REPLIES if "*" in key_expr else _EACH
+        self._counts: Counter[str | None] = Counter()
+
+    def take(self, reply: zenoh.Reply) -> None:
+        """Keep a reply, if there is room."""
+        replier = _replier(reply)
+        if len(self) < REPLIES and self._counts[replier] < self._each:
+            self._counts[replier] += 1
+            self.append(reply)
+        else:
+            self._dropped.value += 1
+
+
+def _undeclare(entity: Any) -> bool:
+    """Take an entity back; False where that meets its own running callback and must be tried again."""
+    try:
+        entity.undeclare()
+    except RuntimeError as error:
+        if "borrowed" not in str(error):
+            raise
+        return False
+    return True
+
+
+def _undeclare_soon(entity: Any) -> None:
+    """Take an entity back, here within 2 ms or else by a thread of its own within :data:`UNDECLARE_S`."""
+    for attempt in range(_AT_ONCE):
+        if attempt:
+            time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    threading.Thread(target=_undeclare_later, args=(entity,), name="zbridge-undeclare", daemon=True).start()
+
+
+def _undeclare_later(entity: Any) -> None:
+    give_up_at = time.monotonic() + UNDECLARE_S
+    while time.monotonic() < give_up_at:
+        time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    log.error("%s was not taken back: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+
+
+class _Declared:
+    """Entities of Zenoh's that are undeclared to end them."""
+
+    def __init__(self, *entities: Any) -> None:
+        self._entities = entities
 
     @property
     def closed(self) -> bool:
-        """Whether it was taken back."""
-        return self._entity is None
+        """Whether they were taken back."""
+        return not self._entities
 
     def close(self) -> None:
-        entity, self._entity = self._entity, None
-        if entity is not None:
-            entity.undeclare()
+        entities, self._entities = self._entities, ()
+        for entity in entities:
+            _undeclare_soon(entity)
 
 
 class _PlainPublisher(_Declared):
@@ -408,7 +493,7 @@ class _PlainPublisher(_Declared):
         return True
 
 
-class _StreamPublisher:
+class _StreamPublisher(_Declared):
     """Writes a stream key, plain or express: express is what makes a batch leave at once."""
 
     def __init__(
@@ -416,25 +501,47 @@ class _StreamPublisher:
     ) -> None:
         self.key = key
         self._writer = writer
+        self._blocks = blocks
         if blocks:
             options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
-        self._publishers = (
-            session.declare_publisher(key, **options),
-            session.declare_publisher(key, express=True, **options),
-        )
-        self.put_plain = self._publishers[0].put
-        self.put_express = self._publishers[1].put
+        super().__init__(*self._declare(session, key, options))
+
+    put_plain: Callable[..., object]
+    put_express: Callable[..., object]
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
+        plain = session.declare_publisher(key, **options)
+        express = session.declare_publisher(key, express=True, **options)
+        self.put_plain, self.put_express = plain.put, express.put
+        return plain, express
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        return self._writer.put(lambda: self.put_express(payload, attachment=attachment))
+        return self._writer.put(partial(self.put_express, payload, attachment=attachment))
 
     def close(self) -> None:
-        publishers, self._publishers = self._publishers, ()  # type: ignore[assignment]
-        for publisher in publishers:
-            publisher.undeclare()  # type: ignore[no-untyped-call]
+        if self._blocks:  # what waits to be written is not lost
+            self._writer.put(super().close)
+        else:
+            super().close()
 
 
-class _StatePublisher:
+class _StreamKey(_StreamPublisher):
+    """Writes a stream key that Zenoh is to forget when it is closed."""
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
+        expression = session.declare_keyexpr(key)
+        self.put_plain = partial(session.put, expression, **options)
+        self.put_express = partial(session.put, expression, express=True, **options)
+        return (_Undeclared(lambda: session.undeclare(expression)),)
+
+
+class _Undeclared(msgspec.Struct):
+    """Something that is undeclared by a call."""
+
+    undeclare: Callable[[], object]
+
+
+class _StatePublisher(_Declared):
     """Writes a state key: cached for late joiners, and answered to a plain get."""
 
     def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
@@ -450,17 +557,13 @@ class _StatePublisher:
             publisher_detection=True,
             **options,
         )
-        self._queryable = session.declare_queryable(key, self._reply)
+        super().__init__(session.declare_queryable(key, self._reply), self._publisher)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last = payload
         return self._writer.replace(
             self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 256
         )
-
-    def close(self) -> None:
-        self._queryable.undeclare()  # type: ignore[no-untyped-call]
-        self._publisher.undeclare()  # type: ignore[no-untyped-call]
 
     def _reply(self, query: zenoh.Query) -> None:
         last = self._last

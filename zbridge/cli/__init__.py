@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from zbridge.config import load
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.gateway import Gateway, until_signal
+from zbridge.text import shown
 
 
 def main() -> None:
@@ -76,14 +77,22 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
 
 def set_up_log(*, verbose: bool, level: int = logging.INFO) -> None:
     """Log to stderr; ``verbose`` shows every frame."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else level,
-        format="%(asctime)s %(levelname)-7s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(LineFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.DEBUG if verbose else level, handlers=[handler])
+
+
+class LineFormatter(logging.Formatter):
+    """Writes a record as one line that is safe to show, whatever peers wrote into it; a traceback on lines below it."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's names
+        return shown(super().formatMessage(record))
+
+    def formatException(self, ei: Any) -> str:  # noqa: N802
+        return "\n".join(map(shown, super().formatException(ei).split("\n")))
 
 
 def give_up(code: int, text: object) -> NoReturn:
     """End the process with one line on stderr."""
-    print(f"zbridge: {text}", file=sys.stderr)  # noqa: T201
+    print(f"zbridge: {shown(text)}", file=sys.stderr)  # noqa: T201
     sys.exit(code)

@@ -155,6 +155,7 @@ def ls(
     """List the robots on the bus, or the sessions of their gateways and listeners."""
     from zbridge.cli import bus
 
+    set_up_log(verbose=False, level=logging.ERROR)
     show = bus.list_sessions if sessions else bus.list_robots
     run_loop(show(bus_settings(connect), realm, as_json=json))
 
@@ -169,6 +170,7 @@ def echo(
     """Print what comes on a key, decoded."""
     from zbridge.cli import bus
 
+    set_up_log(verbose=False, level=logging.ERROR)
     run_loop(until_signal(bus.echo(bus_settings(connect), key, as_json=json, count=count)))
 
 
@@ -199,6 +201,7 @@ def stop(
     """Stop a robot, or all of them; open to everyone who can write the key."""
     from zbridge.cli import bus
 
+    set_up_log(verbose=False, level=logging.ERROR)
     if bool(robot) == everything:
         give_up(2, "name one ROBOT, or give --all")
     if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
 from zbridge.client import connect
@@ -22,13 +23,22 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
+from zbridge.text import as_json as to_json
+from zbridge.text import shown
 
 _SHOWN = 8
 _TABLE = 180
 """Characters of the widest table that is printed to a file."""
 
-console = Console(highlight=False, soft_wrap=True)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
+_CELL = 200
+"""Characters of a cell of a table."""
+_MESSAGE = 20_000
+"""Characters of a message that is printed to be read."""
+_DEPTH = 32
+"""Maps and arrays within one another that are printed."""
+
+console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 @contextlib.asynccontextmanager
@@ -48,7 +58,7 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
     if as_json:
         for name, status in robots.items():
             fields = msgspec.to_builtins(status) if status is not None else {"state": None}
-            console.print(json.dumps({"robot": name, **fields}), markup=False)
+            console.print(to_json({"robot": name, **fields}))
     elif robots:
         console.print(_robot_table(robots))
     else:
@@ -62,7 +72,7 @@ async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> 
     if as_json:
         for (robot, who), sessions in tables.items():
             for entry in sessions:
-                console.print(json.dumps({"robot": robot, "who": who, **msgspec.to_builtins(entry)}), markup=False)
+                console.print(to_json({"robot": robot, "who": who, **msgspec.to_builtins(entry)}))
     elif tables:
         console.width = max(console.width, _TABLE)
         console.print(_session_table(tables), crop=False)
@@ -95,26 +105,25 @@ def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> T
             left_out = ", ".join(f"{name} {count}" for name, count in entry.left_out.items())
             carried = [str(counters.get(name, 0)) for name in ("frames_in", "frames_out")]
             agreed = (entry.state, entry.version or "", entry.transport)
-            table.add_row(
-                robot, who, entry.name, entry.peer, *agreed, *carried, str(lost), left_out, entry.reason or ""
-            )
+            cells = (robot, who, entry.name, entry.peer, *agreed, *carried, str(lost), left_out, entry.reason or "")
+            table.add_row(*map(cell, cells))
     return table
+
+
+def cell(text: str) -> Text:
+    """Make a cell of a table: text that is safe to show, and never markup."""
+    return Text(shown(text, _CELL))
 
 
 def _robot_table(robots: dict[str, Status | None]) -> Table:
     table = Table("robot", "state", "protocol", "version", "features", "reason", box=None)
     for name, status in robots.items():
         if status is None:
-            table.add_row(name, "?", "", "", "", "the gateway has published no status yet")
+            cells = (name, "?", "", "", "", "the gateway has published no status yet")
         else:
-            table.add_row(
-                name,
-                status.state,
-                status.protocol or "",
-                status.version or "",
-                " ".join(status.features),
-                status.reason or "",
-            )
+            agreed = (status.protocol or "", status.version or "", " ".join(status.features))
+            cells = (name, status.state, *agreed, status.reason or "")
+        table.add_row(*map(cell, cells))
     return table
 
 
@@ -127,7 +136,7 @@ async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) ->
         if count and seen >= count:
             return
         seen += 1
-        console.print(_line(sample, as_json=as_json), markup=False)
+        console.print(_line(sample, as_json=as_json))
         if seen == count:
             done.set()
 
@@ -142,8 +151,9 @@ def _line(sample: Sample, *, as_json: bool) -> str:
     except PayloadError as error:
         fields = {"error": str(error)}
     if as_json:
-        return json.dumps({"key": sample.key, **_plain(fields, shorten=False)})
-    return f"{sample.key} " + " ".join(f"{name}={_short(value)}" for name, value in fields.items())
+        return to_json({"key": sample.key} | _plain(fields) | {"key": sample.key})
+    line = f"{sample.key} " + " ".join(f"{name}={_short(value)}" for name, value in fields.items())
+    return shown(line, _MESSAGE)
 
 
 def _fields(sample: Sample) -> dict[str, Any]:
@@ -163,24 +173,26 @@ def _short(value: Any) -> str:
         return f"{value[:_SHOWN].hex(' ')}{'...' if len(value) > _SHOWN else ''} ({len(value)} bytes)"
     if isinstance(value, float):
         return f"{value:.4g}"
-    return json.dumps(_plain(value, shorten=True), ensure_ascii=False)
+    return json.dumps(_plain(value), ensure_ascii=False)
 
 
-def _plain(value: Any, *, shorten: bool) -> Any:
-    """Make anything JSON can hold: arrays as lists, bytes as hex, what is no number as null."""
+def _plain(value: Any, depth: int = _DEPTH) -> Any:
+    """Make anything JSON can hold: arrays as lists, bytes as hex, what is no number as null, the rest as it prints."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
-    if isinstance(value, dict):
-        return {name: _plain(item, shorten=shorten) for name, item in value.items()}
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist(), shorten=shorten)
+        value = value.tolist()
+    if isinstance(value, dict | list | tuple) and not depth:
+        return "..."
+    if isinstance(value, dict):
+        return {str(name): _plain(item, depth - 1) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item, shorten=shorten) for item in value]
+        return [_plain(item, depth - 1) for item in value]
     if isinstance(value, bytes):
         return value.hex()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | int) else str(value)
 
 
 async def stop(settings: BusSettings, realm: str, robot: str | None) -> bool:
@@ -189,9 +201,9 @@ async def stop(settings: BusSettings, realm: str, robot: str | None) -> bool:
         outcomes = await fleet.stop([robot] if robot is not None else None)
     for name, error in outcomes.items():
         if error is None:
-            console.print(f"{name}: stopped")
+            console.print(shown(f"{name}: stopped"))
         else:
-            errors.print(str(error))
+            errors.print(shown(error))
     if not outcomes:
         errors.print(f"no gateways on {realm}/")
     return bool(outcomes) and not any(outcomes.values())

@@ -22,6 +22,7 @@ from rich.live import Live
 from rich.table import Table
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.cli.bus import cell
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
 from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
@@ -31,6 +32,7 @@ from zbridge.fleet.topics import split_key
 from zbridge.gateway import until_signal
 from zbridge.metrics import Metrics
 from zbridge.protocol import find_protocol, protocol_names
+from zbridge.text import shown
 
 REFRESH_S = 0.5
 START_S = 20.0
@@ -88,7 +90,7 @@ class Watch:
             rates = [f"{row.counts[name] / seconds:.1f}" for name in _RATES]
             pose = row.pose
             where = [f"{pose.x:.2f}", f"{pose.y:.2f}", f"{math.degrees(pose.heading):.0f}°"] if pose else ["", "", ""]
-            table.add_row(robot, state, version, driver, *rates, *where)
+            table.add_row(*map(cell, (robot, state, version, driver, *rates, *where)))
             row.counts.clear()
         return table
 
@@ -119,8 +121,9 @@ async def run_demo(seconds: float) -> None:
                 gateway.terminate()
         silent = [robot for robot, row in watch.rows.items() if not row.heard]
         if seconds and silent:
-            last = (folder / "log").read_text(errors="replace")[-2000:]
-            raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words:\n{last}")
+            for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
+                print(shown(line), file=sys.stderr)  # noqa: T201
+            raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words are above")
 
 
 async def _router() -> tuple[Bus, str]:

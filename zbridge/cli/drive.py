@@ -16,6 +16,7 @@ from zbridge.cli.keyboard import Keyboard, split_keys
 from zbridge.client import Driver, Robot, connect
 from zbridge.errors import BusError, LeaseLost, Refused, ZbridgeError
 from zbridge.fleet.messages import Drive
+from zbridge.text import shown
 
 EVERY_S = 0.05
 DEADMAN_S = 0.3
@@ -108,7 +109,7 @@ class Session:
         if text == self._line:
             return
         self._line = text
-        sys.stdout.write(f"\r\x1b[K{text}\n")
+        sys.stdout.write(f"\r\x1b[K{shown(text)}\n")
         sys.stdout.flush()
 
 

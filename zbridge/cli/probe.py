@@ -7,10 +7,9 @@ import contextlib
 import json
 
 import msgspec
-from rich.console import Console
 
 from zbridge.bus import BusSettings
-from zbridge.cli.bus import joined
+from zbridge.cli.bus import console, errors, joined
 from zbridge.conversation import Conversation
 from zbridge.errors import BusError, LinkError, PayloadError
 from zbridge.fleet import payload as payloads
@@ -20,6 +19,7 @@ from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
 from zbridge.protocol import Protocol
 from zbridge.session.session import State
+from zbridge.text import shown
 
 PROBE_S = 15.0
 """Longest time a handshake may take."""
@@ -28,16 +28,13 @@ WARNING = (
     "probing uses it up, and the robot must be restarted before a gateway can connect. Say --yes to do it."
 )
 
-console = Console(highlight=False, soft_wrap=True)
-errors = Console(stderr=True, highlight=False, soft_wrap=True)
-
 
 async def probe(settings: BusSettings, protocol: Protocol, address: Address, *, realm: str, sure: bool) -> int:
     """Print what the device is; give the exit code: 0 known, 1 it did not answer, 2 not asked without ``sure``."""
     served = await _served(settings, address, realm)
     if served is not None:
         robot, status = served
-        console.print(f"{address} is served by the gateway of {robot}:")
+        console.print(shown(f"{address} is served by the gateway of {robot}:"))
         _show(msgspec.to_builtins(status))
         return 0
     if not sure:
@@ -78,7 +75,7 @@ async def _talk(protocol: Protocol, address: Address) -> int:
         async with asyncio.timeout(PROBE_S):
             await settled.wait()
     except (LinkError, TimeoutError) as error:
-        errors.print(f"{address}: {error or 'no handshake'}")
+        errors.print(shown(f"{address}: {error or 'no handshake'}"))
         return 1
     finally:
         established, seen = session.version is not None, session.snapshot()
@@ -104,4 +101,4 @@ async def _talk(protocol: Protocol, address: Address) -> int:
 def _show(fields: dict[str, object]) -> None:
     for name, value in fields.items():
         if value not in (None, [], 0):
-            console.print(f"  {name}: {value if isinstance(value, str) else json.dumps(value)}", markup=False)
+            console.print(shown(f"  {name}: {value if isinstance(value, str) else json.dumps(value)}"))

@@ -87,7 +87,7 @@ class Fleet:
         """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""
         if names is None:
             tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
-            names = {split[1] for key in tokens if (split := split_key(key))}
+            names = {split[1] for key in tokens if (split := split_key(key)) and is_name(split[1])}
         names = [names] if isinstance(names, str) else sorted(names)
         return dict(zip(names, await asyncio.gather(*map(self._stop_one, names)), strict=True))
 

@@ -68,6 +68,8 @@ class RobotView:
             if name in self.readings or len(self.readings) < READINGS:
                 self.readings[name] = message
             return
+        if isinstance(message, Status) and message.state != "established":
+            self.readings.clear()  # of a connection that is gone: the next one may have other sensors
         if isinstance(message, Status) and message.state == "established":
             if self.protocol is not None and self.protocol != message.protocol:
                 self.forget()

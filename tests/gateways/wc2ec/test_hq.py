@@ -814,3 +814,28 @@ def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_
     ((topic, command),) = scene.says(set_value(motor, 0.5))
     robot.command(topic, command, 0.0)
     assert (session.outgoing(0.0) or b"")[2:] == set_value(motor, 0.5)[2:]
+
+
+def test_a_robot_that_makes_up_new_names_is_shown_to_controllers_that_come_later() -> None:
+    scene = Scene("wc2ec", clients=0)
+    for connection in range(5):
+        names = [f"c{connection} s{number}" for number in range(255)]
+        scene.tell(topics.STATUS, Status("offline", protocol="wc2ec"))
+        scene.tell(topics.DEVICES, Devices(tuple(Device(name, n, "distance") for n, name in enumerate(names))))
+        scene.established("wc2ec")
+        scene.reads(names[0], 1.0, 0)
+        client = scene.connect()
+        expected = b"".join(bytes((0, 37, n, len(name))) + name.encode() for n, name in enumerate(names))
+        assert scene.told(connection).startswith(expected)
+        client.lost("gone")
+    assert len(scene.side._by_name) <= 255
+    assert len(scene.side._registrations) <= 255
+
+
+def test_a_controller_that_stays_is_never_given_a_number_for_something_else() -> None:
+    scene = Scene("wc2ec", [Device(f"old {number}", number, "distance") for number in range(255)])
+    first = scene.told()
+    scene.tell(topics.DEVICES, Devices((Device("new", 0, "distance"),)))
+    scene.reads("new", 1.0, 0)
+    assert scene.told() == b"", "it knows 255 devices, and can be told of no other"
+    assert first.startswith(bytes.fromhex("00 25 00 05") + b"old 0")

@@ -92,7 +92,7 @@ class Hostile(FakeBus):
 @pytest.fixture
 def bus(monkeypatch: pytest.MonkeyPatch) -> FakeBus:
     """A bus on which every command finds itself, and on which hostile gateways are."""
-    monkeypatch.setenv("COLUMNS", "2000")
+    monkeypatch.setattr("zbridge.cli.bus.console._width", 2000)
     bus = Hostile("evil")
     joined = iter(range(100))
 
@@ -144,8 +144,7 @@ def assert_harmless(text: str) -> None:
     assert not wrong, text
 
 
-def test_ls(zbridge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "180")
+def test_ls(zbridge: Any) -> None:
     shown = zbridge("ls")
     assert shown.code == 0
     assert shown.out.count("established") == 2

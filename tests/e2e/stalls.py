@@ -3,7 +3,7 @@
     python -m tests.e2e.stalls                                    # everything, 30 repetitions; about an hour and a half
     python -m tests.e2e.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
 
-Each repetition has a real gateway process, a strict robot in a process of its own that tells its commanded motion
+Each sitting has a real gateway process, a strict robot in a process of its own that tells its commanded motion
 (:mod:`tests.e2e.moving_robot`), and a driver on the bus in a process of its own. It is driven for a moment; then
 
 stall: the robot's process is stopped (SIGSTOP) and goes on after some seconds (SIGCONT);
@@ -37,6 +37,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -69,7 +70,7 @@ PERIOD_S = 0.04
 PATIENCE_S = 4.0
 """Longest wait for rest, and for motion afterwards; after a cut for as long as it was besides."""
 START_S = 20.0
-CPU_S = 1.2
+CPU_S = 0.4
 """Processor time of one repetition: three interpreters start."""
 SHOWN_S = 2.0
 """The shortest cut that `status` and the counter must show."""
@@ -77,7 +78,9 @@ LINK_STALLS = "zbridge_link_stalls_total"
 KERNEL = (6, 15)
 """The first Linux with TCP_RTO_MAX_MS."""
 LANES = 10
-"""Repetitions at a time: they mostly wait."""
+"""Sittings at a time: they mostly wait."""
+SITTING = 6
+"""Repetitions in a sitting."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +94,8 @@ class Case:
     @property
     def duration_s(self) -> float:
         """Expect a repetition to last so long, where the robot comes to rest."""
-        handshake_s = 2.5 * ROBOTS[self.robot].udp
-        return 5.0 + handshake_s + self.seconds + REST_S
+        start_s = 3.0 + 2.5 * ROBOTS[self.robot].udp
+        return start_s / SITTING + self.seconds + 1.0 + REST_S
 
 
 @dataclass
@@ -374,31 +377,42 @@ async def scenery(seed: int) -> AsyncIterator[Scene]:
             yield Scene(fleet, endpoint, watch, folder, seed)
 
 
-class Repetition:
-    """One robot, its gateway and its driver: from their start to the report."""
+class Sitting:
+    """One robot, its gateway and its driver, from their start to their end, and some repetitions with them."""
 
-    def __init__(self, scene: Scene, case: Case, number: int) -> None:
-        causes = CAUSES[case.way]
-        self.outcome = Outcome(case, number, causes[(number + list(ROBOTS).index(case.robot)) % len(causes)])
+    def __init__(self, scene: Scene, case: Case, numbers: deque[int]) -> None:
         self._scene, self._case, self._kind = scene, case, ROBOTS[case.robot]
-        self._name = f"{case.robot}-{case.way}-{case.seconds:g}-{number}"
+        self._numbers = numbers
+        self._name = f"{case.robot}-{case.way}-{case.seconds:g}-{numbers[0]}"
         self._rng = random.Random(f"{self._name} {scene.seed}")
         self._statuses: list[tuple[float, Status]] = []
         self._patience_s = PATIENCE_S + case.seconds * (case.way == "cut")
 
-    async def run(self) -> Outcome:
-        """Do it; what does not come about is a fault."""
+    async def run(self, took: Callable[[Outcome], object]) -> None:
+        """Take numbers and measure; what does not come about is a fault, after which nothing more is done here."""
         async with contextlib.AsyncExitStack() as stack:
             try:
+                await self._begin()
                 await self._set_up(stack)
+                await self._drive(stack, FIRST)
                 await self._measure(stack)
+                while self._numbers and self.outcome.good:
+                    took(self.outcome)
+                    await self._begin()
+                    _tell(self._driver, f"again {FIRST}")
+                    await self._measure(stack)
                 await self._report()
             except (RuntimeError, OSError, TimeoutError, BusError) as error:
                 self.outcome.faults.append(f"{type(error).__name__}: {error}")
             if not self.outcome.good and (log := self._log_file).exists():
                 self.outcome.log = log.read_text(errors="replace").splitlines()[-12:]
         self._log_file.unlink(missing_ok=True)
-        return self.outcome
+        took(self.outcome)
+
+    async def _begin(self) -> None:
+        number, causes = self._numbers.popleft(), CAUSES[self._case.way]
+        cause = causes[(number + list(ROBOTS).index(self._case.robot)) % len(causes)]
+        self.outcome = Outcome(self._case, number, cause)
 
     # The scene
 
@@ -485,7 +499,6 @@ class Repetition:
 
     async def _measure(self, stack: contextlib.AsyncExitStack) -> None:
         outcome, robot = self.outcome, self._robot
-        await self._drive(stack, FIRST)
         if not await robot.moving(FIRST, START_S):
             counted = [line for line in await self._counters() if not line.endswith(" 0")]
             raise RuntimeError(f"the robot was never driven; status {self._statuses[-1:]}; counters {counted}")
@@ -609,17 +622,24 @@ async def measure(
     took: Callable[[Outcome], None] = lambda _: None,
 ) -> list[Outcome]:
     """Do every case so often, so many at a time, and call ``took`` with each outcome; the longest go first."""
-    plan = [(case, number) for case in cases for number in range(repetitions)]
-    plan.sort(key=lambda each: each[0].duration_s, reverse=True)
+    plan = [
+        (case, deque(range(first, min(first + SITTING, repetitions))))
+        for case in sorted(cases, key=lambda case: case.duration_s, reverse=True)
+        for first in range(0, repetitions, SITTING)
+    ]
     waiting = iter(plan)
     outcomes: list[Outcome] = []
+
+    def take(outcome: Outcome) -> None:
+        outcomes.append(outcome)
+        took(outcome)
+
     async with scenery(seed) as scene:
 
         async def lane() -> None:
-            for case, number in waiting:
-                outcome = await Repetition(scene, case, number).run()
-                outcomes.append(outcome)
-                took(outcome)
+            for case, numbers in waiting:
+                while numbers:
+                    await Sitting(scene, case, numbers).run(take)
 
         async with asyncio.TaskGroup() as tasks:
             for _ in range(min(lanes, len(plan))):

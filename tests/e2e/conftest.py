@@ -25,10 +25,16 @@ T = TypeVar("T")
 WAIT_S = 10.0
 
 
+_given: set[int] = set()
+
+
 def free_port() -> int:
     """Find a port, for TCP and UDP, that nobody is given by chance: what listens there may be away for a while."""
     while True:
         port = random.randrange(20_000, 32_000)
+        if port in _given:
+            continue
+        _given.add(port)
         with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
             tcp.bind(("127.0.0.1", port))
             udp.bind(("127.0.0.1", port))

@@ -224,7 +224,7 @@ class TcpUdpHq(HqSide):
             key = (session.geometry if announced else None, most)
             if key not in frames:
                 cells, to_scale = self._cells(message, *key)
-                frame = encode_packet(ServerSLAMMap(cells or None), session.sender_id)
+                frame = encode_packet(ServerSLAMMap(cells), session.sender_id)
                 frames[key] = (frame, Datagram(frame))
                 larger.update(() if to_scale else (key,))
             if key in larger:

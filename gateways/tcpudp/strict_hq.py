@@ -354,8 +354,8 @@ class StrictHq(Judge):
         elif kind == wire.POSITION:
             x, y, heading = struct.unpack("<3f", body)
             self.position = (x, y, heading)
-        elif kind == wire.MAP and body:
-            self.map = body[4:]
+        elif kind == wire.MAP:
+            self.map = body[4:] or self.map
 
     # Handshake
 

@@ -64,7 +64,7 @@ def test_the_gateway_as_hq_understands_a_robot_of_1_1() -> None:
     assert (timed.session.transport, timed.session.features) == ("tcp", ())
     assert timed.frames("tcp") == [bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")]
     assert timed.frames("udp") == []
-    assert delivered == [(6.4158, POSE), (6.7163, ServerSLAMMap(None)), (7.0166, DebugMessage("bye"))]
+    assert delivered == [(6.4158, POSE), (6.7163, ServerSLAMMap()), (7.0166, DebugMessage("bye"))]
 
 
 def test_the_gateway_as_robot_of_1_1_understands_its_hq() -> None:

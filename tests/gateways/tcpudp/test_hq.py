@@ -45,7 +45,8 @@ CORNER = Map(2, 3, 0.1, (0.0, 0.0), np.array([[1, 2, 0], [0, 0, 2]], np.uint8))
 """Two rows of y, three columns of x."""
 CORNER_CELLS = "010000 020000 000200"
 """x = 0, 1, 2, each from y = 0 to 2."""
-EMPTY_MAP = bytes.fromhex("02000000 01 35")
+EMPTY_MAP = bytes.fromhex("06000000 01 35 00000000")
+"""n = 0: deployed HQ programs throw for good on a 53 without its int."""
 BLOCKS = {"1.1": "0100000000", "1.2": "010000000001", "1.3": "01000000000101"}
 """What HQ programs of each version announce: UDP, LidarSim and SLAMMap as far as they have the flag."""
 LISTS = {"1.1": b"1.1", "1.2": b"1.2", "1.3": LISTED}
@@ -573,7 +574,7 @@ def test_scans_and_readings_have_no_packet() -> None:
 
 
 @pytest.mark.parametrize("version", ["1.1", "1.2", "1.3"])
-def test_a_map_that_is_not_there_yet_has_an_empty_body(version: str) -> None:
+def test_a_map_that_is_not_there_yet_has_a_count_of_no_cells(version: str) -> None:
     listener = side()
     client = joined(listener, version)
     show(listener, topics.MAP, Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), client)
@@ -1143,6 +1144,8 @@ def test_the_shown_robot_is_what_the_captured_one_showed(name: str) -> None:
     show(listener, topics.MAP, empty, client)
     from_robot = [record for record in payloads(name, source=11001) if record.payload[5] not in (2, 4, 6)]
     recorded = {(record.transport.lower(), record.payload) for record in from_robot if len(record.payload) < 400}
+    if name == OLD:  # whose robot leaves out the int that HQ programs need
+        recorded = recorded - {("tcp", bytes.fromhex("02000000 01 35"))} | {("tcp", EMPTY_MAP)}
     shown = {(sent.by, sent.frame) for sent in client.sent}
     assert recorded <= shown
 

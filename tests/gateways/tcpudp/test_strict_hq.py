@@ -40,7 +40,7 @@ PROBE, CONNECTED = "02000000 07 05", "03000000 07 07 01"
 TEXT = "08000000 01 01 02000000 6869"
 LIDAR_OFF = "06000000 01 33 02000000"
 POSITION = "0e000000 01 37 0000c03f 000010c0 0000b442"
-NO_MAP = "02000000 01 35"
+NO_MAP = "06000000 01 35 00000000"
 CELLS = "00010200" * 100
 MAP = "96010000 01 35 90010000" + CELLS
 GET_SCAN = "02000000 01 3c"
@@ -380,11 +380,10 @@ async def test_settings_that_kill(version: str, settings: str, words: str) -> No
         ("1.3", START, "a 4 before the answer 3, or not both set the UDP flag"),
         ("1.3", NOT_RECEIVED, "a 6 that is not due"),
         ("1.2", GET_SCAN, "LidarSim was not announced"),
-        ("1.3", "02000000 02 35", "id byte 2 instead of 1"),
+        ("1.3", "06000000 02 35 00000000", "id byte 2 instead of 1"),
         ("1.3", "06000000 01 33 03000000", "lidar status 3"),
         ("1.3", "0e000000 01 37 0000c07f 000010c0 0000b442", "not finite"),
         ("1.3", "07000000 01 35 01000000 01", "1 cells of a map announced with 20 x 20"),
-        ("1.1", "06000000 01 35 00000000", "n = 0 instead of an empty body"),
         ("1.1", "0a000000 01 35 04000000 00010203", "a cell that is neither 0, 1 nor 2"),
     ],
 )
@@ -428,6 +427,7 @@ async def test_a_square_map_needs_no_announced_size(version: str) -> None:
         ("1.3", "06000000 01 01 00000000", "an empty text"),
         ("1.3", "0e000000 01 35 0000c03f 000010c0 0000b442", "bytes of a map"),
         ("1.3", "04000000 01 35 0100", "n = -1 and 0 bytes of a map"),
+        *[(version, "02000000 01 35", "a 53 without its int, on which it throws for good") for version in VERSIONS],
         ("1.3", "08000000 01 35 02000000 0001", "a map of 2 cells, no square"),
         ("1.3", "01000000 01 35", "its length field is wrong"),
     ],

@@ -72,6 +72,7 @@ class StrictHq(Judge):
         udp: bool = True,
         lidar_sim: bool = False,
         skips_map_flag: bool = False,
+        unasked: bool = False,
         repeat_s: float | None = 0.5,
         udp_port: int = 0,
         keep: int = 10_000,
@@ -81,6 +82,7 @@ class StrictHq(Judge):
         """Set up the program.
 
         ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
+        ``unasked``: one of 1.1 has handlers for 53 and 55 before it asked, which its first programs have not;
         ``repeat_s``: how often the stick is repeated, None: a viewer that sends nothing by itself; ``udp_port``: what
         to bind (deployed: 11000); ``keep``: bound of every list; ``note``: called with each violation.
         """
@@ -97,6 +99,8 @@ class StrictHq(Judge):
         self.texts: list[str] = []
         self.counts: Counter[int] = Counter()
         self._offers_udp, self._lidar_sim, self._skips = udp, lidar_sim, skips_map_flag
+        self._unasked = unasked or version != "1.1"
+        self._asked: set[int] = set()
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
         self._phase = _Phase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
@@ -203,6 +207,7 @@ class StrictHq(Judge):
 
         1.3 sends 11, 12 and 61 by UDP whatever was agreed ("The gateway as robot"); the others where it was agreed.
         """
+        self._asked.add(kind)
         if self._phase is not _Phase.ESTABLISHED:
             self._event(f"lost: packet {kind} while {self._phase.name.lower()}")
         elif kind in wire.BY_UDP and (self._works or self.version == "1.3"):
@@ -335,6 +340,9 @@ class StrictHq(Judge):
             return "" if self._udp is not None and not self._answered else "a 6 that is not due"
         if kind == wire.GET_SCAN and not self._lidar_sim:
             return "a 60 though LidarSim was not announced"
+        question = wire.ANSWERS.get(kind)
+        if question is not None and not self._unasked and question not in self._asked:
+            return f"a {kind} to an HQ 1.1 that never asked ({question}): it has no handler"
         refusal = kind == wire.DEBUG and phase is _Phase.ANSWERED  # "No common version: say so"
         due = refusal or phase in (_Phase.CONNECTED, _Phase.ESTABLISHED)
         return "" if due else f"packet {kind} before the session was established"

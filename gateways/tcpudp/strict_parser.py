@@ -61,6 +61,8 @@ HQ_LOSES_BYTES = 2200
 """An HQ loses TCP packets of so many bytes and more ("The gateway as robot")."""
 HQ_SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3"}
 """The version string an HQ sends."""
+ANSWERS = {MAP: GET_MAP, POSITION: GET_POSITION}
+"""What an HQ asks for, and how."""
 _TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS, MAP, POSITION})
 KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
 """The packet ids that do not cripple an HQ of a version."""

@@ -69,8 +69,10 @@ def connected(listener: TcpUdpHq, number: int = 2) -> Timed:
     return Timed(listener.session(number, BOUNDS))
 
 
-def joined(listener: TcpUdpHq, version: str = "1.3", *, udp: bool = False, number: int = 2, block: str = "") -> Timed:
-    """A client whose handshake is done; what it was sent so far is forgotten."""
+def joined(
+    listener: TcpUdpHq, version: str = "1.3", *, udp: bool = False, number: int = 2, block: str = "", asks: bool = True
+) -> Timed:
+    """A client whose handshake is done, and that asked for map and position; what it was sent so far is forgotten."""
     client = connected(listener, number)
     flags = block or BLOCKS[version]
     flags = ("01" if udp else "00") + flags[2:]
@@ -81,6 +83,8 @@ def joined(listener: TcpUdpHq, version: str = "1.3", *, udp: bool = False, numbe
     assert (client.session.state, client.session.version) == (State.ESTABLISHED, version)
     assert client.session.transport == ("udp" if udp else "tcp")
     client.until(1.0)
+    if asks:
+        said(listener, client, framed(number, 52) + framed(number, 54))
     client.sent.clear()
     return client
 
@@ -710,6 +714,80 @@ def test_a_listener_without_datagrams_announces_a_map_that_fits_by_tcp() -> None
     assert len(frame) < 2200
     assert len(cells_of(frame)) == (size // interval) ** 2
     assert size >= 1000
+
+
+# The first programs of 1.1 have no handlers for 53 and 55: who asks (52, 54) has
+
+
+ASK_MAP, ASK_POSE = bytes.fromhex("02000000 02 34"), bytes.fromhex("02000000 02 36")
+
+
+def seen() -> RobotView:
+    """A robot whose map and position are known."""
+    view = robot("1.1", "lidar", "joystick")
+    view.note(topics.MAP, CORNER)
+    view.note(topics.POSE, POSE)
+    return view
+
+
+def kinds_shown(listener: TcpUdpHq, client: Timed) -> list[int]:
+    """Which packets a client gets of a new map and a new position."""
+    client.sent.clear()
+    show(listener, topics.MAP, CORNER, client)
+    show(listener, topics.POSE, POSE, client)
+    return [sent.frame[5] for sent in client.sent]
+
+
+@pytest.mark.parametrize("udp", [False, True])
+@pytest.mark.parametrize("versions", [("1.1",), ("1.1", "1.2", "1.3")])
+def test_a_client_of_1_1_that_never_asked_gets_no_map_and_no_position(versions: tuple[str, ...], udp: bool) -> None:
+    listener = side(seen(), versions=versions)
+    client = joined(listener, "1.1", udp=udp, asks=False)
+    begin(listener, client)
+    assert client.sent == []
+    assert kinds_shown(listener, client) == []
+    assert client.session.left_out["servertSLAMMap (53) unasked"] == 2
+    assert client.session.left_out["serverPosition (55) unasked"] == 2
+
+
+@pytest.mark.parametrize(
+    ("asked", "topic", "shown"), [(ASK_MAP, topics.RPC_MAP, [53]), (ASK_POSE, topics.RPC_POSE, [55])]
+)
+def test_a_client_of_1_1_that_asked_for_one_gets_that_one_from_then_on(
+    asked: bytes, topic: Topic, shown: list[int]
+) -> None:
+    listener = side(seen())
+    client = joined(listener, "1.1", asks=False)
+    assert said(listener, client, asked) == [(topic, Query())]
+    answer(listener, client, topic, None)
+    assert [sent.frame[5] for sent in client.sent] == shown
+    assert kinds_shown(listener, client) == shown
+    other = joined(listener, "1.1", number=3, asks=False)
+    assert kinds_shown(listener, other) == [], "each for itself"
+
+
+def test_a_client_of_1_1_that_asked_for_both_gets_both() -> None:
+    listener = side(seen())
+    client = joined(listener, "1.1", asks=False)
+    said(listener, client, ASK_POSE + ASK_MAP)
+    assert kinds_shown(listener, client) == [53, 55]
+
+
+def test_a_listener_may_be_told_that_its_clients_of_1_1_take_them_unasked() -> None:
+    listener = side(seen(), unasked=True)
+    client = joined(listener, "1.1", asks=False)
+    begin(listener, client)
+    assert [sent.frame[5] for sent in client.sent] == [53, 55]
+    assert kinds_shown(listener, client) == [53, 55]
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.3"])
+def test_clients_of_later_versions_need_not_ask(version: str) -> None:
+    listener = side(seen())
+    client = joined(listener, version, asks=False)
+    begin(listener, client)
+    assert [sent.frame[5] for sent in client.sent] == [53, 55]
+    assert kinds_shown(listener, client) == [53, 55]
 
 
 # Questions

@@ -138,7 +138,7 @@ async def facing(hq: StrictHq) -> AsyncIterator[tuple[Robot, "asyncio.Task[None]
 
 
 def program(version: str = "1.3", **options: Any) -> StrictHq:
-    return StrictHq(version=version, **{"repeat_s": None, **options})
+    return StrictHq(version=version, **{"repeat_s": None, "unasked": True, **options})
 
 
 async def until(condition: Callable[[], object], what: object) -> None:
@@ -396,6 +396,32 @@ async def test_packets_that_are_wrong(version: str, text: str, words: str) -> No
         await robot.send(TEXT)
         await until(lambda: hq.texts, "it lives on")
         assert hq.alive
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [(MAP, "a 53 to an HQ 1.1 that never asked (52)"), (POSITION, "a 55 to an HQ 1.1 that never asked (54)")],
+)
+async def test_the_first_programs_of_1_1_have_no_handlers_for_what_nobody_asked_for(text: str, words: str) -> None:
+    hq = program("1.1", unasked=False)
+    async with facing(hq) as (robot, _):
+        await robot.shake("1.1")
+        await robot.send(text)
+        await violated(hq, words)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_what_was_asked_for_comes_as_it_comes(version: str) -> None:
+    hq = program(version, unasked=False)
+    async with facing(hq) as (robot, _):
+        await robot.shake(version)
+        await until(hq.established.is_set, "established")
+        hq.ask_map()
+        hq.ask_position()
+        for text in (MAP, POSITION, MAP, POSITION, TEXT):
+            await robot.send(text)
+        await until(lambda: hq.texts, "the last packet")
+        assert (hq.violations, hq.counts[53], hq.counts[55]) == ([], 2, 2)
 
 
 @pytest.mark.parametrize("version", ["1.1", "1.2"])

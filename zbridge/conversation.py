@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from zbridge.errors import Refused
 from zbridge.link import Link, Receiver
 from zbridge.metrics import Count
 from zbridge.session.session import Datagram, Session, State
@@ -19,7 +20,8 @@ _ESTABLISHED = State.ESTABLISHED
 class Conversation:
     """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
 
-    ``before`` is called before anything is written: it may have something that must be written first.
+    ``before`` is called before anything is written: it may have something that must be written first. ``refused`` is
+    told what was refused before it was a message: datagrams that bear the peer's name and do not come from it.
     ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
     """
 
@@ -32,6 +34,8 @@ class Conversation:
         changed: Callable[[], None] = lambda: None,
         malformed: Count | None = None,
         foreign: Count | None = None,
+        rivals: Count | None = None,
+        refused: Callable[[Refused], None] = lambda refusal: None,
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
     ) -> None:
@@ -48,6 +52,8 @@ class Conversation:
         self._seen = (session.state, session.busy)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
+        self._rivals = rivals or Count()
+        self._refused = refused
         self._malformed_logged = 0
 
     def __repr__(self) -> str:
@@ -70,9 +76,23 @@ class Conversation:
         """Take a datagram from the link."""
         self._hand_on(self.session.receive_datagram(datagram, self._clock()))
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this session's."""
-        return self.session.claims(datagram)
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this session's."""
+        return self.session.claims(datagram, port)
+
+    def rivalled(self) -> None:
+        """Count that another source, or session, claims what this one does; its session decides what becomes of it."""
+        self._rivals.value += 1
+        self.session.rivalled(self._clock())
+        log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
+        self.pump()
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed."""
+        try:
+            self.session.stray(datagram)
+        except Refused as refusal:
+            self._refused(refusal)
 
     def foreign_datagram(self) -> None:
         """Count a datagram that came from elsewhere."""
@@ -104,6 +124,9 @@ class Conversation:
         self._before()
         session, link = self.session, self._link
         outbox = session.outbox
+        if session.drops_source and link is not None:
+            session.drops_source = False
+            link.drop_source()
         while link is not None and link.ready:
             frame = session.outgoing(self._clock())
             if frame is None:
@@ -231,9 +254,19 @@ class Accepted(Receiver):
         if self._conversation is not None:
             self._conversation.received_datagram(datagram)
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this conversation's."""
-        return self._conversation is not None and self._conversation.claims(datagram)
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this conversation's."""
+        return self._conversation is not None and self._conversation.claims(datagram, port)
+
+    def rivalled(self) -> None:
+        """Take note that another source, or conversation, claims what this one does."""
+        if self._conversation is not None:
+            self._conversation.rivalled()
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed."""
+        if self._conversation is not None:
+            self._conversation.stray_datagram(datagram)
 
     def foreign_datagram(self) -> None:
         """Count a datagram that came from elsewhere."""

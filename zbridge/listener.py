@@ -130,6 +130,7 @@ class Listener:
         self._refused = metrics.count("hq_refused", listener=name)
         self._malformed = metrics.count("hq_malformed", listener=name)
         self._foreign = metrics.count("hq_foreign_datagrams", listener=name)
+        self._rivals = metrics.count("hq_rival_sources", listener=name)
 
     def __repr__(self) -> str:
         return f"<Listener {self.name} {self.address}, {len(self.clients)} clients>"
@@ -216,6 +217,8 @@ class Listener:
             changed=lambda: self._on_session(client),
             malformed=self._malformed,
             foreign=self._foreign,
+            rivals=self._rivals,
+            refused=lambda refusal: self._refuse_datagram(client, refusal),
             clock=self._clock,
         )
         client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
@@ -396,6 +399,12 @@ class Listener:
             client.session.traffic.refused += 1
             self._refused.value += 1
             self._tell(client, str(refusal))
+
+    def _refuse_datagram(self, client: Client, refusal: Refused) -> None:
+        """Tell of datagrams in a client's name that did not come from it: they may be its own motion."""
+        client.session.traffic.refused += 1
+        self._refused.value += 1
+        self._tell(client, str(refusal))
 
     def _ask(self, client: Client, topic: Topic) -> None:
         """Ask the robot for a client; who asks the same meanwhile gets the same answer."""

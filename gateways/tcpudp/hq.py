@@ -46,7 +46,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.session import RobotSession
+from gateways.tcpudp.session import CLIENT_PORT, RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, Length, PacketId, Scale
 from zbridge.errors import EncodeError, ProtocolError
@@ -81,6 +81,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = ("1.1", "1.2", "1.3")
     udp: bool = True
+    client_port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = CLIENT_PORT
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
     quiet_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 2.0
     known: tuple[PacketId, ...] = ()
@@ -111,6 +112,7 @@ class HqClient(RobotSession):
             options.versions,
             block=_without_map_flag(settings) if options.skip_map_flag else None,
             known=options.known,
+            client_port=options.client_port,
         )
         self._unasked = options.unasked
         self._asked: set[int] = set()

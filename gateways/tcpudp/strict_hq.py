@@ -207,10 +207,11 @@ class StrictHq(Judge):
 
         1.3 sends 11, 12 and 61 by UDP whatever was agreed ("The gateway as robot"); the others where it was agreed.
         """
-        self._asked.add(kind)
         if self._phase is not _Phase.ESTABLISHED:
             self._event(f"lost: packet {kind} while {self._phase.name.lower()}")
-        elif kind in wire.BY_UDP and (self._works or self.version == "1.3"):
+            return
+        self._asked.add(kind)
+        if kind in wire.BY_UDP and (self._works or self.version == "1.3"):
             self._send_datagram(kind, body)
         else:
             self._send_tcp(kind, body)

@@ -309,6 +309,18 @@ def test_frames_that_go_first_are_bounded_too() -> None:
     assert [frame for _, frame in drained(outbox, 0.0, 1.0)][-1] == b"there is room again"
 
 
+def test_a_frame_that_goes_first_may_be_taken_back_until_it_was_given_out() -> None:
+    outbox = Outbox(0.01)
+    frames_of_handshake = bytes(4), bytes(5), bytes(4)
+    for frame in frames_of_handshake:
+        outbox.put_exempt(frame)
+    assert outbox.withdraw(frames_of_handshake[2])
+    assert not outbox.withdraw(frames_of_handshake[2])
+    assert outbox.take(0.0) is frames_of_handshake[0]
+    assert not outbox.withdraw(frames_of_handshake[0])
+    assert frames(drained(outbox, 0.01, 1.0)) == [frames_of_handshake[1]]
+
+
 def test_the_two_queues_are_bounded_each_for_itself() -> None:
     outbox = Outbox(0.0)
     for _ in range(LIMIT):

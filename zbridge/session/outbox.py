@@ -87,6 +87,13 @@ class Outbox:
             raise NotReady(f"{self._limit} packets of the handshake wait", Code.BUSY)
         self._exempt.append(frame)
 
+    def withdraw(self, frame: bytes) -> bool:
+        """Take back a frame that :meth:`put_exempt` was given; False where it was given out already."""
+        waiting = [kept for kept in self._exempt if kept is not frame]
+        found = len(waiting) < len(self._exempt)
+        self._exempt = deque(waiting)
+        return found
+
     def stand(
         self,
         slot: str,

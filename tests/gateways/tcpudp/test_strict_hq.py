@@ -36,7 +36,7 @@ ANSWERS = {
 }
 VERSIONS = ("1.1", "1.2", "1.3")
 START, RECEIVED, NOT_RECEIVED = "02000000 01 04", "03000000 01 06 01", "03000000 01 06 00"
-PROBE, CONNECTED = "02000000 07 05", "03000000 07 07 01"
+PROBE, CONNECTED, NOT_CONNECTED = "02000000 07 05", "03000000 07 07 01", "03000000 07 07 00"
 TEXT = "08000000 01 01 02000000 6869"
 LIDAR_OFF = "06000000 01 33 02000000"
 POSITION = "0e000000 01 37 0000c03f 000010c0 0000b442"
@@ -235,10 +235,10 @@ def test_an_hq_that_does_not_exist_is_refused(wrong: dict[str, Any]) -> None:
         StrictHq(**wrong)
 
 
-async def test_a_lost_answer_is_followed_by_true_all_the_same() -> None:
-    hq = program("1.2", times=QUICK)
+async def test_a_lost_answer_is_followed_by_true_all_the_same_in_1_3() -> None:
+    hq = program("1.3", times=QUICK)
     async with facing(hq) as (robot, _):
-        await robot.greet(SETTINGS["1.2", True])
+        await robot.greet(SETTINGS["1.3", True])
         await robot.start_udp()
         assert not hq.established.is_set()
         assert await robot.read() == raw(CONNECTED)
@@ -247,6 +247,23 @@ async def test_a_lost_answer_is_followed_by_true_all_the_same() -> None:
             await send(POSITION)
         await until(lambda: hq.counts[55] == 2, "two positions")
         assert hq.violations == []
+
+
+@pytest.mark.parametrize("version", ["1.1", "1.2"])
+async def test_a_lost_answer_makes_the_older_ones_fall_back_to_tcp(version: str) -> None:
+    hq = program(version, times=QUICK)
+    async with facing(hq) as (robot, _):
+        await robot.greet(SETTINGS[version, True])
+        await robot.start_udp()
+        assert await robot.read() == raw(NOT_CONNECTED)
+        await until(hq.established.is_set, "established")
+        hq.move(0.0, 1.0)
+        assert await robot.read() == raw(FORWARD)
+        await robot.send(POSITION)
+        await until(lambda: hq.position, "the position by TCP")
+        assert hq.violations == []
+        await robot.send_udp(POSITION)
+        await violated(hq, "packet 55 by UDP instead of TCP")
 
 
 async def test_it_reports_once() -> None:
@@ -529,19 +546,17 @@ async def test_what_was_agreed_for_udp_may_not_come_by_tcp(text: str) -> None:
         await violated(hq, "by TCP instead of UDP")
 
 
-async def test_after_a_lost_probe_nothing_may_come_by_udp() -> None:
-    hq = program()
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_a_6_that_says_no_is_reproached_and_makes_the_older_ones_believe_in_udp(version: str) -> None:
+    hq = program(version)
     async with facing(hq) as (robot, _):
-        await robot.greet(SETTINGS["1.3", True])
+        await robot.greet(SETTINGS[version, True])
         await robot.start_udp()
         await robot.send(NOT_RECEIVED)
-        await told(hq, "6(false)")
+        await violated(hq, "6(false): a listener sends 6(true) or none")
         assert await robot.read() == raw(CONNECTED)
-        await robot.send(POSITION)
-        await until(lambda: hq.position, "the position by TCP")
-        assert hq.violations == []
-        await robot.send_udp(POSITION)
-        await violated(hq, "packet 55 by UDP instead of TCP")
+        hq.move(0.0, 1.0)
+        assert await robot.read_udp() == raw(FORWARD)
 
 
 @pytest.mark.parametrize("text", [TEXT, LIDAR_OFF])
@@ -588,6 +603,15 @@ async def test_it_binds_the_port_it_is_told() -> None:
     async with facing(program(udp_port=port)) as (robot, _):
         await robot.shake(udp=True)
         assert robot.source == ("127.0.0.1", port)
+
+
+async def test_it_binds_the_port_of_deployed_programs_if_it_is_free() -> None:
+    first, second = program(), program()
+    async with facing(first) as (robot, _), facing(second) as (other, _):
+        await robot.shake(udp=True)
+        await other.shake(udp=True)
+        assert robot.source[1] == 11000 or any("UDP port 11000 is taken" in event for event in first.events)
+        assert any(f"UDP port 11000 is taken, {other.source[1]} instead" in event for event in second.events)
 
 
 # One read is one packet
@@ -731,12 +755,11 @@ async def test_with_udp_agreed_the_stick_goes_by_udp_and_13_by_tcp(version: str)
 
 @pytest.mark.parametrize("version", VERSIONS)
 async def test_after_a_lost_probe_only_1_3_goes_on_by_udp(version: str) -> None:
-    hq = program(version)
+    hq = program(version, times=QUICK)
     async with facing(hq) as (robot, _):
         await robot.greet(SETTINGS[version, True])
         await robot.start_udp()
-        await robot.send(NOT_RECEIVED)
-        assert await robot.read() == raw(CONNECTED)
+        assert await robot.read() == raw(CONNECTED if version == "1.3" else NOT_CONNECTED)
         hq.move(0.0, 1.0)
         assert await (robot.read_udp() if version == "1.3" else robot.read()) == raw(FORWARD)
 

@@ -63,6 +63,11 @@ class Tcp:
     def ready(self) -> bool:
         return self.judge.established.is_set()
 
+    def ask(self) -> None:
+        """Ask for map and position, without which a program of 1.1 is sent none."""
+        self.judge.ask_map()
+        self.judge.ask_position()
+
     async def drive(self, forward: float) -> None:
         self.judge.mode(2)  # joystick
         self.judge.move(0.0, 1.0 if forward > 0 else -1.0, abs(forward))
@@ -85,14 +90,14 @@ class Tcp:
 
 
 class Alf:
-    """A program of ALF in one dialect."""
+    """The driving program of ALF in one dialect."""
 
     protocol = "alf"
     number = 1
 
     def __init__(self, dialect: Dialect) -> None:
         self.name = f"alf-{dialect}"
-        self.judge = AlfHq(dialect=dialect)
+        self.judge = AlfHq(dialect=dialect, deployed="driving")
         self.options = f'options = {{ dialect = "{dialect}" }}'
         self._full = ALF_FULL[dialect]
 
@@ -110,16 +115,44 @@ class Alf:
         """Do nothing: there is no word for it."""
 
     def sees(self, robot: str) -> bool:
-        """Measurements where there is any scan, drive info of a vehicle."""
-        judge = self.judge
-        if robot == "tcpudp-1.1":  # has no scan, nor can be fed with one
-            return True
-        return judge.scanner is not None and judge.scans > 0 and (robot != "alf" or bool(judge.infos))
+        """Drive info of a vehicle."""
+        return robot != "alf" or bool(self.judge.infos)
 
     async def leave(self) -> None:
         """Say END first in one dialect; in the other the gateway does."""
         if self.judge.dialect == "binary":
             await self.judge.end()
+
+
+class AlfScanning:
+    """The scanning program of ALF, which sends no commands."""
+
+    protocol = "alf"
+    number = 1
+    name = "alf-scans"
+    options = ""
+
+    def __init__(self) -> None:
+        self.judge = AlfHq(deployed="scanning")
+
+    @property
+    def ready(self) -> bool:
+        return self.judge.connected.is_set()
+
+    async def drive(self, forward: float) -> None:
+        raise NotImplementedError
+
+    async def idle(self) -> None:
+        """Do nothing: it has no stick."""
+
+    release = idle
+
+    def sees(self, robot: str) -> bool:
+        """Measurements where there is any scan: a robot of 1.1 has none, nor can be fed with one."""
+        return robot == "tcpudp-1.1" or (self.judge.scanner is not None and self.judge.scans > 0)
+
+    async def leave(self) -> None:
+        """Stay: the gateway ends first."""
 
 
 class Ec:
@@ -178,7 +211,7 @@ class Ec:
         """Stay: the gateway ends first."""
 
 
-Program = Tcp | Alf | Ec
+Program = Tcp | Alf | AlfScanning | Ec
 DRIVES = {"tcp1.1": 0.4, "alf-text": -0.4, "tcp1.2": 0.6, "alf-binary": -0.6, "tcp1.3": 0.8, "ec": -0.8}
 """Who drives, and at what fraction of full scale; each at its own, so that the robot can tell them apart."""
 
@@ -299,7 +332,7 @@ async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = ""
     assert robot_process.stdout is not None
     programs: list[Program] = [
         *(Tcp("1.1", udp=False), Tcp("1.2", udp=True), Tcp("1.3", udp=True)),
-        *(Alf("text"), Alf("binary"), Ec()),
+        *(Alf("text"), Alf("binary"), AlfScanning(), Ec()),
     ]
     protocol = robot.partition("-")[0]
     at = dict(zip((program.name for program in programs), ports(len(programs)), strict=True))
@@ -313,6 +346,9 @@ async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = ""
         await soon(lambda: bench.fleet.state("r1") == "established", "established")
         async with playing(*(program.judge.run(HOST, at[program.name]) for program in programs)):
             await soon(lambda: all(program.ready for program in programs), "all connected")
+            for program in programs:
+                if isinstance(program, Tcp):
+                    program.ask()
             ec = programs[-1]
             assert isinstance(ec, Ec)
             async with playing(ec.keep_idle()):

@@ -67,7 +67,7 @@ async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_b
             ranges_m = np.frombuffer(scan["ranges"], "<f4")
             assert ranges_m == pytest.approx(np.array(RANGES) / 100)
             assert (scan["angle_min"], scan["angle_increment"]) == pytest.approx((0.0, np.radians(1.0)))
-            vehicle = on.program("alf-text").judge
+            vehicle = on.program("alf-scans").judge
             assert isinstance(vehicle, AlfHq)
             assert vehicle.last_scan is not None
             assert (vehicle.last_scan.points[0], vehicle.last_scan.points[-1]) == (1200, 2995), "millimetres"

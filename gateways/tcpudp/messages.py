@@ -207,7 +207,8 @@ class ClientGetSLAMMap(Packet, frozen=True):
 class ServerSLAMMap(Packet, frozen=True):
     """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. Empty: no map yet.
 
-    The count is always written: an HQ program that gets a 53 without it throws for good ("Packets"). Robots leave it out.
+    The count is always written: an HQ program that gets a 53 without it throws for good ("Packets"). Robots may leave
+    it out.
     """
 
     cells: Blob = b""

@@ -301,8 +301,8 @@ class RobotSession(_TcpUdpSession):
 
     ``block``: the settings block as it is sent, where that is not the one of ``settings``. ``known``: packet ids that
     this HQ knows besides those of its version. client_port: the UDP port that this HQ is known to bind; 0: none. The
-    ``id`` byte of what it sends by TCP is not looked at: the connection tells who it is, and programs send 0 before they
-    have read the settings.
+    ``id`` byte of what it sends by TCP is not looked at: the connection tells who it is, and programs send 0 before
+    they have read the settings.
 
     Datagrams tell nothing but their source, and any process of the HQ's host can send them. So there are two ways to
     become its source, and no others:

@@ -87,7 +87,8 @@ class StrictHq(Judge):
         ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
         ``unasked``: one of 1.1 has handlers for 53 and 55 before it asked, which its first programs have not;
         ``repeat_s``: how often the stick is repeated, None: a viewer that sends nothing by itself; ``udp_port``: what
-        to bind, 0 for any; None: what deployed programs bind, or any where that is taken; ``keep``: bound of every list; ``note``: called with each violation.
+        to bind, 0 for any; None: what deployed programs bind, or any where that is taken; ``keep``: bound of every
+        list; ``note``: called with each violation.
         """
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)

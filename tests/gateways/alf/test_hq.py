@@ -668,7 +668,9 @@ def test_what_was_configured_stays_whether_the_client_drives_or_not(serve: str) 
     assert set(shown(scene)) == set(before) - {b"2|"}, "2 is sent once"
 
 
-@pytest.mark.parametrize(("serve", "drives", "left_out"), [("auto", 1, 0), ("both", 1, 0), ("drive", 1, 0), ("laser", 0, 1)])
+@pytest.mark.parametrize(
+    ("serve", "drives", "left_out"), [("auto", 1, 0), ("both", 1, 0), ("drive", 1, 0), ("laser", 0, 1)]
+)
 def test_a_listener_of_the_laser_takes_no_drive_command_and_counts_it(serve: str, drives: int, left_out: int) -> None:
     scene = Scene(serve=serve)
     assert len(scene.says(b"3|255|0|0|0;")) == drives

@@ -9,6 +9,8 @@ import asyncio
 import contextlib
 import gc
 import ipaddress
+import logging
+import re
 import weakref
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -351,7 +353,7 @@ async def test_clients_get_the_lowest_numbers_that_are_free() -> None:
 
 @jumping
 async def test_254_clients_are_served_and_the_255th_is_turned_away() -> None:
-    async with serving() as scene:
+    async with serving(accept_hz=1000) as scene:
         programs = [scene.connect().greeted() for _ in range(254)]
         assert sorted(scene.listener.clients) == list(range(2, 256))
         late = scene.connect()
@@ -377,6 +379,52 @@ async def test_a_listener_may_be_told_to_serve_fewer() -> None:
         programs[0].leave()
         await soon()
         assert not scene.connect().link.closed
+
+
+@jumping
+async def test_more_than_so_many_connections_a_second_of_one_address_are_closed_at_once() -> None:
+    async with serving(accept_hz=3.0) as scene:
+        programs = [scene.connect() for _ in range(5)]
+        assert [program.link.closed for program in programs] == [False, False, False, True, True]
+        assert programs[4].heard() == []
+        assert not scene.connect("10.0.0.2").link.closed, "another address"
+        assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (4, 2)
+        for program in programs[:3]:
+            program.leave()
+        await soon()
+        assert scene.connect().link.closed, "that they have left makes no room"
+        await asyncio.sleep(1.0)
+        assert not scene.connect().link.closed
+
+
+@jumping
+async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise() -> None:
+    async with serving() as scene:
+        assert [scene.connect().link.closed for _ in range(25)] == [False] * 20 + [True] * 5
+
+
+@pytest.mark.parametrize("accept_hz", [20.0, 1000.0])
+@jumping
+async def test_a_flood_of_connections_costs_a_few_lines_a_second(
+    accept_hz: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        async with serving(accept_hz=accept_hz, clients=10_000) as scene:
+            caplog.clear()
+            for _ in range(800):
+                program = scene.connect()
+                program.leave()
+                await asyncio.sleep(0.0025)
+            scene.connect("10.0.0.9")
+            await asyncio.sleep(2.0)
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) <= 20, lines
+    came = sum(int(count) for line in lines for count in re.findall(r"(\d+) more connected", line))
+    told = sum("10.0.0.1:" in line and "connected as client" in line for line in lines)
+    assert came + told == scene.count("hq_accepted") - 1
+    away = sum(int(count) for line in lines for count in re.findall(r"(\d+) more turned away", line))
+    assert away + sum(" turned away (" in line for line in lines) == scene.count("hq_turned_away")
+    assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
 @jumping
@@ -415,7 +463,7 @@ async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.Monke
 
 @jumping
 async def test_many_clients_come_and_go_and_leave_nothing_behind() -> None:
-    async with serving() as scene:
+    async with serving(accept_hz=1000) as scene:
         await soon()
         tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
         subscribers, queryables = len(kept.subscribers), len(kept.queryables)

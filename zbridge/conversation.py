@@ -22,6 +22,7 @@ class Conversation:
 
     ``before`` is called before anything is written: it may have something that must be written first. ``refused`` is
     told what was refused before it was a message: datagrams that bear the peer's name and do not come from it.
+    ``may_warn`` is asked before a warning of one kind about the peer is logged.
     ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
     """
 
@@ -36,6 +37,7 @@ class Conversation:
         foreign: Count | None = None,
         rivals: Count | None = None,
         refused: Callable[[Refused], None] = lambda refusal: None,
+        may_warn: Callable[[str], bool] = lambda kind: True,
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
     ) -> None:
@@ -54,6 +56,7 @@ class Conversation:
         self._foreign = foreign or Count()
         self._rivals = rivals or Count()
         self._refused = refused
+        self._may_warn = may_warn
         self._malformed_logged = 0
 
     def __repr__(self) -> str:
@@ -84,7 +87,8 @@ class Conversation:
         """Count that another source, or session, claims what this one does; its session decides what becomes of it."""
         self._rivals.value += 1
         self.session.rivalled(self._clock())
-        log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
+        if self._may_warn("with a rival source of datagrams"):
+            log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
         self.pump()
 
     def stray_datagram(self, datagram: bytes) -> None:
@@ -215,7 +219,8 @@ class Conversation:
         """Warn at the first, second, fourth ... malformed message: the log stays readable in a flood."""
         count = self.session.traffic.malformed
         self._malformed.value += count - self._malformed_logged
-        if count.bit_length() != self._malformed_logged.bit_length():
+        due = count.bit_length() != self._malformed_logged.bit_length()
+        if due and self._may_warn("warnings of malformed messages"):
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count
 
@@ -246,7 +251,7 @@ class Accepted(Receiver):
     def lost(self, reason: str) -> None:
         """Take note that the link is gone."""
         if self._conversation is not None:
-            log.info("%s: %s", self._conversation.session.peer, reason)
+            log.debug("%s: %s", self._conversation.session.peer, reason)
             self._conversation.lost(reason)
 
     def received_datagram(self, datagram: bytes) -> None:

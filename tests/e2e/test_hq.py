@@ -285,7 +285,7 @@ async def test_254_programs_connect_the_next_is_closed_and_when_they_have_left_t
     bench: Bench, stack: contextlib.ExitStack
 ) -> None:
     (port,) = ports(1)
-    hq = gateway(bench, stack, listener("hq", "tcpudp", port, "options = { quiet_s = 0.5 }"))
+    hq = gateway(bench, stack, listener("hq", "tcpudp", port, "accept_hz = 1000\noptions = { quiet_s = 0.5 }"))
     await soon(lambda: hq.listens(1), "the listener")
     programs, refused = await crowd(port)
     assert refused

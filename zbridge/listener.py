@@ -73,6 +73,9 @@ class Client:
         self.seen = (0, 0)
         """Messages that were malformed, and all, at the last look."""
         self.told: dict[str, float] = {}
+        self.due = math.inf
+        """When what it said is carried out that waits for more of it."""
+        self.timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
         return f"<Client {self.number} {self.session!r}>"
@@ -285,6 +288,7 @@ class Listener:
     def _dismiss(self, client: Client) -> None:
         """Forget a client whose conversation has ended; its number is free again after a while."""
         client.helm.close()
+        self._set_timer(client, math.inf)
         self.clients.pop(client.number, None)
         self._active.discard(client)
         self._ids.release(client.number, self._clock(), rests=client.session.traffic.frames_in > 0)
@@ -327,6 +331,10 @@ class Listener:
             self._left_out.value += 1
             log.debug("%s: %s not shown: %s", self.name, topic.path, error)
             return
+        self._show(send)
+
+    def _show(self, send: Send | None) -> None:
+        """Let every client have something, if there is anything."""
         if send is None:
             return
         for number, client in enumerate(tuple(self.clients.values()), 1):
@@ -349,6 +357,7 @@ class Listener:
             for client in tuple(self.clients.values()):
                 client.told.pop(text, None)
                 self._tell(client, text)
+            self._show(self._side.presence(missing is None))
         self._missing = missing
 
     def _send(self, client: Client, send: Send) -> None:
@@ -387,7 +396,27 @@ class Listener:
             intent.refused(_STOOD_STILL)
         if client.helm.active:
             self._active.add(client)
+        self._set_timer(client, self._side.deadline(client.session))
         self._follow_wanted()
+
+    def _set_timer(self, client: Client, due: float) -> None:
+        """Have what a client said carried out when it has waited long enough for more of it."""
+        if due == client.due:
+            return
+        if client.timer is not None:
+            client.timer.cancel()
+        client.due = due
+        client.timer = self._loop.call_at(due, self._on_due, client) if due < math.inf else None
+
+    def _on_due(self, client: Client) -> None:
+        client.due, client.timer = math.inf, None
+        for topic, command in self._side.expire(client.session, self._clock()):
+            if self._stale():
+                client.helm.intent.refused(_STOOD_STILL)
+            self._carry_out(client, topic, command)
+        if client.helm.active:
+            self._active.add(client)
+        self._set_timer(client, self._side.deadline(client.session))
 
     def _follow_wanted(self) -> None:
         """Follow what clients want now and did not before, and no more what none of them wants."""

@@ -8,6 +8,7 @@ import pytest
 from tests.clock import jumping
 from tests.session.test_session import LIMITS, Toy
 from zbridge.conversation import Conversation
+from zbridge.errors import NotReady
 from zbridge.link import FakeLink
 from zbridge.metrics import Count
 from zbridge.session.session import LINGER_S, State
@@ -183,6 +184,50 @@ async def test_malformed_messages_are_counted() -> None:
     conversation.received(b"\x01?")
     conversation.received(b"\x01a")
     assert count.value == 3
+
+
+class Wary(Toy):
+    """A session that looks at its datagrams."""
+
+    def claims(self, datagram: bytes, port: int) -> bool:
+        return datagram == b"mine" and port == 11000
+
+    def rivalled(self, now: float) -> None:
+        self.close("rivalled", now)
+
+    def stray(self, datagram: bytes) -> None:
+        if datagram == b"in its name":
+            raise NotReady("not taken")
+
+
+@jumping
+async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say() -> None:
+    rivals, refused = Count(), []
+    loop = asyncio.get_running_loop()
+    session = Wary(LIMITS, name="robot")
+    conversation = Conversation(session, loop, deliver=lambda _: None, rivals=rivals, refused=refused.append)
+    conversation.attached(FakeLink("tcp://toy.test:1"))
+    assert conversation.claims(b"mine", 11000)
+    assert not conversation.claims(b"mine", 11001)
+    conversation.stray_datagram(b"somebody's")
+    assert refused == []
+    conversation.stray_datagram(b"in its name")
+    assert [str(refusal) for refusal in refused] == ["not taken"]
+    conversation.rivalled()
+    assert rivals.value == 1
+    await conversation.ended
+    assert session.reason == "rivalled"
+
+
+@jumping
+async def test_a_session_that_drops_its_source_has_its_link_forget_it() -> None:
+    rig = established()
+    rig.conversation.pump()
+    assert rig.link.sources_dropped == 0
+    rig.session.drops_source = True
+    rig.conversation.pump()
+    rig.conversation.pump()
+    assert rig.link.sources_dropped == 1
 
 
 @jumping

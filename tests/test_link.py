@@ -19,13 +19,16 @@ LOCAL = Address("127.0.0.1", 0)
 
 
 class Recorder(Receiver):
-    """A receiver that keeps what a link brings, and claims the first datagrams that begin with ``mark``."""
+    """A receiver that keeps what a link brings, and claims datagrams that begin with ``mark``, until it is rivalled."""
 
     def __init__(self, mark: bytes = b"") -> None:
         self.link: Link | None = None
         self.mark = mark
         self.data = b""
         self.datagrams: list[bytes] = []
+        self.asked: list[int] = []
+        """The ports of what it was asked whether it claims it."""
+        self.stray: list[bytes] = []
         self.foreign = 0
         self.reason: str | None = None
         self.calls: list[str] = []
@@ -45,8 +48,17 @@ class Recorder(Receiver):
         self.datagrams.append(datagram)
         self._note("datagram")
 
-    def claims(self, datagram: bytes) -> bool:
+    def claims(self, datagram: bytes, port: int) -> bool:
+        self.asked.append(port)
         return bool(self.mark) and datagram.startswith(self.mark)
+
+    def rivalled(self) -> None:
+        self.mark = b""
+        self._note("rivalled")
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        self.stray.append(datagram)
+        self._note("stray")
 
     def foreign_datagram(self) -> None:
         self.foreign += 1
@@ -519,10 +531,47 @@ async def test_a_link_has_one_source_and_others_are_foreign() -> None:
         with sources(2) as (one, two):
             serving.send(one, b"a5")
             await serving.recorders[0].until("datagram", datagrams=1)
-            serving.send(two, b"a5")
+            serving.send(two, b"b5")
             serving.send(one, b"more")
             await serving.recorders[0].until("datagram", datagrams=2)
             assert serving.recorders[0].datagrams == [b"a5", b"more"]
+            assert serving.recorders[0].stray == [b"b5"]
+            assert serving.recorders[0].asked == [one.getsockname()[1], two.getsockname()[1]]
+
+
+async def test_a_second_source_that_a_link_claims_costs_it_the_first() -> None:
+    """One of the two speaks in the name of another, and nobody here knows which."""
+    async with served(b"a", b"b") as serving:
+        with sources(3) as (one, two, other):
+            serving.send(one, b"a5")
+            serving.send(two, b"a5")
+            await serving.recorders[0].until("rivalled")
+            serving.links(0).write_datagram(b"to nobody")
+            for source in (one, two):
+                serving.send(source, b"a more")
+            serving.send(other, b"b5")
+            await serving.recorders[1].until("datagram", datagrams=1)
+            assert serving.recorders[0].datagrams == [b"a5"]
+            assert serving.recorders[0].stray == [b"a more", b"a more"]
+            assert serving.recorders[1].stray == [b"a more", b"a more"]
+            for source in (one, two):
+                with pytest.raises(BlockingIOError):
+                    source.recv(100)
+
+
+async def test_a_source_that_is_dropped_is_nobodys_until_it_is_claimed_again() -> None:
+    async with served(b"a") as serving:
+        with sources(2) as (one, two):
+            serving.send(one, b"a5")
+            await serving.recorders[0].until("datagram", datagrams=1)
+            serving.links(0).drop_source()
+            serving.links(0).drop_source()
+            serving.send(one, b"more")
+            serving.send(two, b"a5 again")
+            await serving.recorders[0].until("datagram", datagrams=2)
+            assert serving.recorders[0].datagrams == [b"a5", b"a5 again"]
+            serving.links(0).write_datagram(b"six")
+            assert (await heard_by(two))[0] == b"six"
 
 
 async def test_a_link_that_has_claimed_nothing_sends_datagrams_nowhere() -> None:
@@ -559,6 +608,7 @@ async def test_a_datagram_that_two_links_claim_is_neithers() -> None:
             serving.send(second, b"b5")
             await serving.recorders[2].until("datagram", datagrams=1)
             assert [recorder.datagrams for recorder in serving.recorders] == [[], [], [b"b5"]]
+            assert ["rivalled" in recorder.calls for recorder in serving.recorders] == [True, True, False]
 
 
 async def test_datagrams_that_wait_are_taken_before_the_stream_that_followed_them() -> None:
@@ -612,7 +662,8 @@ async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link() -
     hub.add(link, "10.0.0.1", recorder)
     hub._take(b"b5", ("10.0.0.1", 1))
     hub._take(b"a5", ("10.0.0.1", 1))
-    hub._take(b"a5", ("10.0.0.1", 2))
+    hub._take(b"c5", ("10.0.0.1", 2))
+    assert recorder.stray == [b"b5", b"c5"]
     hub.remove(link)
     hub.remove(link)
     hub._take(b"a5", ("10.0.0.1", 1))
@@ -630,6 +681,8 @@ def test_a_fake_link_keeps_what_is_done_to_it() -> None:
     link.pause()
     assert (link.peer, link.ready, link.paused) == ("tcp://a:1", True, True)
     assert (link.written, link.datagrams) == ([b"x"], [b"y"])
+    link.drop_source()
+    assert link.sources_dropped == 1
     link.resume()
     link.close()
     assert (link.paused, link.closed) == (False, True)

@@ -9,6 +9,9 @@ import asyncio
 import contextlib
 import gc
 import ipaddress
+import logging
+import math
+import re
 import weakref
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -70,6 +73,7 @@ class ToySession(Session[bytes]):
     role = Role.ROBOT
     frame_end = staticmethod(frame_end)
     scans = False
+    said_at = half_at = 0.0
 
     def encode(self, message: bytes) -> bytes:
         return framed(message)
@@ -83,6 +87,7 @@ class ToySession(Session[bytes]):
         self.send_first(b"who are you")
 
     def accept(self, message: bytes, now: float) -> bool:
+        self.said_at = now
         if self.state is State.ESTABLISHED:
             return True
         if message != b"hi":
@@ -209,6 +214,8 @@ class Program:
 class Scene:
     """A listener that runs, and the robot's gateway beside it."""
 
+    side_class = ToySide
+
     def __init__(self, *, allow: tuple[str, ...] = (), robot: bool = True, **settings: Any) -> None:
         self.loop = asyncio.get_running_loop()
         self.skipped_s = 0.0
@@ -245,7 +252,7 @@ class Scene:
         self.hosts = 0
 
     def _side(self, options: Any, view: RobotView, metrics: Metrics) -> ToySide:
-        self.side = ToySide(options, view, metrics)
+        self.side = self.side_class(options, view, metrics)
         return self.side
 
     @property
@@ -353,7 +360,7 @@ async def test_clients_get_the_lowest_numbers_that_are_free() -> None:
 
 @jumping
 async def test_254_clients_are_served_and_the_255th_is_turned_away() -> None:
-    async with serving() as scene:
+    async with serving(accept_hz=1000) as scene:
         programs = [scene.connect().greeted() for _ in range(254)]
         assert sorted(scene.listener.clients) == list(range(2, 256))
         late = scene.connect()
@@ -379,6 +386,52 @@ async def test_a_listener_may_be_told_to_serve_fewer() -> None:
         programs[0].leave()
         await soon()
         assert not scene.connect().link.closed
+
+
+@jumping
+async def test_more_than_so_many_connections_a_second_of_one_address_are_closed_at_once() -> None:
+    async with serving(accept_hz=3.0) as scene:
+        programs = [scene.connect() for _ in range(5)]
+        assert [program.link.closed for program in programs] == [False, False, False, True, True]
+        assert programs[4].heard() == []
+        assert not scene.connect("10.0.0.2").link.closed, "another address"
+        assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (4, 2)
+        for program in programs[:3]:
+            program.leave()
+        await soon()
+        assert scene.connect().link.closed, "that they have left makes no room"
+        await asyncio.sleep(1.0)
+        assert not scene.connect().link.closed
+
+
+@jumping
+async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise() -> None:
+    async with serving() as scene:
+        assert [scene.connect().link.closed for _ in range(25)] == [False] * 20 + [True] * 5
+
+
+@pytest.mark.parametrize("accept_hz", [20.0, 1000.0])
+@jumping
+async def test_a_flood_of_connections_costs_a_few_lines_a_second(
+    accept_hz: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        async with serving(accept_hz=accept_hz, clients=10_000) as scene:
+            caplog.clear()
+            for _ in range(800):
+                program = scene.connect()
+                program.leave()
+                await asyncio.sleep(0.0025)
+            scene.connect("10.0.0.9")
+            await asyncio.sleep(2.0)
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) <= 20, lines
+    came = sum(int(count) for line in lines for count in re.findall(r"(\d+) more connected", line))
+    told = sum("10.0.0.1:" in line and "connected as client" in line for line in lines)
+    assert came + told == scene.count("hq_accepted") - 1
+    away = sum(int(count) for line in lines for count in re.findall(r"(\d+) more turned away", line))
+    assert away + sum(" turned away (" in line for line in lines) == scene.count("hq_turned_away")
+    assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
 @jumping
@@ -417,7 +470,7 @@ async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.Monke
 
 @jumping
 async def test_many_clients_come_and_go_and_leave_nothing_behind() -> None:
-    async with serving() as scene:
+    async with serving(accept_hz=1000) as scene:
         await soon()
         tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
         subscribers, queryables = len(kept.subscribers), len(kept.queryables)
@@ -1143,3 +1196,129 @@ async def test_a_listener_and_its_clients_print_themselves() -> None:
         scene.connect()
         assert repr(scene.listener) == "<Listener toy tcp://127.0.0.1:11002, 1 clients>"
         assert repr(scene.listener.clients[2]) == "<Client 2 <ToySession toy.2 handshaking>>"
+
+
+# What waits for more of it
+
+
+class HalfSide(ToySide):
+    """A protocol whose clients say two halves of a motion, one after the other."""
+
+    def session(self, number: int, bounds: Limits) -> ToySession:
+        session = super().session(number, bounds)
+        session.handled = frozenset({bytes})
+        session.half_at = math.inf
+        return session
+
+    def take(self, session: ToySession, message: bytes) -> tuple[Telemetry, ...]:
+        if message != b"half":
+            return super().take(session, message)
+        if session.half_at == math.inf:
+            session.half_at = session.said_at
+            return ()
+        session.half_at = math.inf
+        return (_TAKEN[b"go"],)
+
+    def deadline(self, session: ToySession) -> float:
+        return session.half_at + 0.03
+
+    def expire(self, session: ToySession, now: float) -> tuple[Telemetry, ...]:
+        if now < self.deadline(session):
+            return ()
+        session.half_at = math.inf
+        return ((topics.CMD_DRIVE, Drive(forward=0.25)),)
+
+
+@contextlib.asynccontextmanager
+async def halves(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[tuple[Scene, Program]]:
+    """A client of such a protocol that may drive."""
+    monkeypatch.setattr(Scene, "side_class", HalfSide)
+    async with serving() as scene:
+        program = scene.connect().greeted()
+        program.say(b"stand")
+        yield scene, program
+
+
+def driven(scene: Scene) -> list[float]:
+    """The speeds that were commanded since the last call."""
+    return [message.forward for _, message in scene.gateway.taken() if isinstance(message, Drive)]
+
+
+@jumping
+async def test_what_waits_for_more_is_carried_out_when_it_has_waited_long_enough() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        async with halves(monkeypatch) as (scene, program):
+            program.say(b"half")
+            await asyncio.sleep(0.029)
+            assert driven(scene) == []
+            await asyncio.sleep(0.0015)
+            assert driven(scene) == [0.25]
+            assert scene.count("hq_commands") == 2
+            await asyncio.sleep(1.0)
+            assert driven(scene) == []
+
+
+@jumping
+async def test_what_comes_in_time_is_carried_out_with_it_at_once_and_the_next_has_its_own_time() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        async with halves(monkeypatch) as (scene, program):
+            program.say(b"half")
+            await asyncio.sleep(0.02)
+            program.say(b"half", b"half")
+            await asyncio.sleep(0.001)
+            assert driven(scene) == [0.5]
+            await asyncio.sleep(0.02)
+            assert driven(scene) == [], "the second has waited 21 ms"
+            await asyncio.sleep(0.0095)
+            assert driven(scene) == [0.25]
+
+
+@jumping
+async def test_what_waits_of_a_client_that_is_gone_is_nothing() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        async with halves(monkeypatch) as (scene, program):
+            program.say(b"half")
+            program.leave()
+            await asyncio.sleep(1.0)
+            assert driven(scene) == []
+            assert scene.count("hq_commands") == 1
+
+
+@jumping
+async def test_what_waited_while_the_process_stood_still_moves_nothing() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        async with halves(monkeypatch) as (scene, program):
+            program.say(b"half")
+            scene.skipped_s += 5.0
+            await asyncio.sleep(0.05)
+            assert driven(scene) == []
+            assert program.heard() == [b"! the gateway stood still: let go of the stick first"]
+
+
+# Whether the robot is there
+
+
+class ToldSide(ToySide):
+    def presence(self, there: bool) -> Send:
+        self.encoded += 1
+        return lambda session, now: session.send(b"there" if there else b"lost")
+
+
+@jumping
+async def test_every_client_is_shown_once_that_the_robot_is_lost_and_that_it_is_there_again() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(Scene, "side_class", ToldSide)
+        async with serving() as scene:
+            programs = [scene.connect().greeted() for _ in range(3)]
+            silent = scene.connect()
+            silent.heard()
+            scene.say(topics.STATUS, Status(state="connecting", protocol="toy"))
+            scene.say(topics.STATUS, Status(state="handshaking", protocol="toy"))
+            scene.go()
+            assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
+            scene.come()
+            scene.say(topics.STATUS, STATUS)
+            assert [program.heard().count(b"there") for program in programs] == [1, 1, 1]
+            scene.go()
+            assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
+            assert silent.heard() == [], "nothing before the handshake"

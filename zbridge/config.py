@@ -40,6 +40,7 @@ METRICS_TEMPLATE = """\
 LISTENER_TEMPLATE = """\
 # name = "desk"                         # of the listener on the bus; left out: made of its protocol and the process
 clients = 256                           # most at a time; one more is turned away
+accept_hz = 20.0                        # connections a second of one address; what is more is closed at once
 handshake_s = 5.0                       # what a client has for its handshake
 # idle_s = 60.0                         # close clients that say nothing for so long; left out: they may be silent
 rate_hz = 1000.0                        # messages a second of one client; one that sends more is closed
@@ -113,8 +114,9 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and what bounds them.
 
     name: of the listener on the bus, the protocol's and this process's where left out. clients: most at a time.
-    handshake_s, idle_s: seconds a client has for its handshake, and may be silent (None: for ever). rate_hz: messages a
-    second of one client. allow: networks clients may come from, all where empty.
+    accept_hz: connections a second that are taken from one address. handshake_s, idle_s: seconds a client has for its
+    handshake, and may be silent (None: for ever). rate_hz: messages a second of one client. allow: networks clients may
+    come from, all where empty.
     """
 
     protocol: str
@@ -122,6 +124,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, msgspec.Meta(max_length=40)] | None = None
     options: dict[str, Any] = {}
     clients: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 256
+    accept_hz: Annotated[float, msgspec.Meta(ge=0.1, le=1e5)] = 20.0
     handshake_s: Seconds = 5.0
     idle_s: Seconds | None = None
     rate_hz: Annotated[float, msgspec.Meta(ge=1, le=1e6)] = 1000.0

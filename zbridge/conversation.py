@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
+from zbridge.errors import Refused
 from zbridge.link import STALLED_S, Link, Receiver
 from zbridge.metrics import Count
 from zbridge.session.session import Datagram, Session, State
@@ -25,7 +26,9 @@ class Conversation:
     Nothing is written to a link on which bytes have waited for their acknowledgement for longer than STALLED_S: a robot
     would read what piles up as one packet, and lose it. ``stalled`` is told when that begins (True) and when all is
     acknowledged (False), before anything else is written.
-    ``before`` is called before anything is written: it may have something that must be written first.
+    ``before`` is called before anything is written: it may have something that must be written first. ``refused`` is
+    told what was refused before it was a message: datagrams that bear the peer's name and do not come from it.
+    ``may_warn`` is asked before a warning of one kind about the peer is logged.
     ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
     """
 
@@ -38,6 +41,9 @@ class Conversation:
         changed: Callable[[], None] = lambda: None,
         malformed: Count | None = None,
         foreign: Count | None = None,
+        rivals: Count | None = None,
+        refused: Callable[[Refused], None] = lambda refusal: None,
+        may_warn: Callable[[str], bool] = lambda kind: True,
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
         stalled: Callable[[bool], object] = lambda stalled: None,
@@ -58,6 +64,9 @@ class Conversation:
         self._seen = (session.state, session.busy, session.doubts)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
+        self._rivals = rivals or Count()
+        self._refused = refused
+        self._may_warn = may_warn
         self._malformed_logged = 0
 
     def __repr__(self) -> str:
@@ -80,9 +89,24 @@ class Conversation:
         """Take a datagram from the link."""
         self._hand_on(self.session.receive_datagram(datagram, self._clock()))
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this session's."""
-        return self.session.claims(datagram)
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this session's."""
+        return self.session.claims(datagram, port)
+
+    def rivalled(self) -> None:
+        """Count that another source, or session, claims what this one does; its session decides what becomes of it."""
+        self._rivals.value += 1
+        self.session.rivalled(self._clock())
+        if self._may_warn("with a rival source of datagrams"):
+            log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
+        self.pump()
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed."""
+        try:
+            self.session.stray(datagram)
+        except Refused as refusal:
+            self._refused(refusal)
 
     def foreign_datagram(self) -> None:
         """Count a datagram that came from elsewhere."""
@@ -114,6 +138,9 @@ class Conversation:
         self._before()
         session, link = self.session, self._link
         outbox = session.outbox
+        if session.drops_source and link is not None:
+            session.drops_source = False
+            link.drop_source()
         writing = link is not None and self._takes(link)
         while writing and link is not None and link.ready:
             frame = session.outgoing(self._clock())
@@ -221,7 +248,8 @@ class Conversation:
         """Warn at the first, second, fourth ... malformed message: the log stays readable in a flood."""
         count = self.session.traffic.malformed
         self._malformed.value += count - self._malformed_logged
-        if count.bit_length() != self._malformed_logged.bit_length():
+        due = count.bit_length() != self._malformed_logged.bit_length()
+        if due and self._may_warn("warnings of malformed messages"):
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count
 
@@ -252,7 +280,7 @@ class Accepted(Receiver):
     def lost(self, reason: str) -> None:
         """Take note that the link is gone."""
         if self._conversation is not None:
-            log.info("%s: %s", self._conversation.session.peer, reason)
+            log.debug("%s: %s", self._conversation.session.peer, reason)
             self._conversation.lost(reason)
 
     def received_datagram(self, datagram: bytes) -> None:
@@ -260,9 +288,19 @@ class Accepted(Receiver):
         if self._conversation is not None:
             self._conversation.received_datagram(datagram)
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this conversation's."""
-        return self._conversation is not None and self._conversation.claims(datagram)
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this conversation's."""
+        return self._conversation is not None and self._conversation.claims(datagram, port)
+
+    def rivalled(self) -> None:
+        """Take note that another source, or conversation, claims what this one does."""
+        if self._conversation is not None:
+            self._conversation.rivalled()
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed."""
+        if self._conversation is not None:
+            self._conversation.stray_datagram(datagram)
 
     def foreign_datagram(self) -> None:
         """Count a datagram that came from elsewhere."""

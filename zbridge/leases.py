@@ -117,7 +117,6 @@ class Leases:
             bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
         ]
 
-
     def stop(self, reason: str) -> None:
         """Stop the robot at once and for a second, and end the lease."""
         self.authority.stop(reason)

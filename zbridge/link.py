@@ -91,8 +91,14 @@ class Receiver(Protocol):
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram of this peer."""
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this peer's."""
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of this peer's host that is no peer's source yet is this peer's."""
+
+    def rivalled(self) -> None:
+        """Take note that another source or another peer claims to be this peer as well: it has no source any more."""
+
+    def stray_datagram(self, datagram: bytes) -> None:
+        """Take note of a datagram of this peer's host that nobody claimed, and that was dropped."""
 
     def foreign_datagram(self) -> None:
         """Take note of a datagram that came from elsewhere and was dropped."""
@@ -118,6 +124,9 @@ class Link(Protocol):
 
     def write_datagram(self, data: bytes) -> None:
         """Send ``data`` as one datagram to the peer; lost where the network takes none."""
+
+    def drop_source(self) -> None:
+        """Take no more datagrams from the source that was taken for an accepted peer's; idempotent."""
 
     @property
     def silent_s(self) -> float:
@@ -187,6 +196,11 @@ class TcpLink(asyncio.BufferedProtocol):
             if self._datagrams is None:
                 self._datagrams = DatagramSocket(self._transport, self._receiver)
             self._datagrams.send(data)
+
+    def drop_source(self) -> None:
+        """Take no more datagrams from the source that was taken for an accepted peer's; idempotent."""
+        if self._hub is not None:
+            self._hub.unbind(self)
 
     @property
     def silent_s(self) -> float:
@@ -456,7 +470,12 @@ class DatagramSocket(_DatagramReader):
 
 
 class DatagramHub(_DatagramReader):
-    """The UDP socket of a listener: each source belongs to the link of the same host that claimed it."""
+    """The UDP socket of a listener: each source belongs to the link of the same host that claimed it.
+
+    A datagram of a source that is nobody's is shown to every link of its host. The one that claims it gets the source,
+    if it has none; where several claim it, or one that has a source already, somebody speaks in another's name: none
+    of them has a source from then on.
+    """
 
     def __init__(self, foreign: Count) -> None:
         super().__init__()
@@ -479,6 +498,10 @@ class DatagramHub(_DatagramReader):
             links.pop(link, None)
             if not links:
                 del self._hosts[host]
+        self.unbind(link)
+
+    def unbind(self, link: Link) -> None:
+        """Forget the source of a link; idempotent."""
         source = self._sources.pop(link, None)
         if source is not None:
             del self._owners[source]
@@ -490,23 +513,24 @@ class DatagramHub(_DatagramReader):
             self._send(data, source)
 
     def _take(self, data: bytes, source: tuple[str, int]) -> None:
-        owner = self._owners.get(source) or self._claim(data, source)
-        if owner is None:
-            self._foreign.value += 1
-        else:
+        owner = self._owners.get(source)
+        if owner is not None:
             owner[1].received_datagram(data)
-
-    def _claim(self, data: bytes, source: tuple[str, int]) -> tuple[Link, Receiver] | None:
-        claiming = [
-            (link, receiver)
-            for link, receiver in self._hosts.get(source[0], {}).items()
-            if link not in self._sources and receiver.claims(data)
-        ]
-        if len(claiming) != 1:  # of two that might have sent it, neither is heard in the other's name
-            return None
-        self._sources[claiming[0][0]] = source
-        self._owners[source] = claiming[0]
-        return claiming[0]
+            return
+        peers = tuple(self._hosts.get(source[0], {}).items())
+        claiming = [(link, receiver) for link, receiver in peers if receiver.claims(data, source[1])]
+        if len(claiming) == 1 and claiming[0][0] not in self._sources:
+            self._sources[claiming[0][0]] = source
+            self._owners[source] = claiming[0]
+            claiming[0][1].received_datagram(data)
+            return
+        self._foreign.value += 1
+        for link, receiver in claiming:
+            self.unbind(link)
+            receiver.rivalled()
+        if not claiming:
+            for _, receiver in peers:
+                receiver.stray_datagram(data)
 
 
 class FakeLink:
@@ -519,6 +543,7 @@ class FakeLink:
         self.unacknowledged_s = 0.0
         self.written: list[bytes] = []
         self.datagrams: list[bytes] = []
+        self.sources_dropped = 0
         self.paused = False
         self.closed = False
 
@@ -529,6 +554,10 @@ class FakeLink:
     def write_datagram(self, data: bytes) -> None:
         """Keep ``data``."""
         self.datagrams.append(data)
+
+    def drop_source(self) -> None:
+        """Take note."""
+        self.sources_dropped += 1
 
     def pause(self) -> None:
         """Take note."""

@@ -27,7 +27,7 @@ from zbridge.link import Link, listen
 from zbridge.metrics import Metrics
 from zbridge.protocol import HqSide, Send
 from zbridge.refusals import Teller
-from zbridge.session.allowance import Allowance
+from zbridge.session.arrivals import Arrivals, Folding
 from zbridge.session.intent import Intent
 from zbridge.session.manager import ClientIds, SessionManager
 from zbridge.session.session import Limits, Session, State
@@ -52,8 +52,6 @@ FROZEN_S = 0.6
 """Seconds without a beat after which a process is taken to have been frozen: what its clients said meanwhile is old."""
 CATCH_UP_S = 0.3
 """Seconds for which old words may still come in after that."""
-LIFE_HZ = 20.0
-"""Lines of the log a second about clients that come and go; the rest is of level DEBUG."""
 _STOOD_STILL = "the gateway stood still"
 _FULL = "as many clients as there can be"
 _FRAME_BYTES = 64 * 1024
@@ -63,8 +61,9 @@ _ANSWERED = {topics.RPC_MAP.path: topics.MAP, topics.RPC_POSE.path: topics.POSE}
 class Client:
     """One HQ program: its session, its conversation, and its hand on the robot."""
 
-    def __init__(self, number: int, session: Session[Any]) -> None:
+    def __init__(self, number: int, host: str, session: Session[Any]) -> None:
         self.number = number
+        self.host = host
         self.session = session
         self.helm: Helm
         self.conversation: Conversation
@@ -75,6 +74,9 @@ class Client:
         self.seen = (0, 0)
         """Messages that were malformed, and all, at the last look."""
         self.told: dict[str, float] = {}
+        self.due = math.inf
+        """When what it said is carried out that waits for more of it."""
+        self.timer: asyncio.TimerHandle | None = None
 
     def __repr__(self) -> str:
         return f"<Client {self.number} {self.session!r}>"
@@ -119,7 +121,8 @@ class Listener:
         self._closing = False
         self._awake_at = self._clock()
         self._stale_until = -math.inf
-        self._life = Allowance(LIFE_HZ)
+        self._arrivals = Arrivals(plan.settings.accept_hz)
+        self._life = Folding()
         self._limits = Limits(
             frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
         )
@@ -133,6 +136,7 @@ class Listener:
         self._refused = metrics.count("hq_refused", listener=name)
         self._malformed = metrics.count("hq_malformed", listener=name)
         self._foreign = metrics.count("hq_foreign_datagrams", listener=name)
+        self._rivals = metrics.count("hq_rival_sources", listener=name)
 
     def __repr__(self) -> str:
         return f"<Listener {self.name} {self.address}, {len(self.clients)} clients>"
@@ -165,6 +169,7 @@ class Listener:
                     self._active.discard(client)
             if self._clock() >= sweep_at:
                 sweep_at = self._clock() + SWEEP_S  # not made up for after a process was frozen
+                self._log_folded(self._clock())
                 self._sweep()
 
     def _stale(self) -> bool:
@@ -189,6 +194,7 @@ class Listener:
             await asyncio.wait(waiting, timeout=LEAVE_S)
         for client in clients:
             client.conversation.abandon()
+        self._log_folded(math.inf)
         for task in tuple(self._tasks):
             task.cancel()
         self._bridge.close()
@@ -201,17 +207,17 @@ class Listener:
     # Clients come and go
 
     def _admit(self, link: Link) -> Conversation | None:
-        """Take a client in; None where its network is not allowed, or there is no place."""
+        """Take a client in; None where its network is not allowed, too many come, or there is no place."""
         host = link.peer.removeprefix("tcp://").rpartition(":")[0].strip("[]")
         reason = self._unwelcome(host)
         number = self._ids.take(self._clock()) if reason is None else None
         if number is None:
-            self._turn_away(link, reason or _FULL)
+            self._turn_away(link, host, reason or _FULL)
             return None
         self._accepted.value += 1
         session = self._side.session(number, self._limits)
         session.name = f"{self.name}.{number}"
-        client = self.clients[number] = Client(number, session)
+        client = self.clients[number] = Client(number, host, session)
         client.helm = self._helm(client)
         client.conversation = Conversation(
             session,
@@ -220,16 +226,21 @@ class Listener:
             changed=lambda: self._on_session(client),
             malformed=self._malformed,
             foreign=self._foreign,
+            rivals=self._rivals,
+            refused=lambda refusal: self._refuse(client, topics.CMD_DRIVE, refusal),
+            may_warn=lambda kind: self._life.first(host, kind, self._clock()),
             clock=self._clock,
         )
         client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
         self._manager.add(session)
-        self._log_life("%s: %s connected as client %d", self.name, link.peer, number)
+        self._log_life("connected", client, "%s connected as client %d", link.peer, number)
         return client.conversation
 
     def _unwelcome(self, host: str) -> str | None:
         if self._closing:
             return "the gateway stops"
+        if not self._arrivals.admit(host, self._clock()):
+            return f"more than {self._settings.accept_hz:g} connections a second of its address"
         if len(self.clients) >= self._settings.clients:
             return _FULL
         if not self._plan.allow:
@@ -238,15 +249,20 @@ class Listener:
         address = getattr(address, "ipv4_mapped", None) or address
         return None if any(address in network for network in self._plan.allow) else "its network is not allowed"
 
-    def _turn_away(self, link: Link, reason: str) -> None:
-        """Count it, and warn at the first, second, fourth ... one: the log stays readable in a flood."""
-        before = self._turned_away.value
+    def _turn_away(self, link: Link, host: str, reason: str) -> None:
         self._turned_away.value += 1
-        if before.bit_length() != self._turned_away.value.bit_length():
-            log.warning("%s: %s turned away (%d so far): %s", self.name, link.peer, before + 1, reason)
+        if self._life.first(host, f"turned away: {reason}", self._clock()):
+            so_far = self._turned_away.value
+            log.warning("%s: %s turned away (%d so far): %s", self.name, link.peer, so_far, reason)
 
-    def _log_life(self, text: str, *values: object) -> None:
-        log.log(logging.INFO if self._life.take(self._clock()) else logging.DEBUG, text, *values)
+    def _log_life(self, kind: str, client: Client, text: str, *values: object) -> None:
+        """Log what happens to a client; of what happens to many of one address, a line a second."""
+        first = self._life.first(client.host, kind, self._clock())
+        log.log(logging.INFO if first else logging.DEBUG, f"%s: {text}", self.name, *values)
+
+    def _log_folded(self, now: float) -> None:
+        for line in self._life.due(now):
+            log.info("%s: %s", self.name, line)
 
     def _helm(self, client: Client) -> Helm:
         side, who = self._side, f"hq.{self.name}.{client.number}"
@@ -265,7 +281,7 @@ class Listener:
         if client.session.state is State.ESTABLISHED and not client.begun:
             client.begun = True
             agreed = f", version {client.session.version}" if client.session.version else ""
-            self._log_life("%s: client %d established%s", self.name, client.number, agreed)
+            self._log_life("established", client, "client %d established%s", client.number, agreed)
             self._send(client, self._side.begin)
             missing = self._audience.view.missing
             if missing is not None:
@@ -276,12 +292,13 @@ class Listener:
     def _dismiss(self, client: Client) -> None:
         """Forget a client whose conversation has ended; its number is free again after a while."""
         client.helm.close()
+        self._set_timer(client, math.inf)
         self.clients.pop(client.number, None)
         self._active.discard(client)
         self._ids.release(client.number, self._clock(), rests=client.session.traffic.frames_in > 0)
         self._manager.remove(client.session)
         self._follow_wanted()
-        self._log_life("%s: client %d gone: %s", self.name, client.number, client.session.reason)
+        self._log_life("gone", client, "client %d gone: %s", client.number, client.session.reason)
 
     def _sweep(self) -> None:
         """Give up clients that take nothing, say nothing for too long, or say nothing but rubbish."""
@@ -318,6 +335,10 @@ class Listener:
             self._left_out.value += 1
             log.debug("%s: %s not shown: %s", self.name, topic.path, error)
             return
+        self._show(send)
+
+    def _show(self, send: Send | None) -> None:
+        """Let every client have something, if there is anything."""
         if send is None:
             return
         for number, client in enumerate(tuple(self.clients.values()), 1):
@@ -340,6 +361,7 @@ class Listener:
             for client in tuple(self.clients.values()):
                 client.told.pop(text, None)
                 self._tell(client, text)
+            self._show(self._side.presence(missing is None))
         self._missing = missing
 
     def _send(self, client: Client, send: Send) -> None:
@@ -378,7 +400,27 @@ class Listener:
             intent.refused(_STOOD_STILL)
         if client.helm.active:
             self._active.add(client)
+        self._set_timer(client, self._side.deadline(client.session))
         self._follow_wanted()
+
+    def _set_timer(self, client: Client, due: float) -> None:
+        """Have what a client said carried out when it has waited long enough for more of it."""
+        if due == client.due:
+            return
+        if client.timer is not None:
+            client.timer.cancel()
+        client.due = due
+        client.timer = self._loop.call_at(due, self._on_due, client) if due < math.inf else None
+
+    def _on_due(self, client: Client) -> None:
+        client.due, client.timer = math.inf, None
+        for topic, command in self._side.expire(client.session, self._clock()):
+            if self._stale():
+                client.helm.intent.refused(_STOOD_STILL)
+            self._carry_out(client, topic, command)
+        if client.helm.active:
+            self._active.add(client)
+        self._set_timer(client, self._side.deadline(client.session))
 
     def _follow_wanted(self) -> None:
         """Follow what clients want now and did not before, and no more what none of them wants."""

@@ -5,6 +5,7 @@ A package adds one by an entry point in the group ``zbridge.protocols`` that nam
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
 from importlib.metadata import entry_points
@@ -150,6 +151,18 @@ class HqSide(ABC):
     def tell(self, session: Any, text: str, now: float) -> None:
         """Say something to the people at a client, where the protocol can."""
         return
+
+    def presence(self, there: bool) -> Send | None:
+        """Show that the robot is there again, or is lost; None where clients are shown nothing of that."""
+        return None
+
+    def deadline(self, session: Any) -> float:
+        """Tell when :meth:`expire` wants to be called because of what a client said; ``inf`` for never."""
+        return math.inf
+
+    def expire(self, session: Any, now: float) -> Iterable[Telemetry]:
+        """Translate what a client said and what waited for more of it."""
+        return ()
 
     def wanted(self) -> tuple[Topic, ...]:
         """List what clients want besides ``follows``, only now and then."""

@@ -54,7 +54,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
-    serve: Literal["both", "drive", "laser"] = "both"
+    serve: Literal["auto", "drive", "laser", "both"] = "auto"
     points: Annotated[int, msgspec.Meta(ge=2, le=MOST_POINTS)] = POINTS
     acceleration_m_s2: Scale | None = None
     gyro_rad_s: Scale | None = None
@@ -62,13 +62,25 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HqClient(VehicleSession):
-    """The session of one client, and the scanner init that it was sent last."""
+    """The session of one client, and the scanner init that it was sent last.
+
+    laser: it is shown measurements and scanner init. drive: it is shown drive info.
+    """
 
     scanner: bytes | None = None
+    laser = True
+    drive = True
+
+    def show_drive(self) -> None:
+        """Show drive info instead of measurements from now on; what waits of those is not sent."""
+        self.laser, self.drive = False, True
+        self.outbox.clear("scan")
+        if self.scanner is not None:
+            self.outbox.withdraw(self.scanner)
 
     def know(self, scanner: bytes | None) -> None:
         """Send scanner init where the client does not have this one: before any measurement by it."""
-        if scanner is not None and scanner != self.scanner:
+        if scanner is not None and scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
             self.outbox.put_exempt(scanner)
             self.scanner = scanner
@@ -138,6 +150,7 @@ class AlfHq(HqSide):
         self.view = view
         self._dialect = Dialect(options.dialect)
         self._write = write_text if self._dialect is Dialect.TEXT else write_binary
+        self._auto = options.serve == "auto"
         self._laser, self._drive = options.serve != "drive", options.serve != "laser"
         self.follows = (("scan", "scanner") if self._laser else ()) + (("motion",) if self._drive else ())
         acceleration, gyro = UNITS[self._dialect]
@@ -148,12 +161,14 @@ class AlfHq(HqSide):
         self._sequence = 0
 
     def session(self, number: int, bounds: Limits) -> HqClient:
-        return HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
+        session = HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
+        session.laser, session.drive = self._laser, self._drive and not self._auto
+        return session
 
     def begin(self, session: HqClient, now: float) -> None:
         scan = self.view.scan
         known = scan if scan is not None and len(scan.ranges) else self.view.scanner
-        if self._laser and known is not None:
+        if session.laser and known is not None:
             session.know(self._sweep_of(known).init)
 
     # The robot, shown
@@ -178,8 +193,9 @@ class AlfHq(HqSide):
         frame = self._write(sweep.measurement(scan, self._sequence))
 
         def send(session: HqClient, now: float) -> None:
-            session.know(sweep.init)
-            session.outbox.stand("scan", (frame,), now)
+            if session.laser:
+                session.know(sweep.init)
+                session.outbox.stand("scan", (frame,), now)
 
         return send
 
@@ -191,7 +207,7 @@ class AlfHq(HqSide):
         speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
         message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
-        return lambda session, now: session.outbox.stand("info", (frame,), now)
+        return lambda session, now: session.outbox.stand("info", (frame,), now) if session.drive else None
 
     def _measured(self, value: float) -> float:
         value = _finite(value)
@@ -205,6 +221,8 @@ class AlfHq(HqSide):
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
+        if self._auto and not session.drive:  # no deployed program bears both ("The gateway as vehicle")
+            session.show_drive()
         straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
         speed = min(1.0, message.speed / self._full_speed)

@@ -26,8 +26,10 @@ from gateways.alf import strict_parser as wire
 from gateways.alf.strict_parser import DRIVE, END, INFO, INIT, NO_ID, SCAN, Dialect, show
 from zbridge.judge import Judge
 
-Serves = Literal["drive", "laser", "both"]
+Serves = Literal["auto", "drive", "laser", "both"]
 """What the gateway's listener is configured to serve ("The gateway as vehicle")."""
+Deployed = Literal["driving", "scanning"]
+"""Which of the deployed programs; none bears both kinds of messages ("The gateway as vehicle")."""
 Fields = tuple[int | float, ...]
 
 _INT, _FLOAT = rb"\|(?:0|-?[1-9][0-9]*)", rb"\|-?(?:0|[1-9][0-9]*)\.[0-9]{6}"
@@ -35,6 +37,8 @@ _FORMS = {INIT: re.compile(b"2" + 3 * _FLOAT + 3 * _INT + b";"), INFO: re.compil
 _FLOATS = {INIT: range(3), INFO: range(1, 8)}
 _LAYOUTS = {INIT: "<B3f3i", INFO: "<BB6hf", END: "<BB"}
 _SERVED = {"drive": (INFO, END), "laser": (INIT, SCAN, END), "both": (INIT, SCAN, INFO, END)}
+_BEARS = 10
+"""Measurements after which the deployed driving program stops reading."""
 _NOT_POINTS, _LONGEST_NUMBER = 4, 12
 _ANGLES = {"text": (-90, 0, 90), "binary": (0, 90, 180)}
 _FULL = {"text": 255, "binary": 100}
@@ -190,21 +194,26 @@ class StrictHq(Judge):
         *,
         dialect: Dialect = "text",
         points: int = wire.POINTS,
-        serves: Serves = "both",
+        serves: Serves = "auto",
+        deployed: Deployed | None = None,
         repeat_s: float | None = 0.02,
         stops_reading_after: int | None = None,
         answer_s: float = 2.0,
+        flight_s: float = 1.0,
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
         """Set up the HQ.
 
-        ``points``: of every measurement; ``serves``: what the listener is configured to serve; ``repeat_s``: from one
-        drive command to the next, None for a viewer that sends none; ``stops_reading_after``: so many measurements it
-        reads no more, for good; ``answer_s``: longest time to the vehicle's END after ours, and to its close after
-        both; ``keep``: bound of every list; ``note``: called with each violation.
+        ``points``: of every measurement; ``serves``: what the listener is configured to serve; ``deployed``: be the
+        driving program, which stops reading after ten measurements, or the scanning one, which sends no commands and
+        takes any id but 1 and 2 as END; None: neither, it bears both; ``repeat_s``: from one drive command to the next,
+        None for a viewer that sends none; ``stops_reading_after``: so many measurements it reads no more, for good;
+        ``answer_s``: longest time to the vehicle's END after ours, and to its close after both; ``flight_s``: how long
+        after the first command measurements may still come; ``keep``: bound of every list; ``note``: called with each
+        violation.
         """
-        if dialect not in _FULL or serves not in _SERVED:
+        if dialect not in _FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
         super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
@@ -217,8 +226,15 @@ class StrictHq(Judge):
         self.last_scan: Scan | None = None
         self.infos: list[Fields] = []
         """Every message 4."""
-        self._served, self._repeat_s, self._stops_after = _SERVED[serves], repeat_s, stops_reading_after
-        self._answer_s = answer_s
+        self._serves: Serves = serves
+        self._scanning = deployed == "scanning"
+        self._repeat_s = None if self._scanning else repeat_s
+        self._stops_after = _BEARS if deployed == "driving" and stops_reading_after is None else stops_reading_after
+        self._answer_s, self._flight_s = answer_s, flight_s
+        self._drove_at = math.inf
+        """When the first command was sent."""
+        self._blind = False
+        """It has taken something as END, and shows nothing more."""
         self._reader = Reader(dialect, points)
         self._phase, self._stopped, self._midway = _Phase.CONNECTING, False, False
         self._conn: socket.socket | None = None
@@ -344,13 +360,23 @@ class StrictHq(Judge):
             self._die(f"{told.problem}: {raw}")
         if told.problem:
             self._violate(f"{told.problem}: {raw}")
-        elif told.kind not in self._served:
+        elif told.kind not in self._served():
             self._violate(f"message {told.kind} from a listener that does not serve it: {raw}")
         if told.kind == END:
             self._answer(conn)
-        elif whole:
+        elif self._scanning and told.kind not in (INIT, SCAN):
+            self._violate(f"message {told.kind} taken as END, it shows nothing more: {raw}")
+            self._blind = True
+        elif whole and not self._blind:
             self._take(told)
         return None
+
+    def _served(self) -> tuple[int, ...]:
+        """Give the ids that may come now: with ``auto`` 1 and 2 until the first command, from then on 4."""
+        if self._serves != "auto":
+            return _SERVED[self._serves]
+        since_s = time.monotonic() - self._drove_at
+        return _SERVED["laser" if since_s < 0 else "both" if since_s < self._flight_s else "drive"]
 
     def _take(self, told: Told) -> None:
         """Take a message of the right length ("Send the cached 2 first, then 1 and 4 as they come")."""
@@ -394,6 +420,7 @@ class StrictHq(Judge):
         async with self._sending:
             if self._phase is not _Phase.STANDING:
                 return
+            self._drove_at = min(self._drove_at, time.monotonic())
             try:
                 self._midway = True
                 await asyncio.get_running_loop().sock_sendall(conn, data)
@@ -415,20 +442,16 @@ async def simulate_strict_hq(
     *,
     dialect: Dialect,
     points: int = wire.POINTS,
-    serves: Serves = "both",
-    repeat_s: float | None = 0.02,
-    stops_reading_after: int | None = None,
 ) -> None:
-    """Run a strict HQ until cancelled, dead or left by the vehicle; log each violation, and print what it died of.
+    """Run the strict driving HQ until cancelled, dead or left by the vehicle; log violations, print what it died of.
 
     Raise OSError if nobody listens.
     """
     hq = StrictHq(
         dialect=dialect,
         points=points,
-        serves=serves,
-        repeat_s=repeat_s,
-        stops_reading_after=stops_reading_after,
+        serves="both",  # nobody has said what the listener serves
+        deployed="driving",
         note=lambda text: _log.error("violation: %s", text),
     )
     await hq.run(host, port)

@@ -54,9 +54,13 @@ listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and hear datag
 [hq.options]
 versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
 udp = true                              # offer datagrams: 1.3 programs drive by nothing else
+client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is heard from
+                                        # there alone; 0: from nowhere
 gap_s = 0.01                            # least time between two packets: programs take one read as one packet
 quiet_s = 2.0                           # before a client's id is given again
 known = []                              # packet ids that these programs know besides those of their version
+unasked = false                         # maps and positions (53, 55) also to programs of 1.1 that asked for none
+                                        # (52, 54): its first ones have no handlers for them
 skip_map_flag = false                   # leave out the byte that some 1.3 programs skip, so that they see the map size
 slam_map_size = 1000                    # announced while the robot's map is not known yet, in its unit of length
 slam_map_interval = 10

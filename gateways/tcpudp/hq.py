@@ -46,7 +46,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.session import RobotSession
+from gateways.tcpudp.session import CLIENT_PORT, RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, Length, PacketId, Scale
 from zbridge.errors import EncodeError, ProtocolError
@@ -69,6 +69,9 @@ _NEARLY = 1 + 1e-9
 _MODES = {1: "none", 2: "manual", 3: "autonomous"}
 _SIZES = ("1.3", "1.4")
 """Versions whose clients were told the size of the map."""
+_ASKING = ("1.1",)
+"""Versions whose first programs have no handlers for what nobody asked for ("The gateway as robot")."""
+_ON_REQUEST = frozenset({ServerSLAMMap.spec.id, ServerPosition.spec.id})
 
 VersionName = Literal["1.1", "1.2", "1.3", "1.4"]
 
@@ -78,9 +81,11 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = ("1.1", "1.2", "1.3")
     udp: bool = True
+    client_port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = CLIENT_PORT
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
     quiet_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 2.0
     known: tuple[PacketId, ...] = ()
+    unasked: bool = False
     skip_map_flag: bool = False
     slam_map_size: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 1000
     slam_map_interval: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 10
@@ -96,7 +101,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HqClient(RobotSession):
-    """The session of one client, and the size of the map that it was told."""
+    """The session of one client, the size of the map that it was told, and what it has asked for."""
 
     def __init__(self, bounds: Limits, settings: Settings, number: int, options: HqOptions, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -107,7 +112,20 @@ class HqClient(RobotSession):
             options.versions,
             block=_without_map_flag(settings) if options.skip_map_flag else None,
             known=options.known,
+            client_port=options.client_port,
         )
+        self._unasked = options.unasked
+        self._asked: set[int] = set()
+
+    def establish(self, version: str, features: tuple[str, ...]) -> None:
+        super().establish(version, features)
+        if version in _ASKING and not self._unasked:
+            self.known -= _ON_REQUEST - self._asked
+
+    def asks(self, packet_id: int) -> None:
+        """Take note that the client asked for a packet: it knows what to do with it."""
+        self._asked.add(packet_id)
+        self.known |= {packet_id}
 
     @property
     def by_udp(self) -> bool:
@@ -124,7 +142,8 @@ class HqClient(RobotSession):
     def leave_out(self, packet_id: int) -> None:
         """Count a packet that the client does not know."""
         spec = PACKETS.get(packet_id)
-        self.left_out[f"{spec.name} ({packet_id})" if spec is not None else f"packet {packet_id}"] += 1
+        name = f"{spec.name} ({packet_id})" if spec is not None else f"packet {packet_id}"
+        self.left_out[f"{name} unasked" if packet_id in _ON_REQUEST else name] += 1
 
 
 class TcpUdpHq(HqSide):
@@ -224,7 +243,7 @@ class TcpUdpHq(HqSide):
             key = (session.geometry if announced else None, most)
             if key not in frames:
                 cells, to_scale = self._cells(message, *key)
-                frame = encode_packet(ServerSLAMMap(cells or None), session.sender_id)
+                frame = encode_packet(ServerSLAMMap(cells), session.sender_id)
                 frames[key] = (frame, Datagram(frame))
                 larger.update(() if to_scale else (key,))
             if key in larger:
@@ -335,9 +354,11 @@ class TcpUdpHq(HqSide):
         return ((topics.CMD_SCAN, Scan(0.0, 2 * math.pi / count, 0.0, most, ranges)),)
 
     def _ask_map(self, session: HqClient, message: ClientGetSLAMMap) -> tuple[Telemetry, ...]:
+        session.asks(ServerSLAMMap.spec.id)
         return ((topics.RPC_MAP, Query()),)
 
     def _ask_pose(self, session: HqClient, message: ClientGetPosition) -> tuple[Telemetry, ...]:
+        session.asks(ServerPosition.spec.id)
         return ((topics.RPC_POSE, Query()),)
 
     def _take_raw(self, session: HqClient, message: Packet) -> tuple[Telemetry, ...]:

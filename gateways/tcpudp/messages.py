@@ -205,9 +205,13 @@ class ClientGetSLAMMap(Packet, frozen=True):
 
 @packet(53, "servertSLAMMap", Sender.ROBOT, Carrier.UDP_IF_AGREED)
 class ServerSLAMMap(Packet, frozen=True):
-    """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. None or empty: no map yet."""
+    """The map: 0 unknown, 1 free, 2 obstacle, index = x * side + y. Empty: no map yet.
 
-    cells: Blob | None = None
+    The count is always written: an HQ program that gets a 53 without it throws for good ("Packets"). Robots may leave
+    it out.
+    """
+
+    cells: Blob = b""
 
 
 @packet(54, "clientGetPosition", Sender.HQ, needs=_MAPPING)
@@ -324,7 +328,12 @@ def _is_whole_text(frame: bytes, start: int) -> bool:
 
 
 def _decode_map(frame: bytes, start: int) -> Packet:
-    """Read packet 53; some robots answer 54 with it and three floats: a position ("The gateway as HQ")."""
+    """Read packet 53; some robots answer 54 with it and three floats: a position ("The gateway as HQ").
+
+    One without a body is a map of no cells ("Packets").
+    """
+    if start == len(frame):
+        return ServerSLAMMap()
     three_floats = len(frame) - start == 12 and int.from_bytes(frame[start : start + 4], "little") != _MAP_OF_12_BYTES
     return (ServerPosition if three_floats else ServerSLAMMap).spec.codec.decode(frame, start)
 

@@ -36,7 +36,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
-from zbridge.errors import EncodeError, Malformed, ProtocolError, Unsupported
+from zbridge.errors import EncodeError, Malformed, NotReady, ProtocolError, Unsupported
 from zbridge.session.negotiation import agree, newest, parse_versions
 from zbridge.session.probe import Probe, Verdict
 from zbridge.session.session import Datagram, Limits, Role, Session, State
@@ -50,6 +50,9 @@ REPORT_S = 3.0
 """Seconds an HQ has for packet 7: it may wait :data:`PROBE_S` for a 6 that was lost."""
 SILENCE_S = 2.5
 """Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7: it sleeps 2 s, and may be late."""
+CLIENT_PORT = 11000
+"""The UDP port that deployed HQ programs bind."""
+RIVAL = "another source of datagrams claims to be this client"
 LATE_START = "handshaking"
 AGAIN_S = 0.3
 """Seconds after which what is sent once and matters is sent again to robots that misread a tenth of what they get."""
@@ -254,7 +257,7 @@ class HqSession(_TcpUdpSession):
     def withdraw_autonomous(self) -> None:
         """Let no mode 3 leave any more, neither for the first time nor again."""
         if self._chosen is not None and self._chosen.autonomous:
-            self.outbox.withdraw(self._chosen)
+            self.outbox.unqueue(self._chosen)
             self.outbox.clear(_MODE_AGAIN)
 
     def outgoing(self, now: float) -> bytes | None:
@@ -367,14 +370,36 @@ _FROM_HQ: dict[int, Decode] = {
 """How to read what an HQ may send, by packet id."""
 _NOBODYS_IDS = (0, SERVER_ID)
 """The ``id`` bytes that no client is given."""
+_NO_HEADER = (-1, -1)
+
+
+def _header(datagram: bytes) -> tuple[int, int]:
+    """Give the ``id`` byte and the packet id of a datagram that is one packet."""
+    try:
+        return read_header(datagram)
+    except ProtocolError:
+        return _NO_HEADER
 
 
 class RobotSession(_TcpUdpSession):
     """We play the robot towards an HQ: what we announce, the versions we list verbatim, and the id we give it.
 
     ``block``: the settings block as it is sent, where that is not the one of ``settings``. ``known``: packet ids that
-    this HQ knows besides those of its version. The ``id`` byte of what it sends is not looked at: the connection tells
-    who it is, and programs send 0 before they have read the settings.
+    this HQ knows besides those of its version. client_port: the UDP port that this HQ is known to bind; 0: none. The
+    ``id`` byte of what it sends by TCP is not looked at: the connection tells who it is, and programs send 0 before
+    they have read the settings.
+
+    Datagrams tell nothing but their source, and any process of the HQ's host can send them. So there are two ways to
+    become its source, and no others:
+
+    - a 5 within :data:`PROBE_S` of our 4 and before its 7. If a second source sends one too, neither is heard: no 6 is
+      sent, or the HQ is let go where it was sent already. Where no 5 came there is no 6 either: any 6, false too,
+      makes programs of 1.1 and 1.2 believe in datagrams, and without one they fall back to TCP.
+    - after the handshake, while it has no source, a packet with its id from ``client_port``: a program of 1.3 whose 5
+      was lost sends 11, 12 and 61 by UDP all the same.
+
+    A packet with its id from ``client_port`` while its source is another one shows that one of the two is not the HQ:
+    neither is heard any more.
     """
 
     role = Role.ROBOT
@@ -390,6 +415,7 @@ class RobotSession(_TcpUdpSession):
         *,
         block: bytes | None = None,
         known: Iterable[int] = (),
+        client_port: int = CLIENT_PORT,
     ) -> None:
         super().__init__(limits)
         self.settings = settings
@@ -403,6 +429,15 @@ class RobotSession(_TcpUdpSession):
         self._agreed = ""
         self._probe = Probe(PROBE_S)
         self._report = Probe(REPORT_S)
+        self._answer: Datagram | None = None
+        """Packet 6, once it was queued."""
+        self._client_port = client_port
+        self._sourced = False
+        """Whether datagrams come from a source that is taken for the HQ's."""
+        self._port = 0
+        """The port of that source."""
+        self._contested = False
+        """Whether two sources were taken for the HQ's after the handshake."""
 
     def decode(self, frame: bytes) -> Packet:
         """Read a packet of the stream; ``frame_end`` has checked its length."""
@@ -420,41 +455,79 @@ class RobotSession(_TcpUdpSession):
         elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         elif isinstance(message, ClientUDPConnectionStatus):
-            # Deployed HQ programs say true whatever happened: true is believed only if a datagram arrived.
-            if not self._report.settle(works=message.connected):
+            if self.state is not State.HANDSHAKING:
                 raise ProtocolError("clientUDPConnectionStatus was not due")
-            if not message.connected:
-                self.transport = "tcp"
-            self._finish()
+            self._take_report(works=message.connected)
         elif isinstance(message, ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
             return True
         return False
 
-    def claims(self, datagram: bytes) -> bool:
-        """Claim packet 5 while it is waited for; later, of an HQ whose 5 was lost, any packet with its id.
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Claim a 5 between our 4 and its 7; later a packet with its id from its port."""
+        claims = False
+        if self.state is State.HANDSHAKING:
+            claims = self._claims_probe(datagram)
+        elif self.state is State.ESTABLISHED and port == self._client_port and not self._contested:
+            claims = self._claims_late(datagram)
+        if claims and not self._sourced:
+            self._port = port
+        return claims
 
-        Deployed HQ programs of version 1.3 send packets 11, 12 and 61 by UDP whatever was agreed.
-        """
-        if self._probe.verdict is Verdict.UNKNOWN:
+    def _claims_probe(self, datagram: bytes) -> bool:
+        if self._probe.verdict not in (Verdict.WAITING, Verdict.WORKS):
             return False
-        try:
-            sender_id, packet_id = read_header(datagram)
-        except ProtocolError:
+        sender_id, packet_id = _header(datagram)
+        own = sender_id == self.client_id or sender_id in _NOBODYS_IDS
+        return own and packet_id == ClientUDPConnection.spec.id
+
+    def _claims_late(self, datagram: bytes) -> bool:
+        if self._probe.verdict is Verdict.UNKNOWN or (self._sourced and self._port == self._client_port):
             return False
-        if self._probe.verdict is Verdict.WAITING:
-            own = sender_id == self.client_id or sender_id in _NOBODYS_IDS
-            return own and packet_id == ClientUDPConnection.spec.id
+        sender_id, packet_id = _header(datagram)
         return sender_id == self.client_id and packet_id in _FROM_HQ
+
+    def rivalled(self, now: float) -> None:
+        """Hear neither source; let an HQ go that was told that its datagrams arrive, as it believes that."""
+        answer, self._answer = self._answer, None
+        self._probe.fail()
+        self._sourced, self.transport = False, "tcp"
+        self.left_out[RIVAL] += 1
+        if self.state is State.ESTABLISHED:
+            self._contested = True
+        elif answer is not None and not self.outbox.withdraw(answer):
+            self.close(RIVAL, now)
+        else:
+            self._report.begin(now)
+
+    def stray(self, datagram: bytes) -> None:
+        """Raise Refused where a packet bears this HQ's id and comes from where nobody knows it."""
+        if self.state is State.ESTABLISHED and _header(datagram)[0] == self.client_id:
+            self.traffic.foreign += 1
+            text = "packets by UDP from another port than this client's are not taken"
+            raise NotReady(f"{text} (client_port = {self._client_port})")
+
+    def receive_datagram(self, datagram: bytes, now: float) -> list[Packet]:
+        """Take one datagram of the HQ's source, unless it bears the id of another one."""
+        self._sourced = True
+        sender_id = _header(datagram)[0]
+        if sender_id in (_NO_HEADER[0], self.client_id, *_NOBODYS_IDS):
+            return super().receive_datagram(datagram, now)
+        self.malformed(f"datagram with id {sender_id}, which is another client's")
+        return []
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if not isinstance(message, ClientUDPConnection):
+            if self.state is not State.ESTABLISHED:  # whose source this is, only the 7 tells
+                raise ProtocolError(f"{type(message).__name__} by UDP before the handshake is over")
             return self.accept(message, now)
         if not self._probe.settle(works=True):
             raise ProtocolError("clientUDPConnection was not due")
         self.transport = "udp"
-        self._answer_probe(now)
+        self._answer = Datagram(self.encode(ServerUDPConnection(True)))
+        self.outbox.put_exempt(self._answer)
+        self._report.begin(now)
         return False
 
     def may_send(self, message: Packet) -> None:
@@ -481,12 +554,17 @@ class RobotSession(_TcpUdpSession):
         else:
             self._finish()
 
-    def _answer_probe(self, now: float) -> None:
-        """Packet 6: true by UDP, false by TCP; then the HQ has its time to answer 7."""
-        works = self.transport == "udp"
-        frame = self.encode(ServerUDPConnection(works))
-        self.outbox.put_exempt(Datagram(frame) if works else frame)
-        self._report.begin(now)
+    def _take_report(self, *, works: bool) -> None:
+        """End the handshake with packet 7. Programs of 1.3 say true whatever happened; false is the truth.
+
+        An HQ that got no 6 may not be who sent the 5 that was answered; nor one that never says.
+        """
+        self._probe.settle(works=False)
+        self._report.settle(works=works)
+        if not works and self._sourced:
+            self._sourced, self.transport = False, "tcp"
+            self.drops_source = True
+        self._finish()
 
     def _finish(self) -> None:
         assert self.client is not None
@@ -497,6 +575,6 @@ class RobotSession(_TcpUdpSession):
 
     def on_timer(self, now: float) -> None:
         if self._probe.expire(now):
-            self._answer_probe(now)
+            self._report.begin(now)
         if self._report.expire(now):
-            self._finish()
+            self._take_report(works=False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import enum
+import errno
 import logging
 import socket
 import struct
@@ -29,6 +30,8 @@ Channel = Literal["tcp", "udp"]
 _READ_BYTES = _DATAGRAM_BYTES = 65536
 _SMALLEST_READ = 6
 _WAITING = 1000
+DEPLOYED_PORT = 11000
+"""The UDP port that deployed programs bind ("Handshake", Ports)."""
 _STAMPS = 35
 """SO_TIMESTAMPNS of Linux, which Python does not name."""
 _log = logging.getLogger(__name__)
@@ -72,8 +75,9 @@ class StrictHq(Judge):
         udp: bool = True,
         lidar_sim: bool = False,
         skips_map_flag: bool = False,
+        unasked: bool = False,
         repeat_s: float | None = 0.5,
-        udp_port: int = 0,
+        udp_port: int | None = None,
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
         times: HqTimes = _DEPLOYED,
@@ -81,8 +85,10 @@ class StrictHq(Judge):
         """Set up the program.
 
         ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
+        ``unasked``: one of 1.1 has handlers for 53 and 55 before it asked, which its first programs have not;
         ``repeat_s``: how often the stick is repeated, None: a viewer that sends nothing by itself; ``udp_port``: what
-        to bind (deployed: 11000); ``keep``: bound of every list; ``note``: called with each violation.
+        to bind, 0 for any; None: what deployed programs bind, or any where that is taken; ``keep``: bound of every
+        list; ``note``: called with each violation.
         """
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
@@ -97,6 +103,8 @@ class StrictHq(Judge):
         self.texts: list[str] = []
         self.counts: Counter[int] = Counter()
         self._offers_udp, self._lidar_sim, self._skips = udp, lidar_sim, skips_map_flag
+        self._unasked = unasked or version != "1.1"
+        self._asked: set[int] = set()
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
         self._phase = _Phase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
@@ -205,7 +213,9 @@ class StrictHq(Judge):
         """
         if self._phase is not _Phase.ESTABLISHED:
             self._event(f"lost: packet {kind} while {self._phase.name.lower()}")
-        elif kind in wire.BY_UDP and (self._works or self.version == "1.3"):
+            return
+        self._asked.add(kind)
+        if kind in wire.BY_UDP and (self._works or self.version == "1.3"):
             self._send_datagram(kind, body)
         else:
             self._send_tcp(kind, body)
@@ -317,7 +327,7 @@ class StrictHq(Judge):
     def _channel(self, kind: int, body: bytes) -> Channel | None:
         """Tell what carries a packet ("Packets"); none: either, as nothing was agreed for lack of an answer 6."""
         if kind == wire.UDP_ANSWER:
-            return "udp" if any(body) else "tcp"
+            return "udp" if any(body) else "tcp"  # which is reproached for itself
         if kind in wire.BY_UDP and self._udp is not None:
             return None if self._works is None else "udp" if self._works else "tcp"
         return "tcp"
@@ -335,6 +345,9 @@ class StrictHq(Judge):
             return "" if self._udp is not None and not self._answered else "a 6 that is not due"
         if kind == wire.GET_SCAN and not self._lidar_sim:
             return "a 60 though LidarSim was not announced"
+        question = wire.ANSWERS.get(kind)
+        if question is not None and not self._unasked and question not in self._asked:
+            return f"a {kind} to an HQ 1.1 that never asked ({question}): it has no handler"
         refusal = kind == wire.DEBUG and phase is _Phase.ANSWERED  # "No common version: say so"
         due = refusal or phase in (_Phase.CONNECTED, _Phase.ESTABLISHED)
         return "" if due else f"packet {kind} before the session was established"
@@ -354,8 +367,8 @@ class StrictHq(Judge):
         elif kind == wire.POSITION:
             x, y, heading = struct.unpack("<3f", body)
             self.position = (x, y, heading)
-        elif kind == wire.MAP and body:
-            self.map = body[4:]
+        elif kind == wire.MAP:
+            self.map = body[4:] or self.map
 
     # Handshake
 
@@ -395,10 +408,20 @@ class StrictHq(Judge):
         self._phase = _Phase.PROBING
         self._udp = socket.socket(self._tcp.family, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
-        self._udp.bind((self._tcp.getsockname()[0], self._udp_port))
+        self._bind(self._udp, self._tcp.getsockname()[0])
         asyncio.get_running_loop().add_reader(self._udp.fileno(), self._hear)
         self._send_datagram(wire.UDP_PROBE)
         self._start(self._wait())
+
+    def _bind(self, sock: socket.socket, host: str) -> None:
+        """Bind the UDP port; several programs of one machine cannot all have the deployed one."""
+        try:
+            sock.bind((host, DEPLOYED_PORT if self._udp_port is None else self._udp_port))
+        except OSError as error:
+            if self._udp_port is not None or error.errno != errno.EADDRINUSE:
+                raise
+            sock.bind((host, 0))
+            self._event(f"UDP port {DEPLOYED_PORT} is taken, {sock.getsockname()[1]} instead")
 
     async def _wait(self) -> None:
         await asyncio.sleep(self._times.probe_s)
@@ -407,15 +430,20 @@ class StrictHq(Judge):
         self._report()
 
     def _conclude(self, works: bool) -> None:
-        self._answered, self._works = True, works
+        """Take 6: programs of 1.1 and 1.2 believe in UDP after any ("The gateway as robot")."""
+        self._answered = True
+        self._works = works or self.version != "1.3"
         if not works:
-            self._event("6(false): the robot took no 5")
+            self._violate("6(false): a listener sends 6(true) or none")
         self._report()
 
     def _report(self) -> None:
-        """Send 7, true whatever happened ("The gateway as robot")."""
+        """Send 7: whether a 6 came; 1.3 says true all the same ("Handshake" 6)."""
         if self._phase is _Phase.PROBING:
-            self._send_tcp(wire.UDP_STATUS, b"\x01")
+            connected = self._answered or self.version == "1.3"
+            if not connected:
+                self._works = False
+            self._send_tcp(wire.UDP_STATUS, bytes([connected]))
             self._establish()
 
     def _establish(self) -> None:
@@ -467,7 +495,7 @@ async def simulate_strict_hq(
     udp: bool,
     lidar_sim: bool = False,
     skips_map_flag: bool = False,
-    udp_port: int = 0,
+    udp_port: int | None = None,
     times: HqTimes = _DEPLOYED,
 ) -> None:
     """Run a strict HQ with an idle stick until cancelled, dead or left; log violations, print what it died of."""

@@ -63,6 +63,8 @@ HQ_LOSES_BYTES = 2200
 """An HQ loses TCP packets of so many bytes and more ("The gateway as robot")."""
 HQ_SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3"}
 """The version string an HQ sends."""
+ANSWERS = {MAP: GET_MAP, POSITION: GET_POSITION}
+"""What an HQ asks for, and how."""
 _TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS, MAP, POSITION})
 KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
 """The packet ids that do not cripple an HQ of a version."""
@@ -333,7 +335,7 @@ def hq_body_problem(kind: int, body: bytes) -> str:
         return f"a body of {len(body)} bytes instead of {size}"
     if kind == DEBUG:
         return _text(body) or ("" if body != bytes(4) else "an empty text")
-    return _map(body) if kind == MAP and body else ""
+    return _map(body) if kind == MAP else ""
 
 
 def hq_value_problem(kind: int, body: bytes, side: int) -> str:
@@ -342,10 +344,8 @@ def hq_value_problem(kind: int, body: bytes, side: int) -> str:
         return f"lidar status {struct.unpack('<i', body)[0]}"
     if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):
         return "numbers that are not finite"
-    if kind == MAP and body:
+    if kind == MAP and len(body) > 4:
         count = len(body) - 4
-        if not count:
-            return "n = 0 instead of an empty body"
         if side not in (0, math.isqrt(count)):
             return f"{count} cells of a map announced with {side} x {side}"
         return "a cell that is neither 0, 1 nor 2" if body[4:].translate(None, b"\0\1\2") else ""
@@ -471,6 +471,8 @@ def _scan(body: bytes) -> str:
 
 
 def _map(body: bytes) -> str:
+    if not body:
+        return "a 53 without its int, on which it throws for good"
     count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
     if count != len(body) - 4:
         return f"n = {count} and {max(len(body) - 4, 0)} bytes of a map"

@@ -145,7 +145,7 @@ class TcpUdpRobot(Robot):
         """Turn the x-major cells (index = x * side + y) into rows of y, cells that are not 0, 1, 2 into unknown."""
         self._map_awaited = False
         settings = self._session.settings if self._session is not None else None
-        values = message.cells or b""
+        values = message.cells
         side = _side(len(values), settings)
         cell = self._cell_m(settings)
         cells = _known_cells(np.frombuffer(values, np.uint8)).reshape(side, side).T

@@ -62,6 +62,8 @@ listen = "tcp://127.0.0.1:27016"
 dialect = "deployed"                    # what controllers in the field speak; "draft": the document's, without names
 hold = true                             # repeat what a controller set once while its connection lives: one that hangs
                                         # keeps the robot moving; false: it must set values twice a second
+join_s = 0.03                           # a controller sets "left" and "right" one after the other: what it sets within
+                                        # this time is one drive; a stop never waits
 sectors = 8                             # a scan is shown as so many distance sensors, sector0 ahead, counter-clockwise
 sector_unit_m = 1.0                     # what their value 1 is in metres
 distance_type = 37                      # type bytes; they move with the Webots version

@@ -31,7 +31,18 @@ from gateways.wc2ec.session import ControllerSession
 from gateways.wc2ec.translate import NAME, Byte, DeviceOption, Positive
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Device, Devices, Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Status
+from zbridge.fleet.messages import (
+    Device,
+    Devices,
+    Drive,
+    FleetMessage,
+    Motor,
+    Reading,
+    Scan,
+    Scanner,
+    SensorSetting,
+    Status,
+)
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
@@ -39,11 +50,17 @@ from zbridge.protocol import HqSide, Send, Telemetry
 from zbridge.session.session import Limits
 
 DEADMAN_S = 0.5
+MOST_POINTS = 100_000
+"""Of a scanner that nobody has seen a scan of."""
 NUMBERS = 255
 """Devices there can be: numbers 0 to 254."""
 LEFT, RIGHT = "left", "right"
 """The motors of a robot that has none of its own."""
+FAULT = -1.0
+"""What a distance sensor shows of which nothing is known: deployed controllers take it as a fault, while anything from
+0 to 1000 would be a lie ("The gateway as Webots controller")."""
 _MOST = 1e9
+_MOST_RAD = 1e6
 _NAME_BYTES = 255
 _ESCAPED = re.compile(r"\\x([89a-f][0-9a-f])")
 
@@ -62,6 +79,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     dialect: Literal["deployed", "draft"] = "deployed"
     hold: bool = True
+    join_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.03
     sectors: Annotated[int, msgspec.Meta(ge=1, le=128)] = 8
     sector_unit_m: Positive = 1.0
     wheels: Wheels = Wheels()
@@ -97,11 +115,23 @@ class Shown(msgspec.Struct, frozen=True):
 class HqClient(ControllerSession):
     """The session of one controller: what it was told there is, what it wants to know, what it set."""
 
+    handled = frozenset({SetValue})
+
     def __init__(self, dialect: Dialect, *, values: int, bounds: Limits) -> None:
         super().__init__(dialect, values=values, bounds=bounds)
         self.registered: set[int] = set()
         self.enabled: set[int] = set()
         self.wheels = {LEFT: 0.0, RIGHT: 0.0}
+        self.fresh: set[str] = set()
+        """The wheels that were set since the last drive."""
+        self.joined_at = math.inf
+        """When what was set becomes a drive, whatever else is set or not."""
+        self.said_at = -math.inf
+        """When the last value came."""
+
+    def accept(self, message: Wc2EcMessage, now: float) -> bool:
+        self.said_at = now
+        return super().accept(message, now)
 
 
 class Wc2EcHq(HqSide):
@@ -117,14 +147,20 @@ class Wc2EcHq(HqSide):
         self.hold = options.hold
         self._dialect = Dialect(options.dialect)
         self._draft = self._dialect is Dialect.DRAFT
-        self.follows = ("scan",) if self._draft else ("scan", "devices", "sensor/*")
+        self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
         self._sessions: list[HqClient] = []
         self._by_name: dict[str, Shown] = {}
         self._by_number: dict[int, Shown] = {}
         self._registrations: dict[int, bytes] = {}
         self._unregistered = (metrics or Metrics()).count("hq_devices_left_out")
-        self._sectors: dict[str, float] = {}
+        self._sectors: tuple[Scan | None, dict[str, float]] = (None, {})
+        """The nearest point of each sector, and the scan that it is of."""
         self._sectoring: tuple[tuple[float, float, int], list[tuple[str, Any]]] | None = None
+        self._frames: dict[int, tuple[float, bytes]] = {}
+        """The data that was encoded last of each device."""
+        self._gone: dict[str, Reading] = {}
+        """The last readings of a robot that was lost since: nothing is known of it by them."""
+        self._scan_gone: Scan | None = None
         for device in options.devices:
             self._enter(device.name, device.number, device.kind)
 
@@ -142,9 +178,15 @@ class Wc2EcHq(HqSide):
 
     def begin(self, session: HqClient, now: float) -> None:
         self._learn()
-        self._register(session)
-        for name, value in self._values().items():
-            self._put(session, self._by_name[name], value, now)
+        self._register(session, now)
+
+    def presence(self, there: bool) -> Send | None:
+        """Show what is known of a robot that is there; of one that is lost that nothing is."""
+        if there:
+            known = ((device, self._known(device)) for device in self._by_name.values())
+            return self._data((device, value) for device, value in known if value is not None)
+        self._gone, self._scan_gone = dict(self.view.readings), self.view.scan
+        return self._data((device, FAULT) for device in self._by_name.values() if device.kind == DISTANCE)
 
     def wanted(self) -> tuple[Topic, ...]:
         if not self._draft:
@@ -152,11 +194,24 @@ class Wc2EcHq(HqSide):
         enabled = set().union(*(session.enabled for session in self._sessions if not session.over))
         return tuple(topics.SENSOR(self._by_number[number].name) for number in sorted(enabled))
 
-    def _values(self) -> dict[str, float]:
-        """Give what is known of the devices there are."""
-        readings = {name: reading.value for name, reading in self.view.readings.items()}
-        sectors = self._sectors if self.view.scan is not None else {}  # of this robot, not of one before it
-        return {name: value for name, value in {**readings, **sectors}.items() if name in self._by_name}
+    # Values
+
+    def _first(self, device: Shown) -> float | None:
+        """Give what a controller is told first of a device, which is ready only then; None of a motor."""
+        if device.motor:
+            return None
+        known = self._known(device) if self.view.missing is None else None
+        return known if known is not None else FAULT if device.kind == DISTANCE else 0.0
+
+    def _known(self, device: Shown) -> float | None:
+        """Give the last value of a device since the robot is there; None where there is none."""
+        reading, scan = self.view.readings.get(device.name), self.view.scan
+        if reading is not None and reading is not self._gone.get(device.name):
+            return _shown(device, reading.value, fault=reading.fault)
+        if scan is None or scan is self._scan_gone or self.view.protocol in (None, NAME):
+            return None
+        nearest = self._nearest(scan).get(device.name)
+        return None if nearest is None else _shown(device, nearest)
 
     # Devices
 
@@ -175,10 +230,21 @@ class Wc2EcHq(HqSide):
             if self._complete and not any(device.motor for device in self._by_name.values()):
                 self._enter(LEFT, None, ROTATIONAL)
                 self._enter(RIGHT, None, ROTATIONAL)
+        if self.view.protocol != NAME:
+            for name in self._sector_names():
+                self._enter(name, None, DISTANCE)
+
+    def _sector_names(self) -> list[str]:
+        """List the sectors there are, whether a scan has come or not: a controller without sensors is never ready."""
+        for geometry in (self.view.scan, self.view.scanner):
+            names = [name for name, _ in self._sectors_of(geometry)] if geometry is not None else []
+            if names:
+                return names
+        return [] if self.view.readings else [f"sector{number}" for number in range(self.options.sectors)]
 
     def _forget_gone(self, devices: Iterable[Device]) -> None:
         """Give up the numbers of devices that the robot had once, and that no controller knows."""
-        there = {LEFT, RIGHT, *self.view.readings, *self._sectors, *(_name(device.name) for device in devices)}
+        there = {LEFT, RIGHT, *self.view.readings, *self._sector_names(), *(_name(device.name) for device in devices)}
         known = set[int]().union(*(session.registered for session in self._sessions if not session.over))
         for name, device in tuple(self._by_name.items()):
             if name not in there and device.number not in known:
@@ -214,12 +280,16 @@ class Wc2EcHq(HqSide):
         known = digits.isdecimal() and len(digits) <= 3 and int(digits) < 256
         return types.get(kind, int(digits) if known else self.options.distance_type)
 
-    def _register(self, session: HqClient) -> None:
-        """Register what the controller does not know yet: each name once, and before any data."""
+    def _register(self, session: HqClient, now: float) -> None:
+        """Register what the controller does not know yet, each name once; a value of each sensor follows at once."""
         new = [device for device in self._by_number.values() if device.number not in session.registered]
         if new and not self._draft:
             session.outbox.put_exempt(b"".join(self._registrations[device.number] for device in new))
         session.registered.update(device.number for device in new)
+        for device in new:
+            value = self._first(device)
+            if value is not None:
+                self._stand(session, device, self._frame(device, value), now)
 
     # The robot, shown
 
@@ -228,48 +298,58 @@ class Wc2EcHq(HqSide):
             return self._reading(topics.unescape(topic.path.rpartition("/")[2]), message)
         if isinstance(message, Scan):
             return self._scan(message)
-        if isinstance(message, Devices | Status):
+        if isinstance(message, Devices | Scanner | Status):
             before = len(self._by_name)
             self._learn()
-            return (lambda session, now: self._register(session)) if len(self._by_name) > before else None
+            return self._register if len(self._by_name) > before else None
         return None
 
     def _reading(self, name: str, message: Reading) -> Send | None:
         if name not in self._by_name:
             self._learn()
         device = self._by_name.get(name)
-        return self._data(((device, message.value),)) if device is not None else None
+        if device is None or self.view.missing is not None:
+            return None
+        return self._data(((device, _shown(device, message.value, fault=message.fault)),))
 
     def _scan(self, scan: Scan) -> Send | None:
         """Cut a scan of a robot without distance sensors into sectors: the nearest point of each."""
         if self.view.protocol in (None, NAME) or not len(scan.ranges):
             return None
         self._learn()
-        values = []
-        for name, points in self._sectors_of(scan):
-            ranges = scan.ranges[points]
-            nearest = float(np.nanmin(ranges, initial=scan.range_max))
-            if not self._draft:
-                self._enter(name, None, DISTANCE)
-            self._sectors[name] = nearest / self.options.sector_unit_m
-            if name in self._by_name:
-                values.append((self._by_name[name], self._sectors[name]))
-        return self._data(values)
+        if self.view.missing is not None:
+            return None
+        shown = [(self._by_name.get(name), value) for name, value in self._nearest(scan).items()]
+        return self._data((device, _shown(device, value)) for device, value in shown if device is not None)
 
-    def _sectors_of(self, scan: Scan) -> list[tuple[str, Any]]:
-        """Give the indices of each sector that the scan covers; sector 0 is ahead, they go on counter-clockwise."""
-        geometry = (scan.angle_min, scan.angle_increment, len(scan.ranges))
+    def _nearest(self, scan: Scan) -> dict[str, float]:
+        """Give the nearest point of each sector that a scan covers, in the unit of the controllers."""
+        if self._sectors[0] is not scan:
+            measured = np.where(scan.ranges >= 0, scan.ranges, np.float32(np.nan))
+            nearest = {
+                name: float(np.nanmin(measured[points], initial=scan.range_max)) / self.options.sector_unit_m
+                for name, points in self._sectors_of(scan)
+            }
+            self._sectors = (scan, nearest)
+        return self._sectors[1]
+
+    def _sectors_of(self, scan: Scan | Scanner) -> list[tuple[str, Any]]:
+        """Give the indices of each sector that a scan covers; sector 0 is ahead, they go on counter-clockwise."""
+        count = len(scan.ranges) if isinstance(scan, Scan) else min(max(scan.points, 0), MOST_POINTS)
+        geometry = (scan.angle_min, scan.angle_increment, count)
+        if not abs(scan.angle_min) + abs(scan.angle_increment) * count < _MOST_RAD:
+            return []
         if self._sectoring is None or self._sectoring[0] != geometry:
-            angles = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+            angles = scan.angle_min + scan.angle_increment * np.arange(count)
             width = 2 * math.pi / self.options.sectors
             sectors = np.floor_divide(angles + width / 2, width).astype(np.int64) % self.options.sectors
             cut = [(f"sector{number}", np.flatnonzero(sectors == number)) for number in range(self.options.sectors)]
             self._sectoring = (geometry, [(name, points) for name, points in cut if points.size])
         return self._sectoring[1]
 
-    def _data(self, values: Iterable[tuple[Shown, float]]) -> Send | None:
+    def _data(self, values: Iterable[tuple[Shown, float | None]]) -> Send | None:
         """Encode sensor data once for every controller."""
-        frames = [(device, self._frame(device, value)) for device, value in values if math.isfinite(value)]
+        frames = [(device, self._frame(device, value)) for device, value in values if value is not None]
         if not frames:
             return None
 
@@ -280,16 +360,16 @@ class Wc2EcHq(HqSide):
         return send
 
     def _frame(self, device: Shown, value: float) -> bytes:
-        return write(SensorData(device.type, device.number, value), self._dialect)
-
-    def _put(self, session: HqClient, device: Shown, value: float, now: float) -> None:
-        if math.isfinite(value):
-            self._stand(session, device, self._frame(device, value), now)
+        last = self._frames.get(device.number)
+        if last is None or last[0] != value:
+            last = (value, write(SensorData(device.type, device.number, value), self._dialect))
+            self._frames[device.number] = last
+        return last[1]
 
     def _stand(self, session: HqClient, device: Shown, frame: bytes, now: float) -> None:
         """Let a value stand until it is written, if the controller wants it; the newest wins."""
         if device.number not in session.registered:
-            self._register(session)
+            self._register(session, now)
         if not self._draft or device.number in session.enabled:
             session.outbox.stand(f"sensor {device.number}", (frame,), now)
 
@@ -311,7 +391,23 @@ class Wc2EcHq(HqSide):
         if device.name not in session.wheels:
             raise ProtocolError(f"the robot has no motor {device.name!r} any more")
         session.wheels[device.name] = message.value
-        return ((topics.CMD_DRIVE, self._drive(**session.wheels)),)
+        session.fresh.add(device.name)
+        if session.fresh == session.wheels.keys() or not any(session.wheels.values()):
+            return self._joined(session)
+        session.joined_at = min(session.joined_at, session.said_at + self.options.join_s)
+        return self.expire(session, session.said_at)
+
+    def deadline(self, session: HqClient) -> float:
+        return session.joined_at
+
+    def expire(self, session: HqClient, now: float) -> tuple[Telemetry, ...]:
+        """Drive with what was set of the wheels: a deployed controller sets them one after the other."""
+        return self._joined(session) if now >= session.joined_at else ()
+
+    def _joined(self, session: HqClient) -> tuple[Telemetry, ...]:
+        session.fresh.clear()
+        session.joined_at = math.inf
+        return () if self._has_motors else ((topics.CMD_DRIVE, self._drive(**session.wheels)),)
 
     @property
     def _has_motors(self) -> bool:
@@ -342,6 +438,13 @@ class Wc2EcHq(HqSide):
     def _configure(self, session: HqClient, device: Shown, message: SetSensor) -> tuple[Telemetry, ...]:
         values = tuple(message.values.tolist())
         return _setting(device, SensorSetting(values=values), *values)
+
+
+def _shown(device: Shown, value: float, *, fault: bool = False) -> float | None:
+    """Give the value that a controller is shown: a fault where it is no distance; None where it is no other number."""
+    if device.kind == DISTANCE:
+        return FAULT if fault or not math.isfinite(value) else value
+    return value if math.isfinite(value) else None
 
 
 def _setting(device: Shown, setting: SensorSetting, *values: float) -> tuple[Telemetry, ...]:

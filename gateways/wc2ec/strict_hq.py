@@ -132,6 +132,8 @@ class StrictController(Judge):
         self.received: list[tuple[float, int, int, int, str | float | None]] = []
         """Monotonic seconds, command, sensor type, sensor number, name or value; good or bad."""
         self.connected = asyncio.Event()
+        self.ready = asyncio.Event()
+        """It does something: with the first data after its connection ("The gateway as Webots controller")."""
         self.devices: dict[int, tuple[int, str]] = {}
         """Type and name of what was registered, by number."""
         self.values: dict[int, float] = {}
@@ -168,12 +170,15 @@ class StrictController(Judge):
             await asyncio.get_running_loop().sock_connect(conn, (host, port))
             self._conn = conn
             self.connected.set()
+            if self.dialect == "draft":
+                self.ready.set()
             try:
                 async with asyncio.TaskGroup() as tasks:
                     self._work = tasks.create_task(self._live(conn))
             finally:
                 self._conn = None
                 self._over.set()
+                self.ready.set()
 
     async def end(self) -> None:
         """Leave, by closing the connection: there is no word for it ("Roles")."""
@@ -185,8 +190,13 @@ class StrictController(Judge):
     # Commands; all raise ConnectionError without a connection
 
     async def set(self, device: str | int, value: float) -> None:
-        """Send setValue to a device by name or number ("Dialect `deployed`" 130); KeyError if it is not registered."""
+        """Send setValue to a device by name or number ("Dialect `deployed`" 130); KeyError if it is not registered.
+
+        Before it is ready it does nothing: wait for that.
+        """
         self._only("deployed")
+        if self._conn is not None:
+            await self.ready.wait()
         names = {name: number for number, (_, name) in self.devices.items()}
         number = names[device] if isinstance(device, str) else device
         await self._send(SET_VALUE, self.devices[number][0], number, [struct.pack("<d", value)])
@@ -294,6 +304,7 @@ class StrictController(Judge):
             self._violate(f"data of type {told.node_type}: {name!r} was registered with type {node_type}: {raw}")
         if not math.isfinite(value):
             self._event(f"{value} measured by number {number}")
+        self.ready.set()
         self.values[number] = value
         self.counts[number] = self.counts.get(number, 0) + 1
 

@@ -127,7 +127,7 @@ async def churn(cycles: int, warm_up: int = WARM_UP) -> Churn:
         bench = Bench(Path(folder), stack)
         robot, port = ports(2)
         bench.simulator(robot)
-        more = "options = { quiet_s = 0 }"
+        more = "accept_hz = 10000\noptions = { quiet_s = 0 }"
         process = gateway(bench, stack, listener("v13", "tcpudp", port, more), device("tcpudp", robot))
         await soon(lambda: process.listens(1) and bench.fleet.last("r1/map"), "the robot and its listener")
         await _run(port, warm_up, Counter())

@@ -34,6 +34,10 @@ from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener,
 
 LEASE_S = 1.2
 """Seconds of neutral after which a robot is given back: short, so that the next program may have it soon."""
+LET_GO_S = 0.1
+"""Seconds between letting go of a stick and pushing it: datagrams may overtake."""
+BETWEEN_S = 0.01
+"""Seconds between the two wheels; the bytes of one take 6 ms besides. Deployed controllers take 11 to 20 ms."""
 IDLE_S = 0.3
 """Seconds between two neutrals of an external controller that idles."""
 EXCUSED = 2
@@ -51,9 +55,11 @@ class Tcp:
 
     def __init__(self, version: str, *, udp: bool) -> None:
         self.name = f"tcp{version}"
-        self.judge = TcpHq(version=version, udp=udp, lidar_sim=version != "1.1")
+        (port,) = ports(1)  # each binds one of its own, as if it had a machine of its own
+        self.judge = TcpHq(version=version, udp=udp, lidar_sim=version != "1.1", udp_port=port)
         self.protocol = "tcpudp"
-        self.options = f'options = {{ versions = ["{version}"] }}' if version != "1.3" else ""
+        listed = '"1.1", "1.2", "1.3"' if version == "1.3" else f'"{version}"'
+        self.options = f"options = {{ versions = [{listed}], client_port = {port} }}"
 
     @property
     def number(self) -> int:
@@ -63,8 +69,16 @@ class Tcp:
     def ready(self) -> bool:
         return self.judge.established.is_set()
 
+    async def ask(self) -> None:
+        """Ask for map and position, one after the other: without that a program of 1.1 is sent none."""
+        self.judge.ask_map()
+        await soon(lambda: self.judge.counts[53], "an answer to 52")
+        self.judge.ask_position()
+
     async def drive(self, forward: float) -> None:
+        self.judge.idle()  # it may not have said so yet
         self.judge.mode(2)  # joystick
+        await asyncio.sleep(LET_GO_S)
         self.judge.move(0.0, 1.0 if forward > 0 else -1.0, abs(forward))
 
     async def idle(self) -> None:
@@ -85,14 +99,14 @@ class Tcp:
 
 
 class Alf:
-    """A program of ALF in one dialect."""
+    """The driving program of ALF in one dialect."""
 
     protocol = "alf"
     number = 1
 
     def __init__(self, dialect: Dialect) -> None:
         self.name = f"alf-{dialect}"
-        self.judge = AlfHq(dialect=dialect)
+        self.judge = AlfHq(dialect=dialect, deployed="driving")
         self.options = f'options = {{ dialect = "{dialect}" }}'
         self._full = ALF_FULL[dialect]
 
@@ -110,16 +124,44 @@ class Alf:
         """Do nothing: there is no word for it."""
 
     def sees(self, robot: str) -> bool:
-        """Measurements where there is any scan, drive info of a vehicle."""
-        judge = self.judge
-        if robot == "tcpudp-1.1":  # has no scan, nor can be fed with one
-            return True
-        return judge.scanner is not None and judge.scans > 0 and (robot != "alf" or bool(judge.infos))
+        """Drive info of a vehicle."""
+        return robot != "alf" or bool(self.judge.infos)
 
     async def leave(self) -> None:
         """Say END first in one dialect; in the other the gateway does."""
         if self.judge.dialect == "binary":
             await self.judge.end()
+
+
+class AlfScanning:
+    """The scanning program of ALF, which sends no commands."""
+
+    protocol = "alf"
+    number = 1
+    name = "alf-scans"
+    options = ""
+
+    def __init__(self) -> None:
+        self.judge = AlfHq(deployed="scanning")
+
+    @property
+    def ready(self) -> bool:
+        return self.judge.connected.is_set()
+
+    async def drive(self, forward: float) -> None:
+        raise NotImplementedError
+
+    async def idle(self) -> None:
+        """Do nothing: it has no stick."""
+
+    release = idle
+
+    def sees(self, robot: str) -> bool:
+        """Measurements where there is any scan: a robot of 1.1 has none, nor can be fed with one."""
+        return robot == "tcpudp-1.1" or (self.judge.scanner is not None and self.judge.scans > 0)
+
+    async def leave(self) -> None:
+        """Stay: the gateway ends first."""
 
 
 class Ec:
@@ -128,7 +170,8 @@ class Ec:
     protocol = "wc2ec"
     number = 1
     name = "ec"
-    options = ""
+    options = "options = { join_s = 0.5 }"
+    """On a busy machine its two wheels are further apart than elsewhere."""
 
     def __init__(self) -> None:
         self.judge = StrictController(split=True)
@@ -136,7 +179,7 @@ class Ec:
 
     @property
     def ready(self) -> bool:
-        return len(self._wheels) == 2
+        return len(self._wheels) == 2 and self.judge.ready.is_set()
 
     @property
     def _wheels(self) -> list[str]:
@@ -147,6 +190,7 @@ class Ec:
         self._forward = forward
         for name in self._wheels:
             await self.judge.set(name, 10.0 * forward)
+            await asyncio.sleep(BETWEEN_S)
 
     async def idle(self) -> None:
         await self.drive(0.0)
@@ -172,13 +216,14 @@ class Ec:
             expected = sensors | {"left", "right"}
             if len(sensors) < (0 if robot == "tcpudp-1.1" else 6):
                 return False
-        return names.keys() == expected and all(names[sensor] in self.judge.values for sensor in sensors)
+        known = [self.judge.values.get(names[sensor], -1.0) >= 0.0 for sensor in sensors if sensor in names]
+        return names.keys() == expected and (robot == "tcpudp-1.1" or all(known))
 
     async def leave(self) -> None:
         """Stay: the gateway ends first."""
 
 
-Program = Tcp | Alf | Ec
+Program = Tcp | Alf | AlfScanning | Ec
 DRIVES = {"tcp1.1": 0.4, "alf-text": -0.4, "tcp1.2": 0.6, "alf-binary": -0.6, "tcp1.3": 0.8, "ec": -0.8}
 """Who drives, and at what fraction of full scale; each at its own, so that the robot can tell them apart."""
 
@@ -299,7 +344,7 @@ async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = ""
     assert robot_process.stdout is not None
     programs: list[Program] = [
         *(Tcp("1.1", udp=False), Tcp("1.2", udp=True), Tcp("1.3", udp=True)),
-        *(Alf("text"), Alf("binary"), Ec()),
+        *(Alf("text"), Alf("binary"), AlfScanning(), Ec()),
     ]
     protocol = robot.partition("-")[0]
     at = dict(zip((program.name for program in programs), ports(len(programs)), strict=True))
@@ -313,6 +358,9 @@ async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = ""
         await soon(lambda: bench.fleet.state("r1") == "established", "established")
         async with playing(*(program.judge.run(HOST, at[program.name]) for program in programs)):
             await soon(lambda: all(program.ready for program in programs), "all connected")
+            for program in programs:
+                if isinstance(program, Tcp) and program.judge.version == "1.1":
+                    await program.ask()
             ec = programs[-1]
             assert isinstance(ec, Ec)
             async with playing(ec.keep_idle()):
@@ -351,7 +399,19 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
         for name in drivers
         if DRIVES[name] not in commanded
     ]
+    turns = [row for row in report["received"] if _turns(robot, row)]
+    judgement.faults += [f"the robot was told to turn, though nobody turns: {row}" for row in turns[:3]]
     return judgement
+
+
+def _turns(robot: str, row: list[Any]) -> bool:
+    """Tell whether the robot was commanded to turn: between two wheels of a controller, for example."""
+    if robot == "alf":  # 3: speed, direction, steering, light
+        _, kind, fields = row
+        return bool(kind == 3 and fields[2])
+    if robot == "wc2ec":  # its wheels are set one by one
+        return False
+    return bool(row[2] == 12)
 
 
 def _forward(robot: str, row: list[Any]) -> float | None:

@@ -67,7 +67,7 @@ async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_b
             ranges_m = np.frombuffer(scan["ranges"], "<f4")
             assert ranges_m == pytest.approx(np.array(RANGES) / 100)
             assert (scan["angle_min"], scan["angle_increment"]) == pytest.approx((0.0, np.radians(1.0)))
-            vehicle = on.program("alf-text").judge
+            vehicle = on.program("alf-scans").judge
             assert isinstance(vehicle, AlfHq)
             assert vehicle.last_scan is not None
             assert (vehicle.last_scan.points[0], vehicle.last_scan.points[-1]) == (1200, 2995), "millimetres"
@@ -312,7 +312,7 @@ async def test_254_programs_connect_the_next_is_closed_and_when_they_have_left_t
     bench: Bench, stack: contextlib.ExitStack
 ) -> None:
     (port,) = ports(1)
-    hq = gateway(bench, stack, listener("hq", "tcpudp", port, "options = { quiet_s = 0.5 }"))
+    hq = gateway(bench, stack, listener("hq", "tcpudp", port, "accept_hz = 1000\noptions = { quiet_s = 0.5 }"))
     await soon(lambda: hq.listens(1), "the listener")
     programs, refused = await crowd(port)
     assert refused
@@ -373,10 +373,12 @@ class Replaying:
                 told.append((key, said))
         return told
 
-    async def replay(self, where: str, records: list[Record], first: bytes = b"") -> bytes:
+    async def replay(
+        self, where: str, records: list[Record], first: bytes = b"", awaited: tuple[bytes, ...] = ()
+    ) -> bytes:
         """Send what a program sent, with pauses of 0.15 s at most; give what came, of either channel.
 
-        ``first``: sent after the handshake, before all else.
+        ``first``: sent after the handshake, before all else. ``awaited``: what must come before it leaves.
         """
         port, came = self.ports[where], bytearray()
         program = await ByHand.connect(port)
@@ -396,6 +398,7 @@ class Replaying:
                     else:
                         program.writer.write(record.payload)
                 await asyncio.sleep(0.3)
+                await soon(lambda: all(one in came for one in awaited), f"{awaited}")
             await program.leave()
         await soon(lambda: self.bench.fleet.last("r1/control")["state"] == "free", "free")
         return bytes(came)
@@ -437,13 +440,12 @@ def _hq_half(where: str) -> list[Record]:
 async def test_a_captured_program_that_drives_at_once_is_told_to_let_go_first_and_drives_after_that(
     replaying: Replaying, where: str
 ) -> None:
-    came = await replaying.replay(where, _hq_half(where))
+    answers = bytes.fromhex("0e000000 01 37"), bytes.fromhex("01 35")
+    came = await replaying.replay(where, _hq_half(where), awaited=answers)
     hi, *lidar = replaying.commands()
     assert hi == HI
     assert [key for key, _ in lidar] == ["scan"] * (where == "v13")
     assert b"connected: let go of the stick first" in came
-    assert bytes.fromhex("0e000000 01 37") in came, "54 is answered"
-    assert bytes.fromhex("01 35") in came, "52 is answered"
     came = await replaying.replay(where, _hq_half(where), first=NEUTRAL)
     assert replaying.commands() == [HI, MANUAL, MOVE, TURN, STOP, *lidar]
     assert b"let go" not in came
@@ -462,5 +464,9 @@ async def test_captured_programs_of_the_other_protocols_command_what_they_say_or
     came = await replaying.replay("alf", payloads("alf-laser.hex", destination=16667))
     assert came == b"255|1;", "END is answered"
     came = await replaying.replay("ec", payloads("wc2ec-deployed.hex", destination=27515))
-    assert came == bytes.fromhex("00 35 00 04") + b"left" + bytes.fromhex("00 35 01 05") + b"right"
+    sectors = range(2, 10)
+    named = b"".join(bytes([0, 37, number, 7]) + b"sector%d" % (number - 2) for number in sectors)
+    faults = b"".join(bytes([1, 37, number]) + bytes.fromhex("000000000000f0bf") for number in sectors)
+    wheels = bytes.fromhex("00 35 00 04") + b"left" + bytes.fromhex("00 35 01 05") + b"right"
+    assert came == wheels + named + faults, "no scan has come, and it is ready all the same"
     assert replaying.commands() == []

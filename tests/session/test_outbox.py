@@ -267,8 +267,8 @@ def test_a_frame_that_waits_can_be_withdrawn_and_one_that_does_not_is_no_error()
     outbox = Outbox(0.01)
     for frame in (b"a", b"b", b"a", b"c"):
         outbox.put(frame)
-    outbox.withdraw(b"a")
-    outbox.withdraw(b"d")
+    outbox.unqueue(b"a")
+    outbox.unqueue(b"d")
     assert frames(drained(outbox, 0.0, 1.0)) == [b"b", b"c"]
 
 
@@ -370,6 +370,18 @@ def test_frames_that_go_first_are_bounded_too() -> None:
     assert outbox.take(0.0) == b"0"
     outbox.put_exempt(b"there is room again")
     assert [frame for _, frame in drained(outbox, 0.0, 1.0)][-1] == b"there is room again"
+
+
+def test_a_frame_that_goes_first_may_be_taken_back_until_it_was_given_out() -> None:
+    outbox = Outbox(0.01)
+    frames_of_handshake = bytes(4), bytes(5), bytes(4)
+    for frame in frames_of_handshake:
+        outbox.put_exempt(frame)
+    assert outbox.withdraw(frames_of_handshake[2])
+    assert not outbox.withdraw(frames_of_handshake[2])
+    assert outbox.take(0.0) is frames_of_handshake[0]
+    assert not outbox.withdraw(frames_of_handshake[0])
+    assert frames(drained(outbox, 0.01, 1.0)) == [frames_of_handshake[1]]
 
 
 def test_the_two_queues_are_bounded_each_for_itself() -> None:

@@ -44,3 +44,14 @@ def test_a_probe_prints_what_is_known() -> None:
     assert repr(probe) == "<Probe unknown>"
     probe.begin(0.0)
     assert repr(probe) == "<Probe waiting>"
+
+
+@pytest.mark.parametrize("works", [True, None])
+def test_a_probe_may_fail_whatever_was_found_out(works: bool | None) -> None:
+    probe = Probe(2.0)
+    probe.begin(10.0)
+    if works:
+        probe.settle(works=True)
+    probe.fail()
+    assert (probe.verdict, probe.deadline) == (Verdict.FAILED, math.inf)
+    assert not probe.settle(works=True)

@@ -85,6 +85,13 @@ class Outbox:
             raise NotReady(f"{self._limit} packets of the handshake wait", Code.BUSY)
         self._exempt.append(frame)
 
+    def withdraw(self, frame: bytes) -> bool:
+        """Take back a frame that :meth:`put_exempt` was given; False where it was given out already."""
+        waiting = [kept for kept in self._exempt if kept is not frame]
+        found = len(waiting) < len(self._exempt)
+        self._exempt = deque(waiting)
+        return found
+
     def stand(
         self,
         slot: str,
@@ -116,7 +123,7 @@ class Outbox:
         """Forget what stands in ``slot``."""
         self._standing.pop(slot, None)
 
-    def withdraw(self, frame: bytes) -> None:
+    def unqueue(self, frame: bytes) -> None:
         """Forget a frame that was to be sent once, as far as it still waits."""
         while frame in self._queue:
             self._queue.remove(frame)

@@ -41,6 +41,10 @@ class Probe:
         self.verdict, self.deadline = (Verdict.WORKS if works else Verdict.FAILED), math.inf
         return True
 
+    def fail(self) -> None:
+        """Use no datagrams, whatever was found out before."""
+        self.verdict, self.deadline = Verdict.FAILED, math.inf
+
     def expire(self, now: float) -> bool:
         """Tell whether the other end has just used up its time."""
         return now >= self.deadline and self.settle(works=False)

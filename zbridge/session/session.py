@@ -94,6 +94,8 @@ class Session(ABC, Generic[M]):
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
     """The message classes a session keeps for itself after the handshake too."""
+    drops_source = False
+    """Set by a protocol where what datagrams came from turns out not to be the peer; the driver obeys and clears it."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -138,9 +140,15 @@ class Session(ABC, Generic[M]):
     def accept(self, message: M, now: float) -> bool:
         """Take a message of the handshake, or of a class in ``handled``; False keeps it for the session itself."""
 
-    def claims(self, datagram: bytes) -> bool:
-        """Tell whether the first datagram of an unknown source is this session's."""
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Tell whether a datagram from a port of the peer's host that is no peer's source yet is this session's."""
         return False
+
+    def rivalled(self, now: float) -> None:
+        """Take note that another source, or session, claims what this one does: its peer has no source any more."""
+
+    def stray(self, datagram: bytes) -> None:
+        """Look at a datagram of the peer's host that nobody claimed; raise Refused with what the peer is to be told."""
 
     def timers(self) -> float:
         """Tell when :meth:`on_timer` wants to be called next; ``inf`` for never."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from gateways.alf import hq as module
 from gateways.alf.hq import AlfHq, HqClient, HqOptions
@@ -71,11 +72,11 @@ def turned(count: int) -> Scan:
 class Scene:
     """One listener, what is known of its robot, and its clients."""
 
-    def __init__(self, *, protocol: str | None = "alf", clients: int = 1, **options: Any) -> None:
+    def __init__(self, *, protocol: str | None = "alf", clients: int = 1, serve: str = "both", **options: Any) -> None:
         self.view = RobotView()
         if protocol is not None:
             self.view.note(topics.STATUS, Status("established", protocol=protocol))
-        self.side = AlfHq(HqOptions(**options), self.view)
+        self.side = AlfHq(HqOptions(serve=serve, **options), self.view)  # type: ignore[arg-type]
         self.clients: list[HqClient] = []
         for _ in range(clients):
             self.connect()
@@ -585,6 +586,10 @@ def test_commands_may_be_split_at_every_byte(dialect: str, said: bytes) -> None:
         assert scene.says(said[:cut]) + scene.says(said[cut:]) == whole
 
 
+def test_a_listener_is_auto_unless_told_otherwise() -> None:
+    assert HqOptions().serve == "auto"
+
+
 def test_what_its_programs_are_is_said_to_the_core() -> None:
     side = Scene().side
     assert (side.name, side.deadman_s, side.steers, side.hold, side.modes) == ("alf", 0.3, True, False, False)
@@ -594,7 +599,13 @@ def test_what_its_programs_are_is_said_to_the_core() -> None:
 
 
 @pytest.mark.parametrize(
-    ("serve", "kinds"), [("both", [b"2|", b"1|", b"4|"]), ("laser", [b"2|", b"1|"]), ("drive", [b"4|"])]
+    ("serve", "kinds"),
+    [
+        ("auto", [b"2|", b"1|"]),
+        ("both", [b"2|", b"1|", b"4|"]),
+        ("laser", [b"2|", b"1|"]),
+        ("drive", [b"4|"]),
+    ],
 )
 def test_a_listener_serves_what_it_was_told_to(serve: str, kinds: list[bytes]) -> None:
     scene = Scene(serve=serve, clients=0)
@@ -610,7 +621,56 @@ def test_a_listener_serves_what_it_was_told_to(serve: str, kinds: list[bytes]) -
     assert sorted(frame[:2] for frame in frames) == sorted(kinds)
 
 
-@pytest.mark.parametrize(("serve", "drives", "left_out"), [("both", 1, 0), ("drive", 1, 0), ("laser", 0, 1)])
+def shown(scene: Scene, client: int = 0) -> list[bytes]:
+    """The ids of what a client is shown of a robot that measures and moves."""
+    scene.tell(topics.SCANNER, SCANNER)
+    scene.tell(topics.SCAN, scan_of([1.0] * POINTS))
+    scene.tell(topics.MOTION, Motion())
+    return [frame[:2] for frame in scene.told(client)]
+
+
+def test_a_client_is_shown_the_laser_until_it_drives_and_drive_info_from_then_on() -> None:
+    """No deployed program bears both: the driving one stops reading, the scanning one takes a 4 as END."""
+    scene = Scene(serve="auto", clients=2)
+    assert scene.side.follows == ("scan", "scanner", "motion")
+    assert shown(scene) == [b"2|", b"1|"]
+    assert shown(scene) == [b"1|"], "no 4 however often"
+    assert len(scene.says(b"3|0|0|0|0;")) == 1
+    assert [shown(scene) for _ in range(3)] == [[b"4|"]] * 3
+    assert set(shown(scene, 1)) == {b"2|", b"1|"}, "each client for itself"
+
+
+def test_what_waited_of_the_laser_is_not_sent_to_a_client_that_drives() -> None:
+    scene = Scene(serve="auto", clients=0)
+    scene.tell(topics.SCANNER, SCANNER)
+    scene.connect()
+    scene.tell(topics.SCAN, scan_of([1.0] * POINTS))
+    scene.says(b"3|0|0|0|0;")
+    scene.tell(topics.MOTION, Motion())
+    assert scene.told() == [REST_FRAME]
+    other = replace(SCANNER, angle_min=0.0)
+    scene.tell(topics.SCANNER, other)
+    assert scene.told() == [], "another geometry is nothing for it either"
+
+
+@pytest.mark.parametrize("said", [b"3|0|0;", b"7|1;", b"3|300|0|0|0|0;", b"3|nan|0|0|0;"])
+def test_what_is_no_drive_command_changes_nothing(said: bytes) -> None:
+    scene = Scene(serve="auto")
+    scene.says(said)
+    assert shown(scene) == [b"2|", b"1|"]
+
+
+@pytest.mark.parametrize("serve", ["both", "drive", "laser"])
+def test_what_was_configured_stays_whether_the_client_drives_or_not(serve: str) -> None:
+    scene = Scene(serve=serve)
+    before = shown(scene)
+    scene.says(b"3|0|0|0|0;")
+    assert set(shown(scene)) == set(before) - {b"2|"}, "2 is sent once"
+
+
+@pytest.mark.parametrize(
+    ("serve", "drives", "left_out"), [("auto", 1, 0), ("both", 1, 0), ("drive", 1, 0), ("laser", 0, 1)]
+)
 def test_a_listener_of_the_laser_takes_no_drive_command_and_counts_it(serve: str, drives: int, left_out: int) -> None:
     scene = Scene(serve=serve)
     assert len(scene.says(b"3|255|0|0|0;")) == drives

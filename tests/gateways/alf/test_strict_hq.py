@@ -110,7 +110,7 @@ async def until(holds: Callable[[], Any], what: object) -> None:
 
 def viewer(dialect: Dialect = "text", **options: Any) -> StrictHq:
     """An HQ that sends nothing, of 5 points."""
-    return StrictHq(dialect=dialect, **{"points": POINTS, "repeat_s": None, **options})
+    return StrictHq(dialect=dialect, **{"points": POINTS, "repeat_s": None, "serves": "both", **options})
 
 
 async def after(data: bytes, hq: StrictHq) -> StrictHq:
@@ -291,12 +291,60 @@ async def test_a_vehicle_has_to_close_after_both_ends() -> None:
     assert hq.violations == ["the vehicle did not close within 0.05 s of both ENDs"]
 
 
-@pytest.mark.parametrize(("serves", "kinds"), [("drive", [2, 1]), ("laser", [4]), ("both", [])])
+@pytest.mark.parametrize(("serves", "kinds"), [("drive", [2, 1]), ("laser", [4]), ("both", []), ("auto", [4])])
 async def test_a_listener_sends_only_what_it_serves(serves: str, kinds: list[int]) -> None:
     hq = await after(INIT["text"] + SCAN["text"] + INFO["text"] + END["text"], viewer(serves=serves))
     assert [one[:40] for one in hq.violations] == [
         f"message {kind} from a listener that does not serve it"[:40] for kind in kinds
     ]
+
+
+async def test_with_auto_4_comes_after_the_first_command_and_1_and_2_before_it() -> None:
+    hq = StrictHq(points=POINTS, repeat_s=0.002, flight_s=0.0)
+    async with facing(hq) as (vehicle, _):
+        await vehicle.read_until(NEUTRAL["text"])
+        await vehicle.send(INFO["text"] + INIT["text"] + SCAN["text"] + INFO["text"])
+        await until(lambda: len(hq.infos) == 2, hq)
+    assert [one[:10] for one in hq.violations] == ["message 2 ", "message 1 "]
+
+
+async def test_what_was_on_its_way_when_the_first_command_was_sent_is_excused() -> None:
+    hq = StrictHq(points=POINTS, repeat_s=0.002, flight_s=60.0)
+    async with facing(hq) as (vehicle, _):
+        await vehicle.read_until(NEUTRAL["text"])
+        await vehicle.send(INIT["text"] + SCAN["text"] + INFO["text"])
+        await until(lambda: hq.infos, hq)
+    assert hq.violations == []
+
+
+# The deployed programs
+
+
+@pytest.mark.parametrize("serves", ["auto", "laser", "both"])
+async def test_the_scanning_program_takes_whatever_is_not_1_or_2_as_end_and_shows_nothing_more(serves: str) -> None:
+    sent = INIT["text"] + SCAN["text"] + INFO["text"] + SCAN["text"]
+    hq = await after(sent + END["text"], viewer(deployed="scanning", serves=serves))
+    assert (hq.scans, hq.infos) == (1, [])
+    assert hq.violations[-1].startswith("message 4 taken as END, it shows nothing more: ")
+    quiet = await after(sent.replace(INFO["text"], b"") + END["text"], viewer(deployed="scanning", serves=serves))
+    assert (quiet.scans, quiet.violations) == (2, [])
+
+
+async def test_the_scanning_program_sends_no_commands() -> None:
+    hq = StrictHq(deployed="scanning", repeat_s=0.002)
+    async with facing(hq) as (vehicle, task):
+        task.cancel()
+        assert await vehicle.read_to_the_end() == END["text"]
+
+
+async def test_the_driving_program_stops_reading_after_ten_measurements() -> None:
+    hq = StrictHq(points=POINTS, repeat_s=0.002, deployed="driving", serves="both")
+    async with facing(hq) as (vehicle, _), asyncio.timeout(LONG_S):
+        await vehicle.send(INIT["text"] + SCAN["text"] * 10 + INFO["text"])
+        await until(lambda: hq.scans == 10, hq)
+        await vehicle.read(100)
+    assert hq.infos == []
+    assert hq.events[0] == "it reads no more, after 10 measurements"
 
 
 # Commands
@@ -383,7 +431,7 @@ async def test_it_leaves_with_end_when_cancelled() -> None:
 
 
 async def test_it_can_stop_reading_for_good_and_goes_on_driving() -> None:
-    hq = StrictHq(points=POINTS, repeat_s=0.002, stops_reading_after=10)
+    hq = StrictHq(points=POINTS, repeat_s=0.002, stops_reading_after=10, serves="both")
     async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
         await vehicle.send(INIT["text"] + SCAN["text"] * 10 + b"1|broken;nan;" + END["text"])
         await until(lambda: hq.scans == 10, hq)

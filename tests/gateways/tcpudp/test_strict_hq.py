@@ -36,11 +36,11 @@ ANSWERS = {
 }
 VERSIONS = ("1.1", "1.2", "1.3")
 START, RECEIVED, NOT_RECEIVED = "02000000 01 04", "03000000 01 06 01", "03000000 01 06 00"
-PROBE, CONNECTED = "02000000 07 05", "03000000 07 07 01"
+PROBE, CONNECTED, NOT_CONNECTED = "02000000 07 05", "03000000 07 07 01", "03000000 07 07 00"
 TEXT = "08000000 01 01 02000000 6869"
 LIDAR_OFF = "06000000 01 33 02000000"
 POSITION = "0e000000 01 37 0000c03f 000010c0 0000b442"
-NO_MAP = "02000000 01 35"
+NO_MAP = "06000000 01 35 00000000"
 CELLS = "00010200" * 100
 MAP = "96010000 01 35 90010000" + CELLS
 GET_SCAN = "02000000 01 3c"
@@ -138,7 +138,7 @@ async def facing(hq: StrictHq) -> AsyncIterator[tuple[Robot, "asyncio.Task[None]
 
 
 def program(version: str = "1.3", **options: Any) -> StrictHq:
-    return StrictHq(version=version, **{"repeat_s": None, **options})
+    return StrictHq(version=version, **{"repeat_s": None, "unasked": True, **options})
 
 
 async def until(condition: Callable[[], object], what: object) -> None:
@@ -235,10 +235,10 @@ def test_an_hq_that_does_not_exist_is_refused(wrong: dict[str, Any]) -> None:
         StrictHq(**wrong)
 
 
-async def test_a_lost_answer_is_followed_by_true_all_the_same() -> None:
-    hq = program("1.2", times=QUICK)
+async def test_a_lost_answer_is_followed_by_true_all_the_same_in_1_3() -> None:
+    hq = program("1.3", times=QUICK)
     async with facing(hq) as (robot, _):
-        await robot.greet(SETTINGS["1.2", True])
+        await robot.greet(SETTINGS["1.3", True])
         await robot.start_udp()
         assert not hq.established.is_set()
         assert await robot.read() == raw(CONNECTED)
@@ -247,6 +247,23 @@ async def test_a_lost_answer_is_followed_by_true_all_the_same() -> None:
             await send(POSITION)
         await until(lambda: hq.counts[55] == 2, "two positions")
         assert hq.violations == []
+
+
+@pytest.mark.parametrize("version", ["1.1", "1.2"])
+async def test_a_lost_answer_makes_the_older_ones_fall_back_to_tcp(version: str) -> None:
+    hq = program(version, times=QUICK)
+    async with facing(hq) as (robot, _):
+        await robot.greet(SETTINGS[version, True])
+        await robot.start_udp()
+        assert await robot.read() == raw(NOT_CONNECTED)
+        await until(hq.established.is_set, "established")
+        hq.move(0.0, 1.0)
+        assert await robot.read() == raw(FORWARD)
+        await robot.send(POSITION)
+        await until(lambda: hq.position, "the position by TCP")
+        assert hq.violations == []
+        await robot.send_udp(POSITION)
+        await violated(hq, "packet 55 by UDP instead of TCP")
 
 
 async def test_it_reports_once() -> None:
@@ -380,11 +397,10 @@ async def test_settings_that_kill(version: str, settings: str, words: str) -> No
         ("1.3", START, "a 4 before the answer 3, or not both set the UDP flag"),
         ("1.3", NOT_RECEIVED, "a 6 that is not due"),
         ("1.2", GET_SCAN, "LidarSim was not announced"),
-        ("1.3", "02000000 02 35", "id byte 2 instead of 1"),
+        ("1.3", "06000000 02 35 00000000", "id byte 2 instead of 1"),
         ("1.3", "06000000 01 33 03000000", "lidar status 3"),
         ("1.3", "0e000000 01 37 0000c07f 000010c0 0000b442", "not finite"),
         ("1.3", "07000000 01 35 01000000 01", "1 cells of a map announced with 20 x 20"),
-        ("1.1", "06000000 01 35 00000000", "n = 0 instead of an empty body"),
         ("1.1", "0a000000 01 35 04000000 00010203", "a cell that is neither 0, 1 nor 2"),
     ],
 )
@@ -397,6 +413,32 @@ async def test_packets_that_are_wrong(version: str, text: str, words: str) -> No
         await robot.send(TEXT)
         await until(lambda: hq.texts, "it lives on")
         assert hq.alive
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [(MAP, "a 53 to an HQ 1.1 that never asked (52)"), (POSITION, "a 55 to an HQ 1.1 that never asked (54)")],
+)
+async def test_the_first_programs_of_1_1_have_no_handlers_for_what_nobody_asked_for(text: str, words: str) -> None:
+    hq = program("1.1", unasked=False)
+    async with facing(hq) as (robot, _):
+        await robot.shake("1.1")
+        await robot.send(text)
+        await violated(hq, words)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_what_was_asked_for_comes_as_it_comes(version: str) -> None:
+    hq = program(version, unasked=False)
+    async with facing(hq) as (robot, _):
+        await robot.shake(version)
+        await until(hq.established.is_set, "established")
+        hq.ask_map()
+        hq.ask_position()
+        for text in (MAP, POSITION, MAP, POSITION, TEXT):
+            await robot.send(text)
+        await until(lambda: hq.texts, "the last packet")
+        assert (hq.violations, hq.counts[53], hq.counts[55]) == ([], 2, 2)
 
 
 @pytest.mark.parametrize("version", ["1.1", "1.2"])
@@ -428,6 +470,7 @@ async def test_a_square_map_needs_no_announced_size(version: str) -> None:
         ("1.3", "06000000 01 01 00000000", "an empty text"),
         ("1.3", "0e000000 01 35 0000c03f 000010c0 0000b442", "bytes of a map"),
         ("1.3", "04000000 01 35 0100", "n = -1 and 0 bytes of a map"),
+        *[(version, "02000000 01 35", "a 53 without its int, on which it throws for good") for version in VERSIONS],
         ("1.3", "08000000 01 35 02000000 0001", "a map of 2 cells, no square"),
         ("1.3", "01000000 01 35", "its length field is wrong"),
     ],
@@ -503,19 +546,17 @@ async def test_what_was_agreed_for_udp_may_not_come_by_tcp(text: str) -> None:
         await violated(hq, "by TCP instead of UDP")
 
 
-async def test_after_a_lost_probe_nothing_may_come_by_udp() -> None:
-    hq = program()
+@pytest.mark.parametrize("version", VERSIONS)
+async def test_a_6_that_says_no_is_reproached_and_makes_the_older_ones_believe_in_udp(version: str) -> None:
+    hq = program(version)
     async with facing(hq) as (robot, _):
-        await robot.greet(SETTINGS["1.3", True])
+        await robot.greet(SETTINGS[version, True])
         await robot.start_udp()
         await robot.send(NOT_RECEIVED)
-        await told(hq, "6(false)")
+        await violated(hq, "6(false): a listener sends 6(true) or none")
         assert await robot.read() == raw(CONNECTED)
-        await robot.send(POSITION)
-        await until(lambda: hq.position, "the position by TCP")
-        assert hq.violations == []
-        await robot.send_udp(POSITION)
-        await violated(hq, "packet 55 by UDP instead of TCP")
+        hq.move(0.0, 1.0)
+        assert await robot.read_udp() == raw(FORWARD)
 
 
 @pytest.mark.parametrize("text", [TEXT, LIDAR_OFF])
@@ -562,6 +603,15 @@ async def test_it_binds_the_port_it_is_told() -> None:
     async with facing(program(udp_port=port)) as (robot, _):
         await robot.shake(udp=True)
         assert robot.source == ("127.0.0.1", port)
+
+
+async def test_it_binds_the_port_of_deployed_programs_if_it_is_free() -> None:
+    first, second = program(), program()
+    async with facing(first) as (robot, _), facing(second) as (other, _):
+        await robot.shake(udp=True)
+        await other.shake(udp=True)
+        assert robot.source[1] == 11000 or any("UDP port 11000 is taken" in event for event in first.events)
+        assert any(f"UDP port 11000 is taken, {other.source[1]} instead" in event for event in second.events)
 
 
 # One read is one packet
@@ -705,12 +755,11 @@ async def test_with_udp_agreed_the_stick_goes_by_udp_and_13_by_tcp(version: str)
 
 @pytest.mark.parametrize("version", VERSIONS)
 async def test_after_a_lost_probe_only_1_3_goes_on_by_udp(version: str) -> None:
-    hq = program(version)
+    hq = program(version, times=QUICK)
     async with facing(hq) as (robot, _):
         await robot.greet(SETTINGS[version, True])
         await robot.start_udp()
-        await robot.send(NOT_RECEIVED)
-        assert await robot.read() == raw(CONNECTED)
+        assert await robot.read() == raw(CONNECTED if version == "1.3" else NOT_CONNECTED)
         hq.move(0.0, 1.0)
         assert await (robot.read_udp() if version == "1.3" else robot.read()) == raw(FORWARD)
 

@@ -45,10 +45,12 @@ from tests.gateways.tcpudp.frames import (
     framed,
     server_settings,
 )
-from zbridge.errors import Refused
+from zbridge.errors import NotReady, Refused
 from zbridge.session.session import State
 
 POSE = ServerPosition(1.5, -2.25, 90.0)
+PORT = 11000
+"""What deployed HQ programs bind."""
 HQ_ANSWER = framed(5, 3, counted(LISTED) + bytes.fromhex("01000000000100"))
 
 
@@ -330,7 +332,7 @@ def test_the_gap_is_kept_between_datagrams_and_segments_too() -> None:
 
 
 def test_an_hq_claims_no_datagram_of_an_unknown_source() -> None:
-    assert not started().session.claims(ANSWER_TRUE)
+    assert not started().session.claims(ANSWER_TRUE, PORT)
 
 
 # The gateway as robot. Its settings leave at 0.0, those of the HQ come at 0.1 and its 4 leaves.
@@ -357,7 +359,7 @@ def served() -> Timed:
 def test_a_robot_asks_for_the_datagram_and_answers_it_by_udp() -> None:
     timed = waiting()
     assert timed.frames("tcp", 0.1) == [START]
-    assert timed.session.claims(PROBE)
+    assert timed.session.claims(PROBE, PORT)
     timed.datagram(PROBE, 0.2)
     assert timed.frames("udp") == [ANSWER_TRUE]
     assert timed.session.state is State.HANDSHAKING
@@ -379,15 +381,30 @@ def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once() -> N
     assert timed.session.transport == "tcp"
 
 
-def test_a_robot_that_gets_no_datagram_within_two_seconds_says_so_by_tcp() -> None:
+@pytest.mark.parametrize("status", [STATUS_FALSE, STATUS_TRUE])
+def test_a_robot_that_gets_no_datagram_sends_no_6_at_all(status: bytes) -> None:
+    """Any 6, false too, makes programs of 1.1 and 1.2 believe in datagrams; without one they fall back to TCP."""
     timed = waiting()
-    timed.until(2.09)
-    assert timed.frames("tcp", 0.1) == [START]
-    timed.until(2.11)
-    assert timed.frames("tcp", 0.1) == [START, ANSWER_FALSE]
+    timed.until(2.2)
     assert timed.session.state is State.HANDSHAKING
-    timed.stream(STATUS_FALSE, 2.2)
+    timed.stream(status, 2.2)
     assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+    timed.until(10.0)
+    assert timed.frames("tcp", 0.1) == [START]
+    assert timed.frames("udp") == []
+    assert timed.session.traffic.malformed == 0
+
+
+@pytest.mark.parametrize("status", [STATUS_FALSE, STATUS_TRUE])
+def test_a_report_ends_the_wait_for_the_datagram(status: bytes) -> None:
+    """A 5 counts between our 4 and its 7 only: who has reported sent its own before that."""
+    timed = waiting()
+    timed.stream(status, 1.9)
+    assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+    assert timed.session.traffic.malformed == 0
+    assert not timed.session.claims(PROBE, PORT + 1)
+    timed.until(10.0)
+    assert [frame[5] for frame in timed.frames("tcp", 0.1)] == [4]
     assert timed.frames("udp") == []
 
 
@@ -407,6 +424,7 @@ def test_a_false_status_is_believed_although_the_datagram_arrived() -> None:
     timed.datagram(PROBE, 0.2)
     timed.stream(STATUS_FALSE, 2.15)
     assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+    assert timed.session.drops_source, "who got no 6 may not have sent that 5"
     timed.session.send(POSE)
     timed.until(3.0)
     assert timed.frames("tcp", 2.15) == [POSITION]
@@ -427,18 +445,18 @@ def test_an_hq_that_never_reports_is_established_all_the_same() -> None:
         for datagram in datagrams:
             timed.datagram(datagram, 0.2)
         timed.until(10.0)
-        assert timed.session.state is State.ESTABLISHED
-        assert timed.session.transport == ("udp" if datagrams else "tcp")
+        assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+        assert timed.session.drops_source is bool(datagrams), "nobody said that this 5 was its own"
 
 
-def test_a_datagram_after_the_refusal_changes_nothing() -> None:
+def test_a_datagram_that_comes_late_is_not_answered() -> None:
     timed = waiting()
     timed.until(2.15)
-    timed.datagram(PROBE, 2.2)
+    assert not timed.session.claims(PROBE, PORT)
     timed.stream(STATUS_TRUE, 2.3)
     timed.until(10.0)
     assert timed.frames("udp") == []
-    assert timed.frames("tcp", 0.1) == [START, ANSWER_FALSE]
+    assert timed.frames("tcp", 0.1) == [START]
     assert timed.session.transport == "tcp"
 
 
@@ -470,7 +488,7 @@ def test_a_second_datagram_is_not_answered_again() -> None:
     ],
 )
 def test_a_datagram_that_is_no_probe_is_not_claimed(datagram: bytes) -> None:
-    assert not waiting().session.claims(datagram)
+    assert not waiting().session.claims(datagram, PORT)
 
 
 @pytest.mark.parametrize("sender", [5, 0, 1])
@@ -478,7 +496,7 @@ def test_a_probe_is_claimed_with_the_id_that_was_given_or_one_that_nobody_has(se
     """Recorded HQ programs write 1, others 0 until they have read the settings."""
     probe = bytes.fromhex("02000000") + bytes([sender, 5])
     timed = waiting()
-    assert timed.session.claims(probe)
+    assert timed.session.claims(probe, PORT)
     timed.datagram(probe, 0.2)
     assert timed.frames("udp") == [ANSWER_TRUE]
     assert timed.session.traffic.malformed == 0
@@ -496,64 +514,183 @@ def test_a_probe_that_is_none_is_counted_and_waited_past(datagram: bytes) -> Non
 
 def test_nothing_is_claimed_before_the_settings_of_the_hq() -> None:
     before = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
-    assert not any(before.session.claims(datagram) for datagram in (PROBE, MOVE, ROTATE, STOP))
+    assert not any(before.session.claims(datagram, PORT) for datagram in (PROBE, MOVE, ROTATE, STOP))
 
 
 def test_nothing_is_claimed_for_an_hq_that_has_no_datagrams() -> None:
     timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
     timed.stream(client_settings(block="00000000000100"), 0.1)
     assert timed.session.state is State.ESTABLISHED
-    assert not any(timed.session.claims(datagram) for datagram in (PROBE, MOVE, ROTATE, STOP))
+    assert not any(timed.session.claims(datagram, PORT) for datagram in (PROBE, MOVE, ROTATE, STOP))
+
+
+def unheard(*, client_port: int = PORT) -> Timed:
+    """A robot whose HQ's 5 was lost, and which has reported."""
+    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5, client_port=client_port))
+    timed.stream(client_settings(), 0.1)
+    timed.stream(STATUS_TRUE, 2.2)
+    assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+    return timed
 
 
 def test_motion_by_datagram_of_an_hq_whose_probe_was_lost_is_claimed_and_taken() -> None:
-    """Deployed HQ programs of 1.3 send 11, 12 and 61 by UDP whatever was agreed."""
-    timed = waiting()
-    timed.until(2.15)
-    timed.stream(STATUS_FALSE, 2.2)
-    assert timed.session.claims(MOVE)
+    """Deployed HQ programs of 1.3 send 11, 12 and 61 by UDP whatever was agreed, and bind port 11000."""
+    timed = unheard()
+    assert timed.session.claims(MOVE, PORT)
     assert timed.datagram(MOVE, 2.3) == [ClientJoystickMove(0.0, 1.0, 0.5)]
     assert timed.session.transport == "tcp", "what it can hear is not known by that"
+    assert not timed.session.claims(MOVE, PORT), "it has its source now"
+
+
+@pytest.mark.parametrize("port", [1, 10999, 11001, 40000])
+def test_motion_by_datagram_from_another_port_is_nobodys(port: int) -> None:
+    timed = unheard()
+    assert not timed.session.claims(MOVE, port)
+    assert not timed.session.claims(PROBE, port)
+    with pytest.raises(NotReady, match=r"another port than this client's are not taken \(client_port = 11000\)"):
+        timed.session.stray(MOVE)
+    assert timed.session.traffic.foreign == 1
+
+
+def test_the_port_of_the_clients_is_an_option() -> None:
+    timed = unheard(client_port=40000)
+    assert not timed.session.claims(MOVE, PORT)
+    assert timed.session.claims(MOVE, 40000)
+    assert not any(unheard(client_port=0).session.claims(MOVE, port) for port in (1, PORT))
+
+
+def test_nothing_is_bound_by_port_before_the_handshake_is_over() -> None:
+    timed = waiting()
+    assert not timed.session.claims(MOVE, PORT)
+    timed.until(2.15)
+    assert not timed.session.claims(MOVE, PORT)
+
+
+@pytest.mark.parametrize("datagram", [b"", MOVE[:-1], MOVE[:4] + b"\x06" + MOVE[5:], PROBE[:4] + b"\x00" + PROBE[5:]])
+def test_a_stray_datagram_that_does_not_bear_the_id_is_not_told(datagram: bytes) -> None:
+    unheard().session.stray(datagram)
+    served().session.stray(datagram)
+
+
+def test_a_stray_datagram_is_told_to_who_has_a_source_too_but_to_nobody_during_the_handshake() -> None:
+    with pytest.raises(NotReady):
+        served().session.stray(MOVE)
+    waiting().session.stray(PROBE)
+    waiting().session.stray(MOVE)
+
+
+# A rival source
+
+
+def test_a_probe_of_a_second_source_is_claimed_until_the_report() -> None:
+    """So it is seen that there are two of them."""
+    timed = waiting()
+    timed.datagram(PROBE, 0.2)
+    assert timed.session.claims(PROBE, PORT + 1)
+    timed.stream(STATUS_TRUE, 0.3)
+    assert not timed.session.claims(PROBE, PORT + 1)
+
+
+def rivalled(*datagrams: bytes, gap_s: float = 0.0) -> Timed:
+    """A robot that was sent a 5 by another source at 0.2, after these by the first at 0.199."""
+    timed = Timed(RobotSession(limits(gap_s), ANNOUNCED, 5))
+    timed.stream(client_settings(), 0.195)
+    for datagram in datagrams:
+        timed.datagram(datagram, 0.199)
+    timed.session.rivalled(0.2)
+    return timed
+
+
+def test_of_two_sources_that_came_before_the_6_neither_is_heard_and_no_6_is_sent() -> None:
+    """The 6 waits for the gap that the 4 began."""
+    for timed in (rivalled(PROBE, gap_s=0.01), rivalled()):
+        assert not timed.session.claims(PROBE, PORT)
+        timed.until(1.0)
+        assert timed.session.state is State.HANDSHAKING
+        timed.stream(STATUS_TRUE, 2.2)
+        assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+        assert timed.frames("udp") == []
+        assert [frame[5] for frame in timed.frames("tcp")] == [2, 4]
+        assert timed.session.left_out == {"another source of datagrams claims to be this client": 1}
+        assert timed.session.claims(MOVE, PORT), "by the port of deployed programs it may drive"
+
+
+def test_an_hq_that_was_told_that_its_datagram_came_is_let_go_when_a_second_source_claims_to_be_it() -> None:
+    timed = rivalled(PROBE)
+    assert timed.frames("udp") == [ANSWER_TRUE]
+    timed.until(1.0)
+    assert timed.session.state is State.CLOSED
+    assert timed.session.reason == "another source of datagrams claims to be this client"
+    assert not timed.session.claims(MOVE, PORT)
+
+
+def test_a_packet_from_the_port_of_deployed_programs_shows_that_the_source_may_be_somebody_elses() -> None:
+    """A 5 of 1.3 was lost, somebody else's was answered, and the 7 is true whatever happened."""
+    timed = waiting()
+    assert timed.session.claims(PROBE, PORT + 1)
+    timed.datagram(PROBE, 0.2)
+    timed.stream(STATUS_TRUE, 0.3)
+    assert not timed.session.claims(MOVE, PORT + 2), "of no port but that one"
+    assert timed.session.claims(MOVE, PORT)
+    timed.session.rivalled(0.4)
+    assert not timed.session.claims(MOVE, PORT), "neither is heard any more"
+    assert not timed.session.claims(MOVE, PORT + 1)
+    assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
+
+
+def test_nothing_but_a_probe_is_taken_by_datagram_before_the_report() -> None:
+    """Whose source it is only the 7 tells: until then nobody drives by it, in whoever's name."""
+    timed = waiting()
+    timed.datagram(PROBE, 0.2)
+    assert timed.datagram(MOVE, 0.25) == []
+    assert timed.datagram(STOP, 0.26) == []
+    assert timed.session.traffic.malformed == 2
+    timed.stream(STATUS_TRUE, 0.3)
+    assert timed.datagram(MOVE, 0.4) == [ClientJoystickMove(0.0, 1.0, 0.5)]
+
+
+@pytest.mark.parametrize("sender", [0, 1])
+def test_a_source_may_leave_the_id_out_but_not_bear_another(sender: int) -> None:
+    timed = served()
+    assert timed.datagram(MOVE[:4] + bytes([sender]) + MOVE[5:], 0.4) == [ClientJoystickMove(0.0, 1.0, 0.5)]
+    assert timed.datagram(MOVE[:4] + b"\x06" + MOVE[5:], 0.5) == []
+    assert timed.session.traffic.malformed == 1
 
 
 @pytest.mark.parametrize("sender", [0, 1, 4, 6, 255])
 def test_motion_by_datagram_with_another_id_is_nobodys_after_the_probe(sender: int) -> None:
-    timed = waiting()
-    timed.until(2.15)
-    assert not timed.session.claims(MOVE[:4] + bytes([sender]) + MOVE[5:])
-    assert not timed.session.claims(PROBE[:4] + bytes([sender]) + PROBE[5:])
+    timed = unheard()
+    assert not timed.session.claims(MOVE[:4] + bytes([sender]) + MOVE[5:], PORT)
+    assert not timed.session.claims(PROBE[:4] + bytes([sender]) + PROBE[5:], PORT)
 
 
 @pytest.mark.parametrize("packet_id", [2, 4, 6, 31, 51, 53, 55, 60])
 def test_a_datagram_of_our_own_side_is_never_claimed(packet_id: int) -> None:
-    assert not served().session.claims(bytes.fromhex("02000000 05") + bytes([packet_id]))
+    for timed in (waiting(), served(), unheard()):
+        assert not timed.session.claims(bytes.fromhex("02000000 05") + bytes([packet_id]), PORT)
 
 
 def test_a_probe_by_tcp_is_refused() -> None:
     timed = waiting()
     timed.stream(PROBE, 0.2)
     assert timed.session.traffic.malformed == 1
-    timed.until(2.15)
-    assert timed.frames("tcp", 0.1) == [START, ANSWER_FALSE]
+    timed.until(6.0)
+    assert timed.frames("tcp", 0.1) == [START]
     assert timed.frames("udp") == []
 
 
 def test_a_report_that_was_not_due_is_counted() -> None:
-    timed = waiting()
-    timed.stream(STATUS_TRUE, 0.15)
-    assert timed.session.state is State.HANDSHAKING
-    assert timed.session.traffic.malformed == 1
     again = served()
     again.stream(STATUS_FALSE, 0.5)
     assert again.session.traffic.malformed == 1
     assert again.session.transport == "udp"
 
 
-def test_motion_is_taken_by_either_channel_before_and_after_the_report() -> None:
+def test_motion_is_taken_by_either_channel_after_the_report() -> None:
     timed = waiting()
     timed.datagram(PROBE, 0.2)
     move, rotate = ClientJoystickMove(0.0, 1.0, 0.5), ClientJoystickRotate(-0.75)
-    assert timed.datagram(MOVE, 0.25) == [move]
+    assert timed.stream(MOVE, 0.25) == [move]
     timed.stream(STATUS_TRUE, 0.3)
     assert timed.datagram(MOVE, 0.4) == [move]
     assert timed.stream(ROTATE, 0.5) == [rotate]

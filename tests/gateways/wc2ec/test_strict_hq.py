@@ -244,8 +244,7 @@ async def test_a_reset_is_an_event_too() -> None:
 async def test_a_motor_is_set_by_name_or_number(split: bool) -> None:
     controller = StrictController(split=split)
     async with facing(controller) as (webots, _):
-        await webots.send(REGISTRATIONS)
-        await until(lambda: len(controller.devices) == 3, controller)
+        await webots.send(REGISTRATIONS + DATA)
         await controller.set("wheel1", 1.5)
         await controller.set(4, 0.25)
         assert await webots.read(22) == bytes.fromhex(
@@ -255,12 +254,37 @@ async def test_a_motor_is_set_by_name_or_number(split: bool) -> None:
             await controller.set("wheel9", 1.0)
 
 
+async def test_it_does_nothing_before_the_first_data() -> None:
+    controller = StrictController()
+    async with facing(controller) as (webots, _):
+        await webots.send(REGISTRATIONS)
+        await until(lambda: len(controller.devices) == 3, controller)
+        task = asyncio.create_task(controller.set("wheel1", 1.5))
+        await asyncio.sleep(0.02)
+        assert (controller.ready.is_set(), task.done()) == (False, False)
+        await webots.send(DATA)
+        assert await webots.read(11) == bytes.fromhex("82 35 00 00 00 00 00 00 00 f8 3f")
+        await task
+        assert controller.ready.is_set()
+
+
+async def test_one_that_never_got_ready_has_no_connection_when_that_is_over() -> None:
+    controller = StrictController()
+    async with facing(controller) as (webots, _):
+        await webots.send(REGISTRATIONS)
+        await until(lambda: len(controller.devices) == 3, controller)
+        task = asyncio.create_task(controller.set("wheel1", 1.5))
+        await asyncio.sleep(0)
+        webots.close()
+        with pytest.raises(ConnectionError):
+            await task
+
+
 async def test_a_split_command_goes_in_four_writes() -> None:
     controller = StrictController(split=True)
     sizes: list[int] = []
     async with facing(controller) as (webots, _):
-        await webots.send(WHEEL1)
-        await until(lambda: controller.devices, controller)
+        await webots.send(WHEEL1 + MID_FRONT + DATA)
         task = asyncio.create_task(controller.set(0, 1.5))
         while sum(sizes) < 11:
             sizes.append(len(await webots.recv()))

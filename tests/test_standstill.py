@@ -10,6 +10,7 @@ from zbridge.link import STALLED_S
 
 STOP = bytes.fromhex("02000000 02 0d")
 """Packet 13 to client id 2 (tcpudp.md, "Framing"): length 2, id, packet id."""
+MODE_NONE = bytes.fromhex("06000000 02 0a 01000000")
 FORWARD = {"forward": 1.0}
 NO_JOYSTICK = bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000000000")
 """serverSettings of a 1.1 robot that announces nothing."""
@@ -79,6 +80,20 @@ async def test_a_robot_in_autonomous_mode_is_left_alone_until_another_mode() -> 
         rig.command("mode", {"mode": "manual"})
         await asyncio.sleep(10.0)
         assert 9 <= rig.written().count(STOP) <= 11
+
+
+@jumping
+async def test_neutral_ends_autonomous_mode_and_the_stop_after_it_is_the_pair() -> None:
+    """tcpudp.md, "Translation": once the gateway sent mode 3, every stop is 1, 13."""
+    async with established(idle_stop_s=1.0) as rig:
+        rig.hold()
+        rig.command("mode", {"mode": "autonomous"})
+        await asyncio.sleep(0.5)
+        rig.command("drive", NEUTRAL)
+        await asyncio.sleep(3.0)
+        rig.forget_written()
+        await asyncio.sleep(5.0)
+        assert rig.written()[:4] == [MODE_NONE, STOP, MODE_NONE, STOP]
 
 
 @jumping

@@ -87,7 +87,7 @@ class Authority:
         self.on_its_own = False
         """Whether the robot may have moved by itself since its last stop: no deadman, but every other stop."""
         self._autonomous = False
-        """Whether its mode is autonomous now."""
+        """Whether its mode is autonomous, since its last stop or neutral."""
         self._opaque = False
         """Whether it was sent what nobody here can read, since its last stop or neutral: it may move by that."""
         self.verifier: Verifier | None = None
@@ -185,7 +185,8 @@ class Authority:
             self._moving.add(part)
         else:
             self._moving.discard(part)
-            self._opaque = self._opaque and bool(self._moving)
+            if not self._moving:  # neutral takes the robot out of its mode too
+                self._autonomous = self._opaque = False
             self._held_back = None
         deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
         self._stop_at = now + deadman_s if self._moving else math.inf

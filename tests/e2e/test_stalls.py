@@ -11,24 +11,18 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.loss import NotHereError, apart
-from tests.e2e.stalls import LIMIT_S, Case, Outcome, measure
+from tests.e2e.stalls import LIMIT_S, Case, measure
 
 STALLED = ("tcpudp-1.3", "alf", "wc2ec")
 
 
-@pytest.fixture(scope="module")
-def outcomes() -> dict[str, Outcome]:
-    """One stall of 2.5 s of each robot, all at the same time."""
-    cases = [Case(robot, "stall", 2.5) for robot in STALLED]
-    return {outcome.case.robot: outcome for outcome in asyncio.run(measure(cases, repetitions=1))}
-
-
-@pytest.mark.parametrize("robot", STALLED)
-def test_a_robot_that_stalls_while_it_is_driven_is_at_rest_after_it(outcomes: dict[str, Outcome], robot: str) -> None:
-    outcome = outcomes[robot]
-    assert outcome.faults == []
-    assert outcome.rest_s is not None, f"the robot drove on; {outcome}"
-    assert outcome.rest_s <= LIMIT_S, outcome
+def test_robots_that_stall_while_they_are_driven_are_at_rest_after_it() -> None:
+    outcomes = asyncio.run(measure([Case(robot, "stall", 2.5) for robot in STALLED], repetitions=1))
+    assert sorted(outcome.case.robot for outcome in outcomes) == sorted(STALLED)
+    for outcome in outcomes:
+        assert outcome.faults == []
+        assert outcome.rest_s is not None, f"the robot drove on; {outcome}"
+        assert outcome.rest_s <= LIMIT_S, outcome
 
 
 def test_a_robot_whose_link_was_cut_while_it_was_driven_is_at_rest_after_it(tmp_path: Path) -> None:

@@ -27,7 +27,6 @@ Channel = Literal["tcp", "udp"]
 
 _TICK_S = 0.02
 _DATAGRAM_BYTES = 65536
-_SEND_S = 5.0
 _BIND_TRIES = 20
 _FROZEN_KEPT = 16
 _LATE_S = 0.1
@@ -232,10 +231,10 @@ class StrictRobot(Judge):
             self._send_datagram(data)
         elif (conn := self._conn) is not None:
             try:
-                async with asyncio.timeout(_SEND_S), self._sending:
+                async with asyncio.timeout(self._times.send_s), self._sending:
                     await asyncio.get_running_loop().sock_sendall(conn, data)
             except TimeoutError:
-                self._event(f"the HQ read nothing for {_SEND_S:g} s")
+                self._event(f"the HQ read nothing for {self._times.send_s:g} s")
                 conn.shutdown(socket.SHUT_RDWR)
             except ConnectionResetError as error:
                 self._broken = error

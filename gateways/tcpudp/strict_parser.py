@@ -85,6 +85,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Mean time between packets sent unasked; 0: nothing unasked."""
     flight_s: float = 0.1
     """How long what the HQ sent before it could know better may still arrive."""
+    send_s: float = 5.0
+    """Longest wait for its own send."""
 
 
 class HqTimes(msgspec.Struct, frozen=True, kw_only=True):

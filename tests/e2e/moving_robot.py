@@ -30,13 +30,14 @@ from zbridge.judge import Judge
 WHEEL_M, FULL_M_S = 0.05, 0.5
 """Radius of a Webots robot's wheels and its full speed; the gateway is configured with the same."""
 SEND_S = 60.0
-"""A vehicle or a simulation waits for its send as long as its kernel does: deployed ones block in it."""
+"""A robot waits for its send as long as its kernel does: deployed ones block in it."""
 
 HELD_UP_S = 0.1
 """Seconds of one send after which a robot's program counts as held up by it."""
 GOES_ON = "on"
 """The word after the time at which such a program goes on."""
 
+_TCPUDP = tcpudp_wire.Times(send_s=SEND_S)
 _ALF = alf_wire.Times(send_s=SEND_S)
 _WC2EC = wc2ec_wire.Times(send_s=SEND_S)
 
@@ -91,7 +92,7 @@ class _Wheels(wc2ec_wire.Robot):
 
 def _package(version: str, udp: bool) -> Callable[[Tell, int], tuple[Judge, Serve]]:
     def make(tell: Tell, seed: int) -> tuple[Judge, Serve]:
-        robot = StrictRobot(version=version, udp=udp, seed=seed)
+        robot = StrictRobot(version=version, udp=udp, seed=seed, times=_TCPUDP)
         robot.machine = _Package(tell, seed)
         return robot, robot.serve
 

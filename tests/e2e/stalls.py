@@ -598,7 +598,7 @@ class Sitting:
             await asyncio.wait_for(self._robot.process.wait(), 5)
         await asyncio.sleep(0)
         report = self._robot.report
-        self.outcome.judge = {key: value[:5] if isinstance(value, list) else value for key, value in report.items()}
+        self.outcome.judge = {key: value[-5:] if isinstance(value, list) else value for key, value in report.items()}
         if not report.get("alive", True):
             self.outcome.faults.append(f"the robot died: {report['violations'][-1:]}")
         lost = [event for event in report.get("events", ()) if "connection" in event or "controller left" in event]

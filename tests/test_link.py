@@ -574,7 +574,7 @@ async def test_a_source_that_is_dropped_is_nobodys_until_it_is_claimed_again() -
             assert (await heard_by(two))[0] == b"six"
 
 
-async def test_a_link_that_has_claimed_nothing_sends_datagrams_nowhere() -> None:
+async def test_a_link_that_has_claimed_nothing_sends_datagrams_nowhere(all_heard: None) -> None:
     async with served(b"a") as serving:
         with sources(1) as (source,):
             serving.links(0).write_datagram(b"early")
@@ -656,7 +656,39 @@ async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
     assert (near.datagrams, far.datagrams, foreign.value) == ([], [b"a5"], 1)
 
 
-async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link() -> None:
+@pytest.fixture
+def all_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Look at every datagram, however soon after one that nobody claimed."""
+    monkeypatch.setattr(links, "STRAY_S", 0.0)
+
+
+async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() -> None:
+    """So a flood costs little, however many links its host has."""
+    foreign = Count()
+    hub, recorder = DatagramHub(foreign), Recorder(b"a")
+    hub.add(FakeLink(), "10.0.0.1", recorder)
+    for _ in range(1000):
+        hub._take(b"b5", ("10.0.0.1", 1))
+    assert (recorder.asked, recorder.stray, foreign.value) == ([1], [b"b5"], 1000)
+    hub._take(b"a5", ("10.0.0.1", 2))
+    assert recorder.datagrams == [b"a5"], "another source is heard"
+    await asyncio.sleep(links.STRAY_S)
+    hub._take(b"b5", ("10.0.0.1", 1))
+    assert recorder.stray == [b"b5", b"b5"]
+
+
+async def test_what_links_are_shown_of_strays_and_what_is_kept_of_them_is_bounded() -> None:
+    foreign = Count()
+    hub, recorder = DatagramHub(foreign), Recorder(b"a")
+    hub.add(FakeLink(), "10.0.0.1", recorder)
+    for port in range(5000):
+        hub._take(b"b5", ("10.0.0.1", port))
+    assert len(recorder.asked) == foreign.value == 5000
+    assert links.STRAYS_HZ <= len(recorder.stray) <= 10 * links.STRAYS_HZ
+    assert len(hub._deaf_until) <= links.STRAY_SOURCES
+
+
+async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link(all_heard: None) -> None:
     foreign = Count()
     hub, recorder, link = DatagramHub(foreign), Recorder(b"a"), FakeLink()
     hub.add(link, "10.0.0.1", recorder)

@@ -1322,3 +1322,83 @@ async def test_every_client_is_shown_once_that_the_robot_is_lost_and_that_it_is_
             scene.go()
             assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
             assert silent.heard() == [], "nothing before the handshake"
+
+
+# A protocol that fails at what it does not know
+
+
+class LostSide(ToySide):
+    """A protocol of another package that has never met this robot."""
+
+    def begin(self, session: ToySession, now: float) -> None:
+        session.send({"toy": b"welcome"}[self.view.protocol or ""])
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        return {"text": super().show}[topic.path](topic, message)
+
+    def take(self, session: ToySession, message: bytes) -> tuple[Telemetry, ...]:
+        return (_TAKEN[message],)
+
+    def presence(self, there: bool) -> Send:
+        raise KeyError(there)
+
+
+@jumping
+async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(Scene, "side_class", LostSide)
+        async with serving() as scene:
+            scene.say(topics.STATUS, Status(state="established", protocol="unheard of"))
+            program = scene.connect()
+            program.say(b"hi")
+            assert program.heard() == [b"who are you"], "and no welcome"
+            for x in range(50):
+                scene.say(topics.POSE, Pose(x=float(x), y=0.0, heading=0.0))
+                program.say(b"what is this")
+            scene.say(topics.TEXT, Text("hello"))
+            assert program.heard() == [b"hello"]
+            program.say(b"stand", b"go")
+            await soon()
+            assert [message for _, message in scene.gateway.taken()] == [Drive(forward=0.5)]
+            scene.go()
+            scene.come()
+            assert scene.reason("toy.2") is None
+            assert scene.count("hq_left_out") >= 1 + 50 + 50 + 2
+            assert scene.count("hq_malformed") == 50
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert sorted(errors) == [
+        "toy: a client not sent: KeyError('unheard of'); going on without",
+        "toy: pose not shown: KeyError('pose'); going on without",
+        "toy: status not shown: KeyError('status'); going on without",
+        "toy: the robot's presence not shown: KeyError(True); going on without",
+        "toy: what a client said not taken: KeyError(b'what is this'); going on without",
+    ]
+
+
+class SessionlessSide(ToySide):
+    def session(self, number: int, bounds: Limits) -> ToySession:
+        raise KeyError(self.view.protocol)
+
+
+@jumping
+async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(Scene, "side_class", SessionlessSide)
+        async with serving() as scene:
+            for _ in range(5):
+                assert scene.connect().link.closed
+            assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
+            assert repr(scene.listener._ids) == "<ClientIds 0 of 254 taken>"
+
+
+@jumping
+async def test_a_question_that_no_robot_is_asked_is_refused() -> None:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setitem(_TAKEN, b"sessions?", (topics.RPC_SESSIONS("x"), Query()))
+        async with serving() as scene:
+            program = scene.connect().greeted()
+            program.say(b"sessions?")
+            await soon()
+            assert program.heard() == [b"! robots are not asked for @rpc/sessions/x"]

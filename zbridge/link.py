@@ -21,6 +21,7 @@ import msgspec
 
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
+from zbridge.session.allowance import Allowance
 from zbridge.session.backlog import Backlog
 
 log = logging.getLogger("zbridge.link")
@@ -396,6 +397,12 @@ async def listen(
 _DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
 """Most datagrams taken from a socket before the loop serves others."""
+STRAYS_HZ = 20.0
+"""Datagrams a second of one host that nobody claimed and that are shown to its links; the others are counted."""
+STRAY_S = 0.02
+"""Seconds for which a source is not listened to after a datagram that nobody claimed: a flood costs little."""
+STRAY_SOURCES = 1024
+"""Such sources that are kept; of more, all are forgotten."""
 _DRAINED = 1024
 """Most datagrams taken before a stream is read: more than a socket's buffer holds by default."""
 
@@ -480,6 +487,8 @@ class DatagramHub(_DatagramReader):
     def __init__(self, foreign: Count) -> None:
         super().__init__()
         self._hosts: dict[str, dict[Link, Receiver]] = {}
+        self._strays: dict[str, Allowance] = {}
+        self._deaf_until: dict[tuple[str, int], float] = {}
         self._owners: dict[tuple[str, int], tuple[Link, Receiver]] = {}
         self._sources: dict[Link, tuple[str, int]] = {}
         self._foreign = foreign
@@ -491,13 +500,14 @@ class DatagramHub(_DatagramReader):
     def add(self, link: Link, host: str, receiver: Receiver) -> None:
         """Let a link have the datagrams of its host that it claims."""
         self._hosts.setdefault(host, {})[link] = receiver
+        self._strays.setdefault(host, Allowance(STRAYS_HZ))
 
     def remove(self, link: Link) -> None:
         """Forget a link and its source; idempotent."""
         for host, links in tuple(self._hosts.items()):
             links.pop(link, None)
             if not links:
-                del self._hosts[host]
+                del self._hosts[host], self._strays[host]
         self.unbind(link)
 
     def unbind(self, link: Link) -> None:
@@ -517,6 +527,10 @@ class DatagramHub(_DatagramReader):
         if owner is not None:
             owner[1].received_datagram(data)
             return
+        now = self._loop.time()
+        if now < self._deaf_until.get(source, now):
+            self._foreign.value += 1
+            return
         peers = tuple(self._hosts.get(source[0], {}).items())
         claiming = [(link, receiver) for link, receiver in peers if receiver.claims(data, source[1])]
         if len(claiming) == 1 and claiming[0][0] not in self._sources:
@@ -525,11 +539,20 @@ class DatagramHub(_DatagramReader):
             claiming[0][1].received_datagram(data)
             return
         self._foreign.value += 1
-        for link, receiver in claiming:
-            self.unbind(link)
-            receiver.rivalled()
-        if not claiming:
-            for _, receiver in peers:
+        if claiming:
+            for link, receiver in claiming:
+                self.unbind(link)
+                receiver.rivalled()
+        elif peers:
+            self._note_stray(data, source, now)
+
+    def _note_stray(self, data: bytes, source: tuple[str, int], now: float) -> None:
+        """Show a datagram that nobody claimed to the links of its host; do not listen to its source for a moment."""
+        if len(self._deaf_until) >= STRAY_SOURCES:
+            self._deaf_until.clear()
+        self._deaf_until[source] = now + STRAY_S
+        if self._strays[source[0]].take(now):
+            for receiver in tuple(self._hosts[source[0]].values()):
                 receiver.stray_datagram(data)
 
 

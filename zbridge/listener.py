@@ -17,7 +17,7 @@ from zbridge.audience import Audience
 from zbridge.bus import Bus
 from zbridge.config import ListenerPlan
 from zbridge.conversation import Accepted, Conversation
-from zbridge.errors import BusError, EncodeError, PayloadError, ProtocolError, Refused
+from zbridge.errors import BusError, EncodeError, PayloadError, ProtocolError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Status
@@ -46,6 +46,8 @@ ANSWER_S = 2.5
 """Longest time a client's question waits for the robot's answer."""
 LEAVE_S = 0.7
 """Longest time clients are given to hear that the listener ends, and the robot's gateway to hear of it."""
+BROKEN = 64
+"""Different things a protocol failed at that are logged; the others are counted."""
 ATTEND_EVERY = 64
 """Clients that are written to between two looks at the stops and commands that wait."""
 FROZEN_S = 0.6
@@ -123,6 +125,7 @@ class Listener:
         self._stale_until = -math.inf
         self._arrivals = Arrivals(plan.settings.accept_hz)
         self._life = Folding()
+        self._broken: set[tuple[str, type[Exception]]] = set()
         self._limits = Limits(
             frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
         )
@@ -214,8 +217,14 @@ class Listener:
         if number is None:
             self._turn_away(link, host, reason or _FULL)
             return None
+        try:
+            session = self._side.session(number, self._limits)
+        except Exception as error:
+            self._leave_out("no session for a client", error)
+            self._ids.release(number, self._clock(), rests=False)
+            self._turn_away(link, host, "the listener cannot serve the robot")
+            return None
         self._accepted.value += 1
-        session = self._side.session(number, self._limits)
         session.name = f"{self.name}.{number}"
         client = self.clients[number] = Client(number, host, session)
         client.helm = self._helm(client)
@@ -331,9 +340,8 @@ class Listener:
             return
         try:
             send = self._side.show(topic, message)
-        except (EncodeError, ProtocolError) as error:
-            self._left_out.value += 1
-            log.debug("%s: %s not shown: %s", self.name, topic.path, error)
+        except Exception as error:
+            self._leave_out(f"{topic.path} not shown", error)
             return
         self._show(send)
 
@@ -346,6 +354,19 @@ class Listener:
                 self._bus.attend()
             if client.begun and not client.session.over:
                 self._send(client, send)
+
+    def _leave_out(self, what: str, error: Exception) -> None:
+        """Go on without what the protocol cannot show or take; what is not its own refusal is logged once, in full.
+
+        A robot may be of a protocol that this one knows nothing of, and both of packages that never met.
+        """
+        self._left_out.value += 1
+        kind = (what, type(error))
+        if isinstance(error, EncodeError | ProtocolError):
+            log.debug("%s: %s: %s", self.name, what, error)
+        elif kind not in self._broken and len(self._broken) < BROKEN:
+            self._broken.add(kind)
+            log.error("%s: %s: %r; going on without", self.name, what, error, exc_info=error)
 
     def _on_gateway(self, alive: bool) -> None:
         self._tell_of_robot()
@@ -361,8 +382,16 @@ class Listener:
             for client in tuple(self.clients.values()):
                 client.told.pop(text, None)
                 self._tell(client, text)
-            self._show(self._side.presence(missing is None))
+            self._show_presence(missing is None)
         self._missing = missing
+
+    def _show_presence(self, there: bool) -> None:
+        try:
+            send = self._side.presence(there)
+        except Exception as error:
+            self._leave_out("the robot's presence not shown", error)
+            return
+        self._show(send)
 
     def _send(self, client: Client, send: Send) -> None:
         """Let a client have something, as far as its queue takes it."""
@@ -371,9 +400,8 @@ class Listener:
         except Refused:
             client.session.traffic.dropped += 1
             self._dropped.value += 1
-        except (EncodeError, ProtocolError) as error:
-            self._left_out.value += 1
-            log.debug("%s: client %d not sent: %s", self.name, client.number, error)
+        except Exception as error:
+            self._leave_out("a client not sent", error)
         client.conversation.pump()
 
     def _tell(self, client: Client, text: str) -> None:
@@ -396,6 +424,9 @@ class Listener:
                     self._carry_out(client, topic, command)
             except (ProtocolError, EncodeError) as error:
                 client.session.malformed(str(error))
+            except Exception as error:
+                client.session.malformed(repr(error))
+                self._leave_out("what a client said not taken", error)
         if stale:
             intent.refused(_STOOD_STILL)
         if client.helm.active:
@@ -414,10 +445,13 @@ class Listener:
 
     def _on_due(self, client: Client) -> None:
         client.due, client.timer = math.inf, None
-        for topic, command in self._side.expire(client.session, self._clock()):
-            if self._stale():
-                client.helm.intent.refused(_STOOD_STILL)
-            self._carry_out(client, topic, command)
+        try:
+            for topic, command in self._side.expire(client.session, self._clock()):
+                if self._stale():
+                    client.helm.intent.refused(_STOOD_STILL)
+                self._carry_out(client, topic, command)
+        except Exception as error:
+            self._leave_out("what a client said not taken", error)
         if client.helm.active:
             self._active.add(client)
         self._set_timer(client, self._side.deadline(client.session))
@@ -451,6 +485,8 @@ class Listener:
 
     def _ask(self, client: Client, topic: Topic) -> None:
         """Ask the robot for a client; who asks the same meanwhile gets the same answer."""
+        if topic.path not in _ANSWERED:
+            raise Unsupported(f"robots are not asked for {topic.path}")
         asking = self._asked.get(topic.path)
         if asking is None:
             self._asked[topic.path] = [client]

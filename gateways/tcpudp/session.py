@@ -371,6 +371,8 @@ _FROM_HQ: dict[int, Decode] = {
 _NOBODYS_IDS = (0, SERVER_ID)
 """The ``id`` bytes that no client is given."""
 _NO_HEADER = (-1, -1)
+_HANDSHAKING, _ESTABLISHED = State.HANDSHAKING, State.ESTABLISHED
+"""As plain names: every client of a host is asked about every datagram that is nobody's."""
 
 
 def _header(datagram: bytes) -> tuple[int, int]:
@@ -466,11 +468,10 @@ class RobotSession(_TcpUdpSession):
 
     def claims(self, datagram: bytes, port: int) -> bool:
         """Claim a 5 between our 4 and its 7; later a packet with its id from its port."""
-        claims = False
-        if self.state is State.HANDSHAKING:
-            claims = self._claims_probe(datagram)
-        elif self.state is State.ESTABLISHED and port == self._client_port and not self._contested:
-            claims = self._claims_late(datagram)
+        if self.state is _ESTABLISHED:
+            claims = port == self._client_port and not self._contested and self._claims_late(datagram)
+        else:
+            claims = self.state is _HANDSHAKING and self._claims_probe(datagram)
         if claims and not self._sourced:
             self._port = port
         return claims

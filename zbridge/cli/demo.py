@@ -31,7 +31,7 @@ from zbridge.fleet.messages import Control, Pose, Status
 from zbridge.fleet.topics import split_key
 from zbridge.gateway import until_signal
 from zbridge.metrics import Metrics
-from zbridge.protocol import find_protocol, protocol_names
+from zbridge.protocol import Protocol, find_protocol, protocol_names
 from zbridge.text import shown
 
 REFRESH_S = 0.5
@@ -114,7 +114,7 @@ async def run_demo(seconds: float) -> None:
         print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}")  # noqa: T201
         print("HQ programs connect to a robot here, for example one to play with:")  # noqa: T201
         for robot, protocol in robots.items():
-            print(f"  {robot}: zbridge simulate {protocol} --hq {listeners[robot]}")  # noqa: T201
+            print(f"  {robot}: {_how_to_connect(find_protocol(protocol), listeners[robot])}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
         for gateway in gateways:  # all at once: each takes its time to leave its robot standing
             with contextlib.suppress(ProcessLookupError):
@@ -124,6 +124,13 @@ async def run_demo(seconds: float) -> None:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
                 print(shown(line), file=sys.stderr)  # noqa: T201
             raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words are above")
+
+
+def _how_to_connect(protocol: Protocol, listener: str) -> str:
+    """Say how an HQ program comes to the robot; a protocol of another package may have none, or none to play with."""
+    if protocol.hq is None:
+        return "serves no HQ programs"
+    return f"zbridge simulate {protocol.name} --hq {listener}" if protocol.simulate_hq is not None else listener
 
 
 async def _router() -> tuple[Bus, str]:
@@ -162,11 +169,11 @@ async def _robot(
         if not addresses:
             raise ZbridgeError(f"the {protocol} simulator did not start")
         file = folder / f"{robot}.toml"
+        serving = f'[[hq]]\nprotocol = "{protocol}"\nlisten = "{listener}"\n' if found.hq is not None else ""
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
             f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
-            f'[[hq]]\nprotocol = "{protocol}"\nlisten = "{listener}"\n'
-            f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
+            f'{serving}[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
         async with _process(log, "run", str(file)) as gateway:
             yield gateway

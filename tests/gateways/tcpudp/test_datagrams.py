@@ -19,6 +19,7 @@ from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp import session as sessions
 from gateways.tcpudp.hq import HqOptions
 from tests.test_helm import Gateway
+from zbridge import link
 from zbridge.audience import Audience
 from zbridge.bus.fake import FakeBus
 from zbridge.config import HqSettings, ListenerPlan
@@ -60,7 +61,9 @@ def move(sender: int) -> bytes:
 
 @pytest.fixture(autouse=True)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait less for a 5, and look at every datagram of an attacker, however fast they come."""
     monkeypatch.setattr(sessions, "PROBE_S", PROBE_S)
+    monkeypatch.setattr(link, "STRAY_S", 0.0)
 
 
 class Scene:
@@ -374,6 +377,21 @@ async def test_of_two_clients_of_one_host_a_packet_from_the_port_binds_the_one_w
         second.send_udp(move(first.number))
         await scene.until(lambda: second_session.traffic.malformed == 1)
         assert second_session.last_malformed == "datagram with id 2, which is another client's"
+
+
+@pytest.mark.parametrize("version", OLD)
+async def test_a_5_that_two_waiting_clients_could_have_sent_is_neithers(version: str) -> None:
+    async with serving() as scene, program(scene, version, 0) as first, program(scene, version, 0) as second:
+        await first.greet()
+        await second.greet()
+        first.send_udp(probe(0))
+        await scene.until(lambda: scene.metrics.total("hq_rival_sources") == 2)
+        second.send_udp(probe(second.number))
+        await scene.taken_in()
+        for client in (first, second):
+            silent(client.udp)
+            await client.report(heard=False)
+        await second.drive(by_udp=False)
 
 
 # Attackers

@@ -283,9 +283,7 @@ class Scene:
 
 
 @contextlib.contextmanager
-def scene(
-    through: Through, options: str = "gap_s = 0", watch: str = "", *, router: bool = False
-) -> Iterator[Scene]:
+def scene(through: Through, options: str = "gap_s = 0", watch: str = "", *, router: bool = False) -> Iterator[Scene]:
     """Set a scene up. ``options``: the gateway's ``[device.options]``; ``watch``: the module that runs it and looks.
 
     router: everybody is linked to one, instead of to the process under test.

@@ -22,7 +22,7 @@ from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.audit import Audit
 from zbridge.bus import Handle, Lane, Question, Sample
 from zbridge.bus.fake import FakeBus, FakeQuestion, meet
-from zbridge.bus.interface import LaneOf
+from zbridge.bus.interface import Sort
 from zbridge.conversation import Conversation
 from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
 from zbridge.errors import LinkError, Malformed, NotReady, Unsupported
@@ -88,9 +88,9 @@ class OpenBus(FakeBus):
     def __init__(self) -> None:
         super().__init__("1")
         self.answers: dict[str, Callable[[Question], None]] = {}
-        self.lanes: dict[str, Lane | LaneOf] = {}
+        self.lanes: dict[str, Lane | Sort] = {}
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         self.answers[key] = handler
         self.lanes[key] = lane
         return super().answer(key, handler, lane=lane)
@@ -100,7 +100,7 @@ class OpenBus(FakeBus):
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | LaneOf = Lane.OTHER,
+        lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
         self.lanes[key_expr] = lane
@@ -1784,14 +1784,15 @@ async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too() 
 @jumping
 async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing() -> None:
     async with established() as rig:
-        assert rig.bus.lanes["fleet/r1/@cmd/stop"] is Lane.STOP
         lane = rig.bus.lanes["fleet/r1/@cmd/**"]
         assert not isinstance(lane, Lane)
         held, drive = rig.driver.held, packed(DRIVE_LEFT)
         assert held is not None
 
-        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane:
-            return lane(attachment, lambda: (key, payload))
+        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane | None:
+            return lane(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
+
+        assert lane_of(None, key="fleet/r1/@cmd/stop") is lane_of(None, key="fleet/*/@cmd/stop") is Lane.STOP
 
         first, late = held.attachment("drive", drive), held.attachment("drive", drive)
         for other in (None, b"", b"\xc1", STRANGE.attachment("drive", drive)):
@@ -1820,13 +1821,15 @@ async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
         assert not isinstance(commands, Lane)
         assert held is not None
         held.seq = 1_000  # its commands have numbers of their own
-        assert commands(held.attachment("drive", b""), lambda: ("fleet/r1/@cmd/drive", b"")) is Lane.COMMAND
+        assert commands("fleet/r1/@cmd/drive", held.attachment("drive", b""), 60, bytes) is Lane.COMMAND
         question = held.question(name)
-        assert lane(question, lambda: (f"fleet/r2/@rpc/control/{name}", b"")) is Lane.OTHER
-        assert lane(question, lambda: (key, b"")) is Lane.COMMAND
-        assert lane(question, lambda: (key, b"")) is Lane.OTHER
+        assert lane(f"fleet/r2/@rpc/control/{name}", question, 60, bytes) is Lane.OTHER
+        assert lane(key, question, 60, bytes) is Lane.COMMAND
+        assert lane(key, question, 60, bytes) is Lane.OTHER
         for asker in ("acquire", "takeover"):
-            assert rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"] is Lane.OTHER
+            asking = rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"]
+            assert not isinstance(asking, Lane)
+            assert asking(f"fleet/r1/@rpc/control/{asker}/me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
 
 
 # Refusals

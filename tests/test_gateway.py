@@ -41,7 +41,7 @@ async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
     """Run a gateway on a fake bus; its robot is not there."""
     bus = FakeBus("1")
 
-    async def open_bus(*_: object) -> Bus:
+    async def open_bus(*_: object, **__: object) -> Bus:
         return bus
 
     monkeypatch.setattr("zbridge.gateway.open_bus", open_bus)

@@ -37,6 +37,15 @@ def _drives(session: zenoh.Session, lease: bytes) -> Send:
     return lambda: put(payload, attachment=next(shown))
 
 
+def _express(session: zenoh.Session, lease: bytes) -> Send:
+    """Drives without attachment, each sent by itself: as dear for the receiving session as can be."""
+    publisher = session.declare_publisher(
+        DRIVE, priority=zenoh.Priority.REAL_TIME, congestion_control=zenoh.CongestionControl.BLOCK, express=True
+    )
+    put, payload = publisher.put, packed(drive(2**19))
+    return lambda: put(payload)
+
+
 def _forged(session: zenoh.Session, lease: bytes) -> Send:
     """Drives with the holder's lease, high numbers and a random proof."""
     put, payload = _publisher(session, DRIVE), packed(drive(2**19))
@@ -80,6 +89,7 @@ def _renewals(session: zenoh.Session, lease: bytes) -> Send:
 
 KINDS: dict[str, Callable[[zenoh.Session, bytes], Send]] = {
     "drives": _drives,
+    "express": _express,
     "forged": _forged,
     "acquires": _acquires,
     "renewals": _renewals,

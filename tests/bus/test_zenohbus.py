@@ -73,10 +73,11 @@ async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_th
 async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -> None:
     seen, asked, all_asked = Seen(), list[bytes | None](), threading.Event()
 
-    def lane(attachment: bytes | None, look: Look) -> Lane:
+    def lane(key: str, attachment: bytes | None, size: int, look: Look) -> Lane:
         asked.append(attachment)
+        assert size == 1 + len(attachment or b"")
         if attachment is not None:
-            looked.append(look())
+            looked.append((key, look()))
         if attachment == b"last":
             all_asked.set()
         return Lane.COMMAND if attachment == b"holder" else Lane.OTHER
@@ -97,8 +98,9 @@ async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -
 async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key(bus: ZenohBus) -> None:
     chosen = list[tuple[bytes | None, str, bytes]]()
 
-    def lane(payload: bytes | None, look: Look) -> Lane:
-        chosen.append((payload, *look()))
+    def lane(key: str, payload: bytes | None, size: int, look: Look) -> Lane:
+        assert size == len(b"proof")
+        chosen.append((payload, key, look()))
         return Lane.COMMAND
 
     bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)

@@ -25,7 +25,7 @@ from zbridge.bus.fake import FakeBus, FakeQuestion, meet
 from zbridge.bus.interface import Sort
 from zbridge.conversation import Conversation
 from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
-from zbridge.errors import LinkError, Malformed, NotReady, Unsupported
+from zbridge.errors import LinkError, Malformed, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.link import Address, FakeLink
@@ -1830,6 +1830,59 @@ async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
             asking = rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"]
             assert not isinstance(asking, Lane)
             assert asking(f"fleet/r1/@rpc/control/{asker}/me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
+
+
+# Floods
+
+
+@jumping
+async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_any_refusal() -> None:
+    async with established() as rig:
+        commands, acquires = rig.bus.lanes["fleet/r1/@cmd/**"], rig.bus.lanes["fleet/r1/@rpc/control/acquire/*"]
+        assert not isinstance(commands, Lane)
+        assert not isinstance(acquires, Lane)
+        before = rig.metrics.total("refused")
+        passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(Lane.OTHER)
+        asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(Lane.OTHER)
+        await asyncio.sleep(1.1)
+        kept_back = [entry for entry in rig.last("control")["refusals"] if entry["command"] in ("commands", "acquire")]
+        assert [(entry["who"], entry["command"], entry["code"], entry["count"]) for entry in kept_back] == [
+            (None, "commands", "no_lease", 1000 - passed),
+            (None, "acquire", "rate", 1000 - asked),
+        ]
+        assert rig.metrics.total("refused") - before == 2000 - passed - asked
+        await asyncio.sleep(1.1)
+        assert rig.metrics.total("refused") - before == 2000 - passed - asked
+
+
+@jumping
+async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot() -> None:
+    async with established() as rig:
+        taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
+        assert [reply.error is None for reply in taken] == [True] * 5 + [False] * 3
+        assert {str(reply.error) for reply in taken[5:]} == {"more than 5 takeovers a second"}
+        assert isinstance(taken[-1].error, TooFast)
+        assert rig.control["holder"] == "n.4"
+        assert ("takeover", "rate") in {(entry["command"], entry["code"]) for entry in rig.control["refusals"]}
+        await asyncio.sleep(0.25)
+        assert rig.ask("control/takeover/n", packed({"who": "n"})).replies[0].error is None
+
+
+@jumping
+async def test_a_stop_right_after_a_stop_is_not_carried_out_again() -> None:
+    async with established() as rig:
+        gate = rig.bus.lanes["fleet/r1/@cmd/**"]
+        assert not isinstance(gate, Lane)
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+        rig.command("stop")
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
+        await asyncio.sleep(0.06)
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+        rig.command("stop")
+        rig.driver.acquire()
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP, "a new holder is stopped at once"
+        await asyncio.sleep(1.0)
+        assert rig.metrics.total("stops_folded") == 1
 
 
 # Refusals

@@ -10,7 +10,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
-from zbridge.gate import OF_THE_HOLDER, may_stop
+from zbridge.gate import OF_THE_HOLDER, is_stop
 from zbridge.leases import Leases
 from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot
@@ -57,7 +57,7 @@ class Commands:
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it where everybody sees."""
         self._taken.value += 1
-        if may_stop(sample.key):  # whatever the payload says and whoever says it
+        if is_stop(sample.key):  # whatever the payload says and whoever says it
             self._leases.stop("stop")
             self._leases.gate.stopped()
             return

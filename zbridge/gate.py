@@ -39,15 +39,12 @@ SAME_STOP_S = 0.05
 _KEPT = 1024
 
 Clock = Callable[[], float]
-_COMMANDS = "@cmd/"
 _STOP_PATH = f"/{topics.CMD_STOP.path}"
 
 
-def may_stop(key: str) -> bool:
-    """Tell whether a command's key is a stop's, or has wildcards that may mean one."""
-    if key.endswith(_STOP_PATH):
-        return True
-    return not topics.is_concrete(key) and "*" in key.rpartition(_COMMANDS)[2].partition("/")[0]
+def is_stop(key: str) -> bool:
+    """Tell whether a command's key is a stop's, which alone may have wildcards before its end."""
+    return key.endswith(_STOP_PATH)
 
 
 class Sieve:
@@ -174,7 +171,7 @@ class CommandGate:
         return kind
 
     def _read(self, key: str) -> _Kind:
-        if may_stop(key):
+        if is_stop(key):
             return _STOP
         topic = topics.find(self._keys.path(key)) if topics.is_concrete(key) else None
         if topic is None or topic.most_bytes is None:

@@ -27,7 +27,7 @@ import zenoh
 from tests.benchmarks.flooder import KINDS
 from tests.benchmarks.harness import WAIT_S, BenchmarkError, memory_mb
 from tests.benchmarks.peer import ROBOT, open_session
-from tests.benchmarks.scene import WARM, Drive, Scene, Through, scene
+from tests.benchmarks.scene import WARM, Drive, Through, scene
 
 DRIVE_HZ = 40.0
 RATES_HZ = {"scans": (200, 0), "raws": (200,), "small": (1000, 0), "stops": (10_000, 75_000, 0)}

@@ -80,6 +80,8 @@ class Row:
     flooded: Drive
     last_motion_s: float | None
     """Seconds from the flood's begin to the last motion the robot was sent, None where there was none after it."""
+    stopped_s: float | None
+    """Seconds from the flood's begin to the first stop the robot was sent."""
     answer_s: float
     before_mb: float
     most_mb: float
@@ -91,8 +93,7 @@ class Row:
         text = f"{self.way:<7} {self.kind:<10} {wished:>8} {self.rate_hz:>9,.0f}  "
         quiet = f"{self.quiet.median_us / 1e3:6.2f} {self.quiet.p99_us / 1e3:6.1f}  "
         if self.kind in ENDING:
-            last = "none" if self.last_motion_s is None else f"{self.last_motion_s * 1e3:.0f} ms"
-            text += f"{quiet}last motion after {last:>9}  "
+            text += f"{quiet}stop {_ms(self.stopped_s):>6} last motion {_ms(self.last_motion_s):>6}  "
         elif self.flooded.latencies_us:
             ratio = self.flooded.median_us / self.quiet.median_us
             text += f"{quiet}{self.flooded.median_us / 1e3:6.2f} {self.flooded.p99_us / 1e3:7.1f} {ratio:5.1f} "
@@ -108,7 +109,15 @@ HEAD = (
 )
 
 
-def measure(way: str, kind: str, rate_hz: float, seconds: float) -> Row:
+def _since(begun_ns: int, at_ns: int | None) -> float | None:
+    return None if at_ns is None else (at_ns - begun_ns) / 1e9
+
+
+def _ms(seconds: float | None) -> str:
+    return "none" if seconds is None else f"{seconds * 1e3:.0f} ms"
+
+
+def measure(way: str, kind: str, rate_hz: float, seconds: float, quiet_s: float | None = None) -> Row:
     """Set a scene up, drive in peace, and drive on under a flood."""
     with scene(Through.GATEWAY, router=way == "router") as running:
         flooder = running.start("flooder", running.endpoint)
@@ -116,17 +125,18 @@ def measure(way: str, kind: str, rate_hz: float, seconds: float) -> Row:
         lease = running.lease()
         with open_session(connect=running.endpoint, shared_memory=False) as session:
             wait_ready(session)
-            quiet = running.drive(DRIVE_HZ, int(DRIVE_HZ * seconds))
+            quiet = running.drive(DRIVE_HZ, int(DRIVE_HZ * (quiet_s or seconds)))
             before_mb, before = memory_mb(running.tested.pid), running.counters()
             with Watch(session, running.tested.pid) as watch:
                 first = running.begin(DRIVE_HZ, int(DRIVE_HZ * (seconds + WAIT_S)))
                 time.sleep((WARM + 1) / DRIVE_HZ)
                 flooder.say(f"flood {kind} {rate_hz} {seconds} {lease}")
                 sent = flooder.hear(seconds + 2 * WAIT_S)
-                flooded, moved_ns = running.halt(first, sent["begun_ns"], sent["ended_ns"])
+                flooded, moved_ns, stopped_ns = running.halt(first, sent["begun_ns"], sent["ended_ns"])
                 time.sleep(_AFTER_S)
             after = running.counters()
-        late = [at_ns for at_ns in moved_ns if at_ns > sent["begun_ns"]]
+        moved_ns = [at_ns for at_ns in moved_ns if at_ns > sent["begun_ns"]]
+        stopped_ns = [at_ns for at_ns in stopped_ns if at_ns > sent["begun_ns"]]
         return Row(
             way,
             kind,
@@ -134,7 +144,8 @@ def measure(way: str, kind: str, rate_hz: float, seconds: float) -> Row:
             sent["sent"] / ((sent["ended_ns"] - sent["begun_ns"]) / 1e9),
             quiet,
             flooded,
-            (max(late) - sent["begun_ns"]) / 1e9 if late else None,
+            _since(sent["begun_ns"], max(moved_ns, default=None)),
+            _since(sent["begun_ns"], min(stopped_ns, default=None)),
             max(watch.answers_s),
             before_mb,
             max(watch.memory_mb),

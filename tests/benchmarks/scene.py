@@ -207,12 +207,13 @@ class Scene:
         self._ask(self._robot, "report")  # what came before is nobody's
         return self._begin(rate_hz, count)
 
-    def halt(self, first: int, from_ns: int, until_ns: int) -> tuple[Drive, list[int]]:
-        """Let the driver end: what came of the drives of a time, and when the robot was sent motion."""
+    def halt(self, first: int, from_ns: int, until_ns: int) -> tuple[Drive, list[int], list[int]]:
+        """Let the driver end: what came of the drives of a time, and when the robot was sent motion, and stops."""
         driven = self._ask(self._driver, "halt")
         time.sleep(_ARRIVE_S)
-        moves = self._ask(self._robot, "report")["moves"]
-        return _match(first, driven, moves, 0.0, from_ns, until_ns), [at_ns for at_ns, number in moves if number]
+        told = self._ask(self._robot, "report")
+        moved_ns = [at_ns for at_ns, number in told["moves"] if number]
+        return _match(first, driven, told["moves"], 0.0, from_ns, until_ns), moved_ns, told["stops"]
 
     # Profiling
 

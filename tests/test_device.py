@@ -22,7 +22,7 @@ from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.audit import Audit
 from zbridge.bus import Handle, Lane, Question, Sample
 from zbridge.bus.fake import FakeBus, FakeQuestion, meet
-from zbridge.bus.interface import LaneOf
+from zbridge.bus.interface import Sort
 from zbridge.conversation import Conversation
 from zbridge.device import ATTEND_EVERY, HEARTBEAT_S, Device
 from zbridge.errors import LinkError, Malformed, NotReady, TooFast, Unsupported
@@ -89,9 +89,9 @@ class OpenBus(FakeBus):
     def __init__(self) -> None:
         super().__init__("1")
         self.answers: dict[str, Callable[[Question], None]] = {}
-        self.lanes: dict[str, Lane | LaneOf] = {}
+        self.lanes: dict[str, Lane | Sort] = {}
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         self.answers[key] = handler
         self.lanes[key] = lane
         return super().answer(key, handler, lane=lane)
@@ -101,7 +101,7 @@ class OpenBus(FakeBus):
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | LaneOf = Lane.OTHER,
+        lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
         self.lanes[key_expr] = lane
@@ -1787,14 +1787,15 @@ async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too() 
 @jumping
 async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing() -> None:
     async with established() as rig:
-        assert rig.bus.lanes["fleet/r1/@cmd/stop"] is Lane.STOP
         lane = rig.bus.lanes["fleet/r1/@cmd/**"]
         assert not isinstance(lane, Lane)
         held, drive = rig.driver.held, packed(DRIVE_LEFT)
         assert held is not None
 
-        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane:
-            return lane(attachment, lambda: (key, payload))
+        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane | None:
+            return lane(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
+
+        assert lane_of(None, key="fleet/r1/@cmd/stop") is lane_of(None, key="fleet/*/@cmd/stop") is Lane.STOP
 
         first, late = held.attachment("drive", drive), held.attachment("drive", drive)
         for other in (None, b"", b"\xc1", STRANGE.attachment("drive", drive)):
@@ -1823,13 +1824,68 @@ async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
         assert not isinstance(commands, Lane)
         assert held is not None
         held.seq = 1_000  # its commands have numbers of their own
-        assert commands(held.attachment("drive", b""), lambda: ("fleet/r1/@cmd/drive", b"")) is Lane.COMMAND
+        assert commands("fleet/r1/@cmd/drive", held.attachment("drive", b""), 60, bytes) is Lane.COMMAND
         question = held.question(name)
-        assert lane(question, lambda: (f"fleet/r2/@rpc/control/{name}", b"")) is Lane.OTHER
-        assert lane(question, lambda: (key, b"")) is Lane.COMMAND
-        assert lane(question, lambda: (key, b"")) is Lane.OTHER
+        assert lane(f"fleet/r2/@rpc/control/{name}", question, 60, bytes) is Lane.OTHER
+        assert lane(key, question, 60, bytes) is Lane.COMMAND
+        assert lane(key, question, 60, bytes) is Lane.OTHER
         for asker in ("acquire", "takeover"):
-            assert rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"] is Lane.OTHER
+            asking = rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"]
+            assert not isinstance(asking, Lane)
+            assert asking(f"fleet/r1/@rpc/control/{asker}/me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
+
+
+# Floods
+
+
+@jumping
+async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_any_refusal() -> None:
+    async with established() as rig:
+        commands, acquires = rig.bus.lanes["fleet/r1/@cmd/**"], rig.bus.lanes["fleet/r1/@rpc/control/acquire/*"]
+        assert not isinstance(commands, Lane)
+        assert not isinstance(acquires, Lane)
+        before = rig.metrics.total("refused")
+        passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(Lane.OTHER)
+        asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(Lane.OTHER)
+        await asyncio.sleep(1.1)
+        kept_back = [entry for entry in rig.last("control")["refusals"] if entry["command"] in ("commands", "acquire")]
+        assert [(entry["who"], entry["command"], entry["code"], entry["count"]) for entry in kept_back] == [
+            (None, "commands", "no_lease", 1000 - passed),
+            (None, "acquire", "rate", 1000 - asked),
+        ]
+        assert rig.metrics.total("refused") - before == 2000 - passed - asked
+        await asyncio.sleep(1.1)
+        assert rig.metrics.total("refused") - before == 2000 - passed - asked
+
+
+@jumping
+async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot() -> None:
+    async with established() as rig:
+        taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
+        assert [reply.error is None for reply in taken] == [True] * 5 + [False] * 3
+        assert {str(reply.error) for reply in taken[5:]} == {"more than 5 takeovers a second"}
+        assert isinstance(taken[-1].error, TooFast)
+        assert rig.control["holder"] == "n.4"
+        assert (None, "takeover", "more than 5 takeovers a second", 3) in await rig.refused()
+        await asyncio.sleep(0.25)
+        assert rig.ask("control/takeover/n", packed({"who": "n"})).replies[0].error is None
+
+
+@jumping
+async def test_a_stop_right_after_a_stop_is_not_carried_out_again() -> None:
+    async with established() as rig:
+        gate = rig.bus.lanes["fleet/r1/@cmd/**"]
+        assert not isinstance(gate, Lane)
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+        rig.command("stop")
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
+        await asyncio.sleep(0.06)
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+        rig.command("stop")
+        rig.driver.acquire()
+        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP, "a new holder is stopped at once"
+        await asyncio.sleep(1.0)
+        assert rig.metrics.total("stops_folded") == 1
 
 
 # Refusals

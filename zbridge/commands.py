@@ -10,15 +10,12 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
+from zbridge.gate import OF_THE_HOLDER, is_stop
 from zbridge.leases import Leases
 from zbridge.metrics import Metrics
 from zbridge.protocol import Outcome, Robot
 
 _MOVING = (Drive, Motor)
-_OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
-"""Commands that move a robot, or may: they need the lease."""
-_ANY_STOP = f"/{topics.CMD_STOP.path}"
-"""The end of the key of a stop, which alone may have wildcards."""
 
 
 LINK_BLOCKED = "the robot's link takes nothing"
@@ -57,16 +54,13 @@ class Commands:
     def __repr__(self) -> str:
         return f"<Commands {self._keys.robot}>"
 
-    def take_stop(self, sample: Sample) -> None:
-        """Stop, whatever the payload says and whoever says it."""
-        self._taken.value += 1
-        self._leases.stop("stop")
-
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it where everybody sees."""
-        if sample.key.endswith(_ANY_STOP):  # has a lane of its own, and came by it
-            return
         self._taken.value += 1
+        if is_stop(sample.key):  # whatever the payload says and whoever says it
+            self._leases.stop("stop")
+            self._leases.gate.stopped()
+            return
         who = None
         try:
             topic = self._topics.get(sample.key) or self._find(sample.key)
@@ -105,7 +99,7 @@ class Commands:
 
     def _admit(self, topic: Topic, sample: Sample) -> str | None:
         """Give the holder whose command this is, None of one that needs no lease; raise Refused where it may not be."""
-        if topic.message not in _OF_THE_HOLDER:
+        if topic.message not in OF_THE_HOLDER:
             return None
         who = self._authority.admit(sample.attachment, sample.key, sample.payload, self._clock())
         self._leases.settle()

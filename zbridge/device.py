@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from zbridge.audit import Audit
-from zbridge.bus import Bus, Handle, Lane, Publisher, Question
+from zbridge.bus import Bus, Handle, Publisher, Question
 from zbridge.commands import LINK_BLOCKED, Commands
 from zbridge.conditions import Conditions
 from zbridge.endpoint import Connect, Endpoint, Hooks
@@ -149,8 +149,7 @@ class Device:
         self._bus.on_relief(self._resume)
         declared = [
             *self._leases.serve(self._bus),
-            self._bus.subscribe(self._keys.key(topics.CMD_STOP.path), self._commands.take_stop, lane=Lane.STOP),
-            self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.lane),
+            self._bus.subscribe(self._keys.key("@cmd/**"), self._commands.take, lane=self._leases.gate),
             self._bus.watch_connected(self._on_bus),
             *(self._bus.answer(self._keys.key(path), self._on_question) for path in _ASKED),
             *(self._watch_listeners(topic) for topic in self._robot.on_demand),

@@ -201,7 +201,7 @@ class Gateway:
     async def _open_bus(self) -> Bus:
         while True:
             try:
-                return await open_bus(self._plan.config.bus, self.metrics)
+                return await open_bus(self._plan.config.bus, self.metrics, bounds=topics.size_bounds())
             except BusError as error:
                 log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
                 await asyncio.sleep(RETRY_S)

@@ -7,13 +7,14 @@ import math
 from collections.abc import Callable
 
 from zbridge.audit import Audit
-from zbridge.bus import Bus, Handle, Lane, Look, Question
+from zbridge.bus import Bus, Handle, Question
 from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.gate import CommandGate, NameGate, QuestionGate
 from zbridge.metrics import Metrics
 from zbridge.protocol import Robot
 from zbridge.session.allowance import Allowance
@@ -31,37 +32,11 @@ _NAMED = 64
 """Characters of a name that are repeated to whoever uses it wrongly."""
 _CONTROL_S = 0.05
 """Least time between two publications of ``control`` while refusals come in."""
+TAKEOVERS_HZ = 5.0
+"""Takeovers a second, of whoever asks."""
 _ANYBODY = "*"
 
 Decide = Callable[[Question], FleetMessage]
-
-
-class Gate:
-    """Chooses the lane: COMMAND for what the holder's proof shows to be new, else OTHER. Runs on bus threads.
-
-    Who only knows the lease's id, or repeats what it overheard, fills no lane of the holder's.
-    One gate for commands and one for questions, which are numbered apart.
-    """
-
-    def __init__(self, authority: Authority) -> None:
-        self._authority = authority
-        self._newest = (b"", -1)
-
-    def __call__(self, shown: bytes | None, look: Look) -> Lane:
-        verifier = self._authority.verifier
-        if verifier is None or shown is None or not verifier.plausible(shown):
-            return Lane.OTHER
-        try:
-            said = read(shown)
-        except Malformed:
-            return Lane.OTHER
-        lease, seq = self._newest
-        if said.lease != verifier.lease or (said.lease == lease and said.seq <= seq):
-            return Lane.OTHER
-        if not verifier.proves(said, *look()):
-            return Lane.OTHER
-        self._newest = (said.lease, said.seq)
-        return Lane.COMMAND
 
 
 class Leases:
@@ -86,8 +61,16 @@ class Leases:
         self.authority = authority
         self.limits = limits
         self.standstill = standstill
-        self.lane = Gate(authority)
-        """Chooses the lane of a command."""
+        self.gate = CommandGate(authority, keys, clock)
+        """Sorts commands."""
+        self._gates: dict[str, CommandGate | QuestionGate | NameGate] = {
+            "commands": self.gate,
+            "acquire": NameGate(clock),
+            "takeover": NameGate(clock),
+            "renew": QuestionGate(authority, clock),
+            "release": QuestionGate(authority, clock),
+        }
+        self._takeovers = Allowance(TAKEOVERS_HZ)
         self._robot = robot
         self._keys = keys
         self._metrics = metrics
@@ -101,18 +84,18 @@ class Leases:
         self._closing: str | None = None
         self._tellings = Allowance(TELLINGS_HZ)
         self._refused = metrics.count("refused")
+        self._same_stops = metrics.count("stops_folded")
 
     def __repr__(self) -> str:
         return f"<Leases {self._keys.robot} {self.authority!r}>"
 
     def serve(self, bus: Bus) -> list[Handle]:
         """Answer questions about the lease, and watch whether its holder lives."""
-        gate = Gate(self.authority)
         return [
             self._answer(bus, "acquire/*", self._acquire),
             self._answer(bus, "takeover/*", self._take_over),
-            self._answer(bus, "renew", self._renew, gate),
-            self._answer(bus, "release", self._release, gate),
+            self._answer(bus, "renew", self._renew),
+            self._answer(bus, "release", self._release),
             self._answer(bus, "refused/*", self._take_told),
             bus.watch_alive(self._keys.alive(_ANYBODY), self._on_alive),
         ]
@@ -162,8 +145,18 @@ class Leases:
 
     def beat(self) -> None:
         """Publish ``control``, and have written down what repeated itself; to be called once a second."""
+        self._count_kept_back()
         self.report()
         self._audit.flush()
+
+    def _count_kept_back(self) -> None:
+        """Show what the gates refused by themselves since the last time: an entry for each code, with its count."""
+        for command, gate in self._gates.items():
+            for refusal, count in gate.sieve.kept_back():
+                self.authority.refuse(command, refusal, count=count)
+                self._refused.value += count - 1  # settling counts one
+        self._same_stops.value = self.gate.same_stops
+        self.settle()
 
     def report(self) -> None:
         """Publish ``control`` now."""
@@ -215,7 +208,7 @@ class Leases:
 
     # Questions
 
-    def _answer(self, bus: Bus, name: str, decide: Decide, lane: Gate | Lane = Lane.OTHER) -> Handle:
+    def _answer(self, bus: Bus, name: str, decide: Decide) -> Handle:
         """Answer one kind of question, or refuse it where everybody sees."""
         command = name.removesuffix("/*")
 
@@ -233,13 +226,16 @@ class Leases:
                 question.refuse(refusal)
             self.settle()
 
-        return bus.answer(self._keys.key(f"@rpc/control/{name}"), answer, lane=lane)
+        return bus.answer(self._keys.key(f"@rpc/control/{name}"), answer, lane=self._gates[command])
 
     def _acquire(self, question: Question) -> FleetMessage:
         return self.authority.acquire(_request(question), self._clock())
 
     def _take_over(self, question: Question) -> FleetMessage:
-        return self.authority.takeover(_request(question), self._clock())
+        request = _request(question)
+        if not self._takeovers.take(self._clock()):
+            raise TooFast(f"more than {TAKEOVERS_HZ:g} takeovers a second")
+        return self.authority.takeover(request, self._clock())
 
     def _renew(self, question: Question) -> FleetMessage:
         return self.authority.renew(read(question.payload), question.asked, self._clock())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import msgpack
@@ -20,7 +21,7 @@ CONTROL = f"fleet/{ROBOT}/@rpc/control"
 ADVERSE = 2**19
 """The numbers from here on are an adversary's: a robot that reads one was driven by somebody who may not."""
 _STEPS = 2**20
-_MOVE = 11
+_MOVE, _STOP = 11, 13
 _MOVE_BODY = struct.Struct("<fff")
 
 
@@ -48,12 +49,23 @@ def plain(fields: dict[str, Any]) -> bytes:
 
 def moves(reads: list[tuple[int, bytes]]) -> list[tuple[int, int]]:
     """Find the packets 11 in what a robot read: the time of the read that completed each, and its number."""
-    found, rest = [], b""
+    return [
+        (at_ns, round(_MOVE_BODY.unpack(body)[2] * _STEPS))
+        for at_ns, packet, body in _packets(reads)
+        if packet == _MOVE
+    ]
+
+
+def stops(reads: list[tuple[int, bytes]]) -> list[int]:
+    """Find the packets 13 in what a robot read: the time of the read that completed each."""
+    return [at_ns for at_ns, packet, _ in _packets(reads) if packet == _STOP]
+
+
+def _packets(reads: list[tuple[int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
+    """Cut what a robot read into packets: the time of the read that completed each, its id and its body."""
+    rest = b""
     for at_ns, data in reads:
         rest += data
         while len(rest) >= HEADER.size and len(rest) >= (end := 4 + HEADER.unpack_from(rest)[0]):
-            if rest[5] == _MOVE:
-                speed = _MOVE_BODY.unpack_from(rest, HEADER.size)[2]
-                found.append((at_ns, round(speed * _STEPS)))
+            yield at_ns, rest[5], rest[HEADER.size : end]
             rest = rest[end:]
-    return found

@@ -108,10 +108,15 @@ def p99(values: tuple[float, ...]) -> float:
 class Scene:
     """The processes of one run; numbers, and so values, are never used twice."""
 
-    def __init__(self, stack: contextlib.ExitStack, through: Through, options: str, watch: str) -> None:
+    def __init__(
+        self, stack: contextlib.ExitStack, through: Through, options: str, watch: str, *, router: bool = False
+    ) -> None:
         self._stack = stack
         self._folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         self._endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self._router = self._start(f"{_PACKAGE}.router", self._endpoint) if router else None
+        if self._router is not None:
+            self._router.hear()
         self._metrics_port = free_port()
         self._number = 1
         self.load_hz = 0.0
@@ -181,6 +186,35 @@ class Scene:
         seconds = (sent["ended_ns"] - sent["begun_ns"]) / 1e9
         return Flood(count, seconds, count / seconds, calm, meanwhile, counted)
 
+    # Floods
+
+    @property
+    def endpoint(self) -> str:
+        """Where everybody finds the bus."""
+        return self._endpoint
+
+    def start(self, module: str, *arguments: object) -> Process:
+        """Start one more process of this package."""
+        return self._start(f"{_PACKAGE}.{module}", *arguments)
+
+    def lease(self) -> str:
+        """Let the driver have the lease; give its public id, in hex."""
+        written: str = self._ask(self._driver, "lease")["lease"]
+        return written.partition(":")[0]
+
+    def begin(self, rate_hz: float, count: int) -> int:
+        """Let the driver begin, to drive until :meth:`halt`; give its first number."""
+        self._ask(self._robot, "report")  # what came before is nobody's
+        return self._begin(rate_hz, count)
+
+    def halt(self, first: int, from_ns: int, until_ns: int) -> tuple[Drive, list[int], list[int]]:
+        """Let the driver end: what came of the drives of a time, and when the robot was sent motion, and stops."""
+        driven = self._ask(self._driver, "halt")
+        time.sleep(_ARRIVE_S)
+        told = self._ask(self._robot, "report")
+        moved_ns = [at_ns for at_ns, number in told["moves"] if number]
+        return _match(first, driven, told["moves"], 0.0, from_ns, until_ns), moved_ns, told["stops"]
+
     # Profiling
 
     def mark(self) -> dict[int, tuple[str, float]]:
@@ -200,7 +234,8 @@ class Scene:
 
     def _start_gateway(self, robot_port: int, options: str, watch: str) -> Process:
         file = self._folder / "gateway.toml"
-        file.write_text(_configuration(robot_port, self._endpoint, self._metrics_port, options))
+        where = "listen" if self._router is None else "connect"
+        file.write_text(_configuration(robot_port, f'{where} = ["{self._endpoint}"]', self._metrics_port, options))
         if watch:
             return self._start(f"{_PACKAGE}.{watch}", self._folder / "watched.json", "run", file)
         return self._start("zbridge", "run", file)
@@ -221,23 +256,7 @@ class Scene:
         self, first: int, driven: dict[str, Any], cpu_s: float, from_ns: int = 0, until_ns: int | None = None
     ) -> Drive:
         """Find what became of the commands, of those that were sent from one moment to another."""
-        sent_ns: list[int] = driven["sent_ns"]
-        arrived: dict[int, int] = {}
-        for at_ns, number in self._ask(self._robot, "report")["moves"]:
-            arrived.setdefault(number, at_ns)
-        counted = [
-            (number, at_ns)
-            for number, at_ns in enumerate(sent_ns, first)
-            if number >= first + WARM and at_ns >= from_ns and (until_ns is None or at_ns <= until_ns)
-        ]
-        return Drive(
-            sent=len(counted),
-            latencies_us=tuple((arrived[number] - at_ns) / 1e3 for number, at_ns in counted if number in arrived),
-            sent_ns=dict(counted),
-            seqs=(driven["first_seq"], driven["first_seq"] + len(sent_ns) - 1),
-            applied=sum(number >= ADVERSE for number in arrived),
-            cpu_us=cpu_s / len(sent_ns) * 1e6,
-        )
+        return _match(first, driven, self._ask(self._robot, "report")["moves"], cpu_s, from_ns, until_ns)
 
     def _drained(self, before: dict[str, int], count: int) -> tuple[dict[str, int], int]:
         """Wait until as many were counted as were sent, or none any more; give the counts and the time of the last."""
@@ -253,17 +272,52 @@ class Scene:
 
     def _counters(self) -> dict[str, int]:
         """Read what the gateway has refused, and dropped before it was looked at."""
+        values = self.counters()
+        return {name: values[name] for name in ("refused", "bus_in_dropped")}
+
+    def counters(self) -> dict[str, int]:
+        """Read every counter of the gateway."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self._metrics_port}/metrics", timeout=WAIT_S) as page:
             lines = page.read().decode().splitlines()
         values = dict(line.rsplit(" ", 1) for line in lines if not line.startswith("#"))
-        return {name: int(values[f"zbridge_{name}_total"]) for name in ("refused", "bus_in_dropped")}
+        return {name.removeprefix("zbridge_").replace("_total", ""): int(value) for name, value in values.items()}
 
 
 @contextlib.contextmanager
-def scene(through: Through, options: str = "gap_s = 0", watch: str = "") -> Iterator[Scene]:
-    """Set a scene up. ``options``: the gateway's ``[device.options]``; ``watch``: the module that runs it and looks."""
+def scene(through: Through, options: str = "gap_s = 0", watch: str = "", *, router: bool = False) -> Iterator[Scene]:
+    """Set a scene up. ``options``: the gateway's ``[device.options]``; ``watch``: the module that runs it and looks.
+
+    router: everybody is linked to one, instead of to the process under test.
+    """
     with contextlib.ExitStack() as stack:
-        yield Scene(stack, through, options, watch)
+        yield Scene(stack, through, options, watch, router=router)
+
+
+def _match(
+    first: int,
+    driven: dict[str, Any],
+    moves: list[tuple[int, int]],
+    cpu_s: float,
+    from_ns: int = 0,
+    until_ns: int | None = None,
+) -> Drive:
+    sent_ns: list[int] = driven["sent_ns"]
+    arrived: dict[int, int] = {}
+    for at_ns, number in moves:
+        arrived.setdefault(number, at_ns)
+    counted = [
+        (number, at_ns)
+        for number, at_ns in enumerate(sent_ns, first)
+        if number >= first + WARM and at_ns >= from_ns and (until_ns is None or at_ns <= until_ns)
+    ]
+    return Drive(
+        sent=len(counted),
+        latencies_us=tuple((arrived[number] - at_ns) / 1e3 for number, at_ns in counted if number in arrived),
+        sent_ns=dict(counted),
+        seqs=(driven["first_seq"], driven["first_seq"] + len(sent_ns) - 1),
+        applied=sum(number >= ADVERSE for number in arrived),
+        cpu_us=cpu_s / len(sent_ns) * 1e6,
+    )
 
 
 def bare_queries(count: int) -> tuple[float, ...]:
@@ -279,7 +333,7 @@ def bare_queries(count: int) -> tuple[float, ...]:
         return tuple(driver.hear()["took_us"][WARM:])
 
 
-def _configuration(robot_port: int, endpoint: str, metrics_port: int, options: str) -> str:
+def _configuration(robot_port: int, bus: str, metrics_port: int, options: str) -> str:
     return f"""
 [robot]
 name = "{ROBOT}"
@@ -290,7 +344,7 @@ connect = ["tcp://127.0.0.1:{robot_port}"]
 {options}
 [bus]
 mode = "peer"
-listen = ["{endpoint}"]
+{bus}
 multicast = false
 [metrics]
 listen = "127.0.0.1:{metrics_port}"

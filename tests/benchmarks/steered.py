@@ -3,7 +3,7 @@
 ``python -m tests.benchmarks.steered``. What it sends under load is sent by a process of its own that has the same
 socket (:mod:`tests.benchmarks.telemetry`): the thread that reads waits for nobody's interpreter lock.
 
-Words: ``report`` gives the packets 11 since the last report; ``load`` and ``calm`` begin and end the telemetry.
+Words: ``report`` gives the packets 11 and 13 since the last report; ``load`` and ``calm`` begin and end the telemetry.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 
-from tests.benchmarks.drives import moves
+from tests.benchmarks.drives import moves, stops
 from tests.benchmarks.harness import ROOT
 from tests.benchmarks.peer import hear, tell
 from tests.benchmarks.robot import ACCEPT_S, shake_hands
@@ -61,7 +61,7 @@ def _obey(reads: list[tuple[int, bytes]], telemetry: subprocess.Popen[bytes]) ->
         word = hear()
         if word == "report":
             count = len(reads)
-            tell(moves=moves(reads[:count]))
+            tell(moves=moves(reads[:count]), stops=stops(reads[:count]))
             del reads[:count]
         elif word:
             telemetry.stdin.write(f"{word}\n".encode())

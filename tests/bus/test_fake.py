@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.clock import jumping
-from zbridge.bus import Answer, Lane, LaneOf, Question, Sample
+from zbridge.bus import Answer, Lane, Question, Sample, Sort
 from zbridge.bus.fake import FakeBus, FakeQuestion, matches, meet
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
@@ -215,8 +215,8 @@ async def test_what_was_put_is_with_the_bus_at_once() -> None:
     assert bus.values("fleet/r1/@cmd/drive") == [b"1"]
 
 
-@pytest.mark.parametrize("lane", [Lane.STOP, Lane.OTHER, lambda shown, look: Lane.COMMAND])
-def test_a_sample_comes_by_whatever_lane(lane: Lane | LaneOf) -> None:
+@pytest.mark.parametrize("lane", [Lane.STOP, Lane.OTHER, lambda key, shown, size, look: Lane.COMMAND])
+def test_a_sample_comes_by_whatever_lane(lane: Lane | Sort) -> None:
     bus = FakeBus()
     seen: list[Sample] = []
     bus.subscribe("fleet/r1/@cmd/**", seen.append, lane=lane)

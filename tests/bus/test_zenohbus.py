@@ -8,15 +8,18 @@ from collections.abc import AsyncIterator, Callable
 
 import msgpack
 import pytest
+import zenoh
 
+from tests.e2e.conftest import free_port
 from zbridge.bus import BusSettings, Lane, Look, Question
 from zbridge.bus import zenohbus as module
-from zbridge.bus.zenohbus import ZenohBus, open_zenoh
+from zbridge.bus.zenohbus import ZenohBus, open_zenoh, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
 
 SOON_S = 5.0
+BLOCK = zenoh.CongestionControl.BLOCK
 ALONE = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
 
 
@@ -73,10 +76,11 @@ async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_th
 async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -> None:
     seen, asked, all_asked = Seen(), list[bytes | None](), threading.Event()
 
-    def lane(attachment: bytes | None, look: Look) -> Lane:
+    def lane(key: str, attachment: bytes | None, size: int, look: Look) -> Lane:
         asked.append(attachment)
+        assert size == 1 + len(attachment or b"")
         if attachment is not None:
-            looked.append(look())
+            looked.append((key, look()))
         if attachment == b"last":
             all_asked.set()
         return Lane.COMMAND if attachment == b"holder" else Lane.OTHER
@@ -97,8 +101,9 @@ async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -
 async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key(bus: ZenohBus) -> None:
     chosen = list[tuple[bytes | None, str, bytes]]()
 
-    def lane(payload: bytes | None, look: Look) -> Lane:
-        chosen.append((payload, *look()))
+    def lane(key: str, payload: bytes | None, size: int, look: Look) -> Lane:
+        assert size == len(b"proof")
+        chosen.append((payload, key, look()))
         return Lane.COMMAND
 
     bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
@@ -314,3 +319,75 @@ async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.M
         bus.publisher(f"fleet/r1/state{number}", topics.STATUS).close()
     assert len(bus._handles) < 200
     assert len(bus._published) == 2
+
+
+async def test_what_a_sort_drops_never_comes_to_the_event_loop(bus: ZenohBus) -> None:
+    seen = Seen()
+
+    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        return Lane.OTHER if look() == b"good" else None
+
+    bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload), lane=sort)
+    text = bus.publisher("fleet/r1/@cmd/text", topics.CMD_TEXT)
+    for payload in (b"bad", b"good", b"bad", b"good"):
+        text.put(payload)
+    await seen.until(lambda: len(seen) == 2)
+    assert seen == [b"good", b"good"]
+
+
+async def test_a_question_that_a_sort_drops_ends_without_an_answer(bus: ZenohBus) -> None:
+    bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lambda *_: None)
+    assert await bus.ask("fleet/r1/@rpc/control/renew", b"proof", timeout_s=SOON_S) == []
+
+
+async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "QUESTIONS_HZ", 2.0)
+    metrics = Metrics()
+    bus = await open_zenoh(ALONE, metrics)
+    bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
+    answers = await asyncio.gather(*(bus.ask("fleet/r1/@rpc/pose", timeout_s=SOON_S) for _ in range(50)))
+    assert 2 <= sum(map(len, answers)) < 50
+    assert metrics.total("bus_unanswered") == 50 - sum(map(len, answers))
+    await bus.close()
+
+
+@pytest.mark.parametrize(
+    ("key", "most"),
+    [
+        ("fleet/r1/@cmd/drive", 256),
+        ("fleet/r1/@cmd/motor/left", 256),
+        ("fleet/*/@cmd/mode", 256),
+        ("fleet/**/@cmd/stop", 256),
+        ("fleet/r1/@cmd/sensor/front", 16_384),
+        ("fleet/r1/@cmd/scan", 65_536),
+        ("fleet/r1/@cmd/raw/tcpudp", 65_536),
+        ("fleet/r1/@cmd/*", 65_536),
+        ("fleet/r1/@cmd/none", 65_536),
+    ],
+)
+async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called(key: str, most: int) -> None:
+    where = (f"tcp/127.0.0.1:{free_port()}",)
+    gateway = await open_zenoh(BusSettings(multicast=False, listen=where), Metrics(), bounds=topics.size_bounds())
+    sender = await asyncio.to_thread(zenoh.open, zenoh_config(BusSettings(multicast=False, connect=where)))
+    seen, called = Seen(), list[int]()
+
+    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        called.append(size)
+        return Lane.OTHER
+
+    gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(len(sample.payload)), lane=sort)
+    gateway.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
+
+    def put_all() -> None:
+        while not list(sender.get("fleet/r1/@rpc/pose", timeout=0.1)):
+            pass
+        for payload, attachment in ((most + 1, 0), (most - 9, 10), (most - 10, 10), (0, most + 1), (1, 0)):
+            sender.put(key, bytes(payload), attachment=bytes(attachment), congestion_control=BLOCK)
+        assert list(sender.get("fleet/r1/@rpc/pose", payload=bytes(1025), timeout=SOON_S)) == []
+
+    await asyncio.to_thread(put_all)
+    await seen.until(lambda: 1 in seen)
+    assert seen == [most - 10, 1]
+    assert called == [most, 1]
+    await asyncio.to_thread(sender.close)
+    await gateway.close()

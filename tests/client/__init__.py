@@ -118,7 +118,6 @@ class Gateway:
         for name in ("acquire/*", "takeover/*", "renew", "release"):
             self._bus.answer(self.keys.key(f"@rpc/control/{name}"), self._note)
         self.leases.serve(self._bus)
-        self._bus.subscribe(self.keys.key(topics.CMD_STOP.path), self.commands.take_stop)
         self._bus.subscribe(self.keys.key("@cmd/**"), self._take)
 
     async def vanish(self) -> None:

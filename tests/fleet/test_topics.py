@@ -55,7 +55,10 @@ TABLE = [
 
 @pytest.mark.parametrize(("path", "message", "delivery"), TABLE)
 def test_every_key_of_the_design_is_known(path: str, message: type[messages.FleetMessage], delivery: Delivery) -> None:
-    assert find(path) == Topic(path, message, delivery)
+    found = find(path)
+    assert found is not None
+    assert (found.path, found.message, found.delivery) == (path, message, delivery)
+    assert (found.most_bytes is not None) is (delivery in (Delivery.COMMAND, Delivery.QUERY)), "what anybody may send"
 
 
 @pytest.mark.parametrize(

@@ -13,13 +13,14 @@ from zbridge.bus.interface import (
     BusSettings,
     Handle,
     Lane,
-    LaneOf,
     Look,
     Publisher,
     Question,
     Sample,
+    Sort,
     Tls,
 )
+from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
 __all__ = [
@@ -29,21 +30,24 @@ __all__ = [
     "BusSettings",
     "Handle",
     "Lane",
-    "LaneOf",
     "Look",
     "Publisher",
     "Question",
     "Sample",
+    "Sort",
     "Tls",
     "open_bus",
 ]
 
 
-async def open_bus(settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False) -> Bus:
+async def open_bus(
+    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
 
-    ``wait_for_peers`` returns only when the peers that scouting finds at once are connected.
+    ``wait_for_peers`` returns only when the peers that scouting finds at once are connected. bounds: what comes in on
+    these keys and is larger is dropped by Zenoh, before anybody can count it.
     """
     from zbridge.bus.zenohbus import open_zenoh
 
-    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers)
+    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds)

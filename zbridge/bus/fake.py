@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.bus.interface import Answer, Batch, Handle, Lane, LaneOf, Publisher, Question, Sample
+from zbridge.bus.interface import Answer, Batch, Handle, Lane, Publisher, Question, Sample, Sort
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete
 
@@ -112,7 +112,7 @@ class FakeBus:
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | LaneOf = Lane.OTHER,
+        lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
@@ -123,7 +123,7 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         entry = (key, handler, self._zid)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))

@@ -1,4 +1,14 @@
-"""Carries what the bus's own threads bring to the event loop. Knows no zenoh."""
+"""Carries what the bus's own threads bring to the event loop. Knows no zenoh.
+
+Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each lane
+it uses, so that a flood of one fills nobody else's queue. A queue that has items stands in the line of its lane. The
+event loop is woken once per batch; a batch serves the lanes in their order, one item of each queue in the line by
+turns, and of each lane no more than its share: so a stop waits for one item at most, and a lane that never empties
+leaves the others their part. What is over is served after the loop has had its turn with sockets and timers.
+
+A queue is filled by one thread (or several) and emptied by the loop's, without a lock: every step is one operation of a
+deque, and whoever adds an item has the queue stand in the line after it; a queue that stands there twice is harmless.
+"""
 
 from __future__ import annotations
 
@@ -10,64 +20,145 @@ from collections.abc import Callable
 from typing import Any
 
 from zbridge.bus.interface import Lane
-from zbridge.metrics import Metrics
+from zbridge.metrics import Count, Metrics
 
 log = logging.getLogger("zbridge.bus")
 
-LANE = 4096
-"""Items that may wait for the event loop in each lane; the oldest makes room."""
-_DRAIN = 256
+QUEUE = 4096
+"""Items of one source that may wait in a lane; the oldest makes room."""
+QUEUE_BYTES = 4 * 2**20
+"""Bytes of sized items of one source that may wait in a lane; the oldest makes room."""
+SHARES = {Lane.STOP: 64, Lane.COMMAND: 128, Lane.OTHER: 64}
+"""Items of each lane that one batch serves at most."""
 
 Handler = Callable[[Any], None]
 Read = Callable[[Any], Any]
 
 
 class Inbox:
-    """A bounded queue per lane, emptied in the order of the lanes; the loop is woken once per batch."""
+    """The lines of the lanes, and the loop that empties them."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
-        self._lanes: list[deque[tuple[Handler, Any, Read]]] = [deque() for _ in Lane]
+        self._lines: dict[Lane, deque[_Queue]] = {lane: deque() for lane in Lane}
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
+        self._folded = metrics.count("bus_in_folded")
 
-    def put(self, handler: Handler, raw: Any, read: Read, lane: Lane) -> None:
-        """Store an item for the loop, from any thread."""
-        waiting = self._lanes[lane]
-        if len(waiting) >= LANE:
-            with contextlib.suppress(IndexError):
-                waiting.popleft()
-            self._dropped.value += 1
-        waiting.append((handler, raw, read))
+    def source(self, handler: Handler, read: Read) -> Source:
+        """Give what one subscription or queryable puts its items in. read: makes of each what the handler takes."""
+        return Source(self, handler, read, self._dropped, self._folded)
+
+    def attend(self) -> None:
+        """Serve the stops and commands that wait, and nothing else."""
+        self._serve({**SHARES, Lane.OTHER: 0})
+
+    def line_up(self, queue: _Queue, lane: Lane) -> None:
+        """Have a queue stand in the line of its lane, and the loop awake; from any thread."""
+        if not queue.listed:
+            queue.listed = True
+            self._lines[lane].append(queue)
         if not self._awake:
             self._awake = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._drain)
 
-    def attend(self) -> None:
-        """Serve the stops and commands that wait, and nothing else."""
-        stops, commands, _others = self._lanes
-        for _ in range(_DRAIN):
-            waiting = stops or commands
-            if not waiting:
-                return
-            self._serve(waiting)
+    def _drain(self) -> None:
+        self._awake = False
+        self._serve(dict(SHARES))
+        if any(self._lines.values()) and not self._awake:
+            self._awake = True
+            self._loop.call_soon(self._drain)
 
-    def _serve(self, waiting: deque[tuple[Handler, Any, Read]]) -> None:
-        handler, raw, read = waiting.popleft()
+    def _serve(self, shares: dict[Lane, int]) -> None:
+        """Serve one item after the other, always of the first lane that has some and has not had its share."""
+        lines = tuple(self._lines.items())
+        while True:
+            for lane, line in lines:
+                if line and shares[lane]:
+                    shares[lane] -= 1
+                    self._serve_one(line)
+                    break
+            else:
+                return
+
+    def _serve_one(self, line: deque[_Queue]) -> None:
+        queue = line.popleft()
+        queue.listed = False  # before the item is taken: what comes from now on lists it anew
         try:
-            handler(read(raw))
+            raw = queue.take()
+        except IndexError:  # it stood in the line twice, or its items had to make room
+            return
+        if queue.items and not queue.listed:
+            queue.listed = True
+            line.append(queue)
+        try:
+            queue.source.handler(queue.source.read(raw))
         except Exception:
             log.exception("a handler failed")
 
-    def _drain(self) -> None:
-        self._awake = False
-        stops, commands, others = self._lanes
-        for _ in range(_DRAIN):
-            waiting = stops or commands or others
-            if not waiting:
-                return
-            self._serve(waiting)
-        if not self._awake:
-            self._awake = True
-            self._loop.call_soon(self._drain)
+
+class Source:
+    """Where one subscription or queryable puts what comes in."""
+
+    def __init__(self, inbox: Inbox, handler: Handler, read: Read, dropped: Count, folded: Count) -> None:
+        self.handler = handler
+        self.read = read
+        self._inbox = inbox
+        self._dropped = dropped
+        self._folded = folded
+        self._queues = {lane: _Queue(self) for lane in Lane}
+
+    def __repr__(self) -> str:
+        waiting = ", ".join(f"{len(queue.items)} {lane.name}" for lane, queue in self._queues.items() if queue.items)
+        return f"<Source {waiting or 'empty'}>"
+
+    def put(self, raw: Any, lane: Lane, size: int = 0) -> None:
+        """Store an item of so many bytes for the loop, from any thread."""
+        queue = self._queues[lane]
+        while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
+            queue.forget()
+            self._dropped.value += 1
+        queue.add(raw, size)
+        self._inbox.line_up(queue, lane)
+
+    def fold(self, raw: Any, lane: Lane) -> None:
+        """Store an item unless one waits that the loop has not begun: then both are the same, and it is counted."""
+        queue = self._queues[lane]
+        if queue.items:
+            self._folded.value += 1
+        else:
+            queue.add(raw, 0)
+        self._inbox.line_up(queue, lane)
+
+
+class _Queue:
+    """Items of one source in one lane. Either side counts its bytes for itself: no sum is written by two threads."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.listed = False
+        self.items: deque[tuple[Any, int]] = deque()
+        self._added = 0
+        self._forgotten = 0
+        self._taken = 0
+
+    @property
+    def bytes(self) -> int:
+        """Bytes that wait."""
+        return self._added - self._forgotten - self._taken
+
+    def add(self, raw: Any, size: int) -> None:
+        self._added += size
+        self.items.append((raw, size))
+
+    def forget(self) -> None:
+        """Forget the oldest item, on the thread that adds."""
+        with contextlib.suppress(IndexError):  # the loop was quicker
+            self._forgotten += self.items.popleft()[1]
+
+    def take(self) -> Any:
+        """Take the oldest item, on the loop's thread; raise IndexError where there is none."""
+        raw, size = self.items.popleft()
+        self._taken += size
+        return raw

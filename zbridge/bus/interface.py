@@ -102,17 +102,21 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 
 
 class Lane(IntEnum):
-    """What waits for the event loop, in the order it is served; each lane has its own bound."""
+    """What waits for the event loop, in the order it is served; each lane has its own bound and its own share."""
 
     STOP = 0
     COMMAND = 1
     OTHER = 2
 
 
-Look = Callable[[], tuple[str, bytes]]
-"""Gives the key and the payload that an authorization came with; of a question the asked key, and no payload."""
-LaneOf = Callable[[bytes | None, Look], Lane]
-"""Chooses a lane by a sample's attachment or a question's payload; called on the bus's own threads: quick and sure."""
+Look = Callable[[], bytes]
+"""Gives the payload that an authorization proves; of a question, whose payload the authorization is, none."""
+Sort = Callable[[str, bytes | None, int, Look], Lane | None]
+"""Chooses a lane, or drops what came (None) and counts it; called on the bus's own threads: quick and sure.
+
+Arguments: the key (of a question what was asked, perhaps with wildcards), the attachment of a sample or the payload of
+a question, the bytes of payload and attachment together, and a look at the payload.
+"""
 
 
 class Bus(Protocol):
@@ -136,12 +140,15 @@ class Bus(Protocol):
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | LaneOf = Lane.OTHER,
+        lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
-        """Take samples by way of a lane; ``history`` asks for last values too."""
+        """Take samples by way of a lane; ``history`` asks for last values too.
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
+        Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
+        """
+
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:

@@ -27,14 +27,15 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, LaneOf, Publisher, Question, Sample
+from zbridge.bus.inbox import Inbox, Source
+from zbridge.bus.interface import Answer, Batch, BusSettings, Handle, Lane, Look, Publisher, Question, Sample, Sort
 from zbridge.bus.writer import Writer
 from zbridge.errors import BusError, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Denied
-from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic, is_concrete
+from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, SizeBounds, Topic, is_concrete
 from zbridge.metrics import Count, Metrics
+from zbridge.session.allowance import Allowance
 
 log = logging.getLogger("zbridge.bus")
 
@@ -44,6 +45,8 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
 PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
+QUESTIONS_HZ = 500.0
+"""Questions a second that one queryable answers."""
 LEAVE_S = 0.4
 """Longest time leaving the bus takes."""
 FLUSH_S = 2.0
@@ -64,6 +67,8 @@ REPLIES = 10_000
 _EACH = 16
 """Most replies of one session to a query for one key."""
 _TIDY = 64
+_INGRESS = ("ingress",)
+_BOUNDED = ("put", "delete", "query")
 _DENIED = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(Denied))
 
 _PRIORITIES = {
@@ -77,7 +82,7 @@ _CONGESTIONS = {
 }
 
 
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zenoh.Config:
+def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
     """Write settings as a Zenoh configuration; raise BusError naming what Zenoh does not take."""
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
@@ -91,6 +96,17 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zeno
     }
     if settings.listen:
         values["listen/endpoints"] = settings.listen
+    if bounds:
+        values["low_pass_filter"] = [
+            {
+                "id": str(number),
+                "flows": _INGRESS,
+                "messages": _BOUNDED,
+                "key_exprs": key_exprs,
+                "size_limit": most_bytes,
+            }
+            for number, (key_exprs, most_bytes) in enumerate(bounds)
+        ]
     if settings.effective_mode == "client":
         values["connect/timeout_ms"] = int(OPEN_S * 1000)
     if settings.tls is not None:
@@ -109,9 +125,11 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False) -> zeno
     return config
 
 
-async def open_zenoh(settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False) -> ZenohBus:
+async def open_zenoh(
+    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
-    config = zenoh_config(settings, wait_for_peers=wait_for_peers)
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds)
     try:
         session = await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
@@ -134,6 +152,7 @@ class ZenohBus:
         self._loop = loop
         self._inbox = Inbox(loop, metrics)
         self._replies_dropped = metrics.count("bus_replies_dropped")
+        self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
         self._lossless = stream == "block"
         self._writer = Writer("states", metrics, lossless=self._lossless, relieved=self._relieve)
@@ -180,26 +199,15 @@ class ZenohBus:
         key_expr: str,
         handler: Callable[[Sample], None],
         *,
-        lane: Lane | LaneOf = Lane.OTHER,
+        lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
-        """Take samples by way of a lane; ``history`` asks for last values too."""
-        inbox = self._inbox
+        """Take samples by way of a lane; ``history`` asks for last values too.
 
-        if isinstance(lane, Lane):
-
-            def store(sample: zenoh.Sample) -> None:
-                inbox.put(handler, sample, _read_sample, lane)
-        else:
-
-            def store(sample: zenoh.Sample) -> None:
-                attachment = sample.attachment
-                own = lane(
-                    attachment.to_bytes() if attachment is not None else None,
-                    lambda: (str(sample.key_expr), sample.payload.to_bytes()),
-                )
-                inbox.put(handler, sample, _read_sample, own)
-
+        Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
+        """
+        source = self._inbox.source(handler, _read_sample)
+        store = _store_by(lane, source) if isinstance(lane, Lane) else _store_sorted(lane, source)
         if not history:
             return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
         config = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -207,20 +215,13 @@ class ZenohBus:
             _Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
         )
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
-        inbox, writer = self._inbox, self._writer
-
-        def choose(query: zenoh.Query) -> Lane:
-            if isinstance(lane, Lane):
-                return lane
-            payload = query.payload
-            return lane(payload.to_bytes() if payload is not None else None, lambda: (str(query.key_expr), b""))
-
-        def store(query: zenoh.Query) -> None:
-            own = choose(query)
-            inbox.put(handler, query, lambda raw: _Question(raw, key, writer), own)
-
+        writer = self._writer
+        source = self._inbox.source(handler, lambda raw: _Question(raw, key, writer))
+        store = _store_sorted_questions(
+            _sparing(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
+        )
         return self._keep(_Declared(self._session.declare_queryable(key, store)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
@@ -258,14 +259,7 @@ class ZenohBus:
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
-        inbox = self._inbox
-
-        def tell(change: tuple[str, bool]) -> None:
-            handler(*change)
-
-        def store(sample: zenoh.Sample) -> None:
-            inbox.put(tell, sample, _read_change, Lane.STOP)
-
+        store = _store_by(Lane.STOP, self._inbox.source(lambda change: handler(*change), _read_change))
         return self._keep(_Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
 
     async def flush(self) -> None:
@@ -366,6 +360,58 @@ class ZenohBus:
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may swallow a cancellation
                 await done
         return list(replies)
+
+
+def _store_by(lane: Lane, source: Source) -> Callable[[Any], None]:
+    """Make the callback of what comes by one lane."""
+
+    def store(raw: Any) -> None:
+        source.put(raw, lane)
+
+    return store
+
+
+def _sparing(lane: Lane, clock: Callable[[], float]) -> Sort:
+    """Let so many questions a second go by a lane; what asks more often gets no answer."""
+    allowance = Allowance(QUESTIONS_HZ)
+
+    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        return lane if allowance.take(clock()) else None
+
+    return sort
+
+
+def _store_sorted(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None]:
+    """Make the callback of samples that are sorted before the event loop hears of them."""
+
+    def store(sample: zenoh.Sample) -> None:
+        attachment, payload = sample.attachment, sample.payload
+        shown = attachment.to_bytes() if attachment is not None else None
+        size = len(payload) + (len(shown) if shown is not None else 0)
+        lane = sort(str(sample.key_expr), shown, size, payload.to_bytes)
+        if lane is Lane.STOP:
+            source.fold(sample, lane)
+        elif lane is not None:
+            source.put(sample, lane, size)
+
+    return store
+
+
+def _store_sorted_questions(sort: Sort, source: Source, unanswered: Count) -> Callable[[zenoh.Query], None]:
+    """Make the callback of queries that are sorted before the event loop hears of them."""
+
+    def store(query: zenoh.Query) -> None:
+        payload = query.payload
+        shown = payload.to_bytes() if payload is not None else None
+        size = len(shown) if shown is not None else 0
+        lane = sort(str(query.key_expr), shown, size, bytes)
+        if lane is None:
+            unanswered.value += 1
+            query.drop()  # type: ignore[no-untyped-call]
+        else:
+            source.put(query, lane, size)
+
+    return store
 
 
 def _options(topic: Topic) -> dict[str, Any]:

@@ -6,7 +6,7 @@ Names in keys: bytes outside ``[A-Za-z0-9_.-]`` become ``%XX``; an empty name is
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
 from functools import lru_cache
 from urllib.parse import unquote
@@ -73,11 +73,15 @@ class QoS(msgspec.Struct, frozen=True):
 
 
 class Topic(msgspec.Struct, frozen=True):
-    """One key of a robot: ``path`` below ``<realm>/<robot>/``."""
+    """One key of a robot: ``path`` below ``<realm>/<robot>/``.
+
+    most_bytes: what payload and attachment of a command or a query may have together.
+    """
 
     path: str
     message: type[FleetMessage]
     delivery: Delivery
+    most_bytes: int | None = None
 
     @property
     def qos(self) -> QoS:
@@ -85,6 +89,8 @@ class Topic(msgspec.Struct, frozen=True):
         return _DRIVE_QOS if self.message is Drive else QOS[self.delivery]
 
 
+SizeBounds = Sequence[tuple[tuple[str, ...], int]]
+"""Key expressions, and the most bytes that payload and attachment may have together on each."""
 Family = Callable[[str], Topic]
 """Topics that share all but the last chunk: ``SENSOR("front left")``."""
 
@@ -95,6 +101,15 @@ QOS = {
     Delivery.QUERY: QoS(Priority.REAL_TIME, Congestion.BLOCK, express=True),
 }
 _DRIVE_QOS = QoS(Priority.REAL_TIME, Congestion.DROP, express=True)
+
+SMALL_BYTES = 256
+"""Bytes of what says little: a motion, a switch, a proof."""
+QUERY_BYTES = 1024
+"""Bytes of a query: an acquire with the longest names."""
+SETTING_BYTES = 16_384
+"""Bytes of a sensor setting of 1 000 values, and of what a listener tells that it refused."""
+LARGE_BYTES = 65_536
+"""Bytes of a scan of 16 000 points, of a text, and of what only the robot's protocol can read."""
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _ESCAPED = re.compile(rb"[^A-Za-z0-9_.-]")
@@ -131,10 +146,10 @@ def is_concrete(key: str) -> bool:
     return "*" not in key
 
 
-def _family(prefix: str, message: type[FleetMessage], delivery: Delivery) -> Family:
+def _family(prefix: str, message: type[FleetMessage], delivery: Delivery, most_bytes: int | None = None) -> Family:
     @lru_cache(maxsize=1024)
     def topic(name: str) -> Topic:
-        return Topic(f"{prefix}/{escape(name)}", message, delivery)
+        return Topic(f"{prefix}/{escape(name)}", message, delivery, most_bytes)
 
     return topic
 
@@ -154,26 +169,26 @@ LIDAR = Topic("lidar", Switch, Delivery.STATE)
 CAMERA = Topic("camera", Switch, Delivery.STATE)
 DEVICES = Topic("devices", Devices, Delivery.STATE)
 
-CMD_DRIVE = Topic("@cmd/drive", Drive, Delivery.COMMAND)
-CMD_STOP = Topic("@cmd/stop", Stop, Delivery.COMMAND)
-CMD_MODE = Topic("@cmd/mode", Mode, Delivery.COMMAND)
-CMD_LIGHT = Topic("@cmd/light", Switch, Delivery.COMMAND)
-CMD_LIDAR = Topic("@cmd/lidar", Switch, Delivery.COMMAND)
-CMD_CAMERA = Topic("@cmd/camera", Switch, Delivery.COMMAND)
-CMD_TEXT = Topic("@cmd/text", Text, Delivery.COMMAND)
-CMD_SCAN = Topic("@cmd/scan", Scan, Delivery.COMMAND)
-CMD_MOTOR = _family("@cmd/motor", Motor, Delivery.COMMAND)
-CMD_SENSOR = _family("@cmd/sensor", SensorSetting, Delivery.COMMAND)
-CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND)
+CMD_DRIVE = Topic("@cmd/drive", Drive, Delivery.COMMAND, SMALL_BYTES)
+CMD_STOP = Topic("@cmd/stop", Stop, Delivery.COMMAND, SMALL_BYTES)
+CMD_MODE = Topic("@cmd/mode", Mode, Delivery.COMMAND, SMALL_BYTES)
+CMD_LIGHT = Topic("@cmd/light", Switch, Delivery.COMMAND, SMALL_BYTES)
+CMD_LIDAR = Topic("@cmd/lidar", Switch, Delivery.COMMAND, SMALL_BYTES)
+CMD_CAMERA = Topic("@cmd/camera", Switch, Delivery.COMMAND, SMALL_BYTES)
+CMD_TEXT = Topic("@cmd/text", Text, Delivery.COMMAND, LARGE_BYTES)
+CMD_SCAN = Topic("@cmd/scan", Scan, Delivery.COMMAND, LARGE_BYTES)
+CMD_MOTOR = _family("@cmd/motor", Motor, Delivery.COMMAND, SMALL_BYTES)
+CMD_SENSOR = _family("@cmd/sensor", SensorSetting, Delivery.COMMAND, SETTING_BYTES)
+CMD_RAW = _family("@cmd/raw", Raw, Delivery.COMMAND, LARGE_BYTES)
 
-RPC_SESSIONS = _family("@rpc/sessions", Query, Delivery.QUERY)
-RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY)
-RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY)
-RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY)
-RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY)
-RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY)
-RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY)
-RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY)
+RPC_SESSIONS = _family("@rpc/sessions", Query, Delivery.QUERY, QUERY_BYTES)
+RPC_MAP = Topic("@rpc/map", Query, Delivery.QUERY, QUERY_BYTES)
+RPC_POSE = Topic("@rpc/pose", Query, Delivery.QUERY, QUERY_BYTES)
+RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY, QUERY_BYTES)
+RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY, QUERY_BYTES)
+RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY, SMALL_BYTES)
+RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY, SMALL_BYTES)
+RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
 
 _TOPICS = {
     topic.path: topic
@@ -194,6 +209,29 @@ _FAMILIES = {
     "@rpc/control/takeover": RPC_TAKEOVER,
     "@rpc/control/refused": RPC_REFUSED,
 }
+
+
+def _bounded() -> Iterator[tuple[str, int]]:
+    """Give every command and query below a robot, families with a wildcard, and its bound."""
+    for topic in _TOPICS.values():
+        if topic.most_bytes is not None:
+            yield topic.path, topic.most_bytes
+    for prefix, family in _FAMILIES.items():
+        most_bytes = family("").most_bytes
+        if most_bytes is not None:
+            yield f"{prefix}/*", most_bytes
+
+
+def size_bounds() -> SizeBounds:
+    """Give the most bytes that may come in on every command and query of any robot.
+
+    Beyond the keys of the design stand all others of their kind, and whatever is put with wildcards: a message has to
+    keep within every bound whose key expression holds its key.
+    """
+    groups: dict[int, list[str]] = {LARGE_BYTES: ["**/@cmd/**"], QUERY_BYTES: ["**/@rpc/**"]}
+    for path, most_bytes in _bounded():
+        groups.setdefault(most_bytes, []).append(f"**/{path}")
+    return tuple((tuple(key_exprs), most_bytes) for most_bytes, key_exprs in sorted(groups.items()))
 
 
 def find(path: str) -> Topic | None:

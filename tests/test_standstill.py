@@ -97,17 +97,67 @@ async def test_neutral_ends_autonomous_mode_and_the_stop_after_it_is_the_pair() 
 
 
 @jumping
-async def test_opaque_packets_count_as_motion_until_neutral() -> None:
+async def test_whoever_only_chats_does_not_drive() -> None:
     async with established(idle_stop_s=1.0) as rig:
         rig.hold()
         rig.command("raw/tcpudp", {"id": 40, "body": b"x"})
         await asyncio.sleep(0.2)
         rig.forget_written()
-        await asyncio.sleep(5.0)
-        assert STOP not in rig.written()
-        rig.command("drive", NEUTRAL)
         await asyncio.sleep(10.0)
         assert rig.written().count(STOP) >= 9
+
+
+@jumping
+async def test_a_stop_drops_the_raw_packets_that_wait() -> None:
+    """Whatever they do to the robot: after its stop nothing of the lease that ended may come."""
+    async with established(idle_stop_s=1.0) as rig:
+        rig.hold()
+        for number in range(30):
+            rig.command("raw/tcpudp", {"id": 21, "body": bytes([number])})
+        rig.command("stop", {})
+        rig.forget_written()
+        await asyncio.sleep(5.0)
+        assert set(rig.written()) == {STOP}
+
+
+@jumping
+async def test_a_gateway_that_ends_while_the_link_takes_nothing_leaves_the_stop_to_the_kernel() -> None:
+    async with established(deadman_s=5.0) as rig:
+        rig.hold()
+        await drive_for(rig, 0.5)
+        rig.link.unacknowledged_s = 1.0
+        await drive_for(rig, 0.5)
+        rig.forget_written()
+    assert rig.written()[0] == STOP
+    assert not any(map(is_move, rig.written()))
+
+
+@jumping
+async def test_the_drive_that_finds_the_link_open_again_is_no_motion_but_refused() -> None:
+    async with established(deadman_s=5.0, idle_stop_s=1.0) as rig:
+        rig.hold()
+        await drive_for(rig, 0.5)
+        rig.link.unacknowledged_s = 1.0
+        await asyncio.sleep(0.01)
+        rig.command("drive", FORWARD)
+        rig.forget_written()
+        rig.link.unacknowledged_s = 0.0
+        rig.command("drive", FORWARD)
+        await asyncio.sleep(3.0)
+        assert set(rig.written()) == {STOP}
+        reasons = [reason for _, reason, _ in await rig.refusals()]
+        assert "the robot's link took nothing: send a neutral drive first" in reasons
+
+
+@jumping
+async def test_nothing_is_asked_of_a_robot_whose_link_takes_nothing() -> None:
+    async with established() as rig:
+        rig.hold()
+        await drive_for(rig, 0.2)
+        rig.link.unacknowledged_s = 1.0
+        rig.command("drive", NEUTRAL)
+        (answer,) = rig.ask("pose").replies
+        assert str(answer.error) == "the robot's link takes nothing"
 
 
 @jumping

@@ -79,6 +79,11 @@ class Commands:
         if not self._robot.ready:
             raise NotReady(session.busy or session.state.value)
 
+    def require_flowing(self) -> None:
+        """Raise Refused where the robot's link takes nothing: what waits for it would come after the stop."""
+        if self.blocked:
+            raise NotReady(LINK_BLOCKED)
+
     def require_sure(self) -> None:
         """Raise Refused where the robot is not to be set in motion: what it is told later might not arrive."""
         session = self._robot.driving
@@ -114,8 +119,7 @@ class Commands:
             self._move(topic, command, now, who)
             return
         self.require_ready()
-        if self.blocked:
-            raise NotReady(LINK_BLOCKED)
+        self.require_flowing()
         autonomous = isinstance(command, Mode) and command.mode == "autonomous"
         if autonomous or isinstance(command, Raw):
             self.require_sure()
@@ -144,10 +148,12 @@ class Commands:
         outcome = self._robot.command(topic, command, now)
         self._unwritten.value += self.blocked
         self._pump()  # the robot first, the accounts after it
+        if command.moving:
+            self._authority.require_motion()  # the link may just have begun to take again: a stop went instead
         if isinstance(command, Drive):
             self._limits.sent(command, now)
         self._authority.applied(topic.path, now, moving=command.moving)
-        if not command.moving:
+        if isinstance(command, Drive) and not self._authority.driven:
             self._leases.standstill.neutral(now)
         self._show(topic, outcome, who)
 

@@ -27,6 +27,8 @@ from zbridge.protocol import Protocol, find_protocol
 T = TypeVar("T")
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 
+LEAST_IDLE_STOP_S = 0.1
+
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
@@ -149,6 +151,11 @@ class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     audit_bytes: Annotated[int, msgspec.Meta(ge=1000)] = 1_000_000
     audit_files: Annotated[int, msgspec.Meta(ge=1)] = 5
     audit_days: Annotated[float, msgspec.Meta(ge=0)] = 30.0
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a stop that would come more often than robots can take."""
+        if 0 < self.idle_stop_s < LEAST_IDLE_STOP_S:
+            raise ValueError(f"idle_stop_s: expected 0, or at least {LEAST_IDLE_STOP_S:g}")
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -141,7 +141,7 @@ class Conversation:
         if session.drops_source and link is not None:
             session.drops_source = False
             link.drop_source()
-        writing = link is not None and self._takes(link)
+        writing = link is not None and (session.over or self._takes(link))  # last words are written in any case
         while writing and link is not None and link.ready:
             frame = session.outgoing(self._clock())
             if frame is None:

@@ -370,7 +370,9 @@ class Device:
             known = self._robot.known(topic)
             if known is not None:
                 question.answer(payloads.encode(known))
-            elif self._questions.add(topic, question):
+                return
+            self._commands.require_flowing()
+            if self._questions.add(topic, question):
                 self._robot.ask(topic)
                 self._pump()
         except Refused as refusal:

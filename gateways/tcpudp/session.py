@@ -6,6 +6,7 @@ Source: "Handshake", "Settings and version negotiation" and "The gateway as HQ" 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable
 
 from gateways.tcpudp.messages import (
@@ -38,6 +39,7 @@ from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, Malformed, NotReady, ProtocolError, Unsupported
 from zbridge.session.negotiation import agree, newest, parse_versions
+from zbridge.session.outbox import LIMIT
 from zbridge.session.probe import Probe, Verdict
 from zbridge.session.session import Datagram, Limits, Role, Session, State
 
@@ -52,6 +54,8 @@ SILENCE_S = 2.5
 """Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7: it sleeps 2 s, and may be late."""
 CLIENT_PORT = 11000
 """The UDP port that deployed HQ programs bind."""
+HEARD = 0.9
+"""Of the time that an HQ waits for a 6, how much a 7 may take that answers one."""
 RIVAL = "another source of datagrams claims to be this client"
 LATE_START = "handshaking"
 AGAIN_S = 0.3
@@ -162,6 +166,8 @@ class HqSession(_TcpUdpSession):
         self._silent_until = math.inf
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
+        self._raw: deque[bytes] = deque(maxlen=LIMIT)
+        """The packets that nobody here can read, as they were queued: as many as can wait."""
         self._signs: Signs = Signs(predecessor._signs if predecessor is not None else None)
         self._look_at = math.inf
         self._others = 0
@@ -253,6 +259,19 @@ class HqSession(_TcpUdpSession):
         """Drop what is still to be repeated: the robot is stopped."""
         self.outbox.clear(_MODE_AGAIN)
         self.outbox.clear(_LIDAR_AGAIN)
+
+    def send_raw(self, packet: Packet) -> None:
+        """Queue a packet that nobody here can read; raise Refused, EncodeError."""
+        frame = self.encode(packet)
+        self.outbox.put(frame)
+        self._raw.append(frame)
+
+    def withdraw_raw(self) -> None:
+        """Forget the packets that nobody here can read and that still wait: they might move a robot after its stop."""
+        waiting = len(self.outbox)
+        while self._raw:
+            self.outbox.unqueue(self._raw.popleft())
+        self.traffic.dropped += waiting - len(self.outbox)
 
     def withdraw_autonomous(self) -> None:
         """Let no mode 3 leave any more, neither for the first time nor again."""
@@ -431,6 +450,8 @@ class RobotSession(_TcpUdpSession):
         self._agreed = ""
         self._probe = Probe(PROBE_S)
         self._report = Probe(REPORT_S)
+        self._heard_until = -math.inf
+        """Until when a 7 answers a 6 that was heard."""
         self._answer: Datagram | None = None
         """Packet 6, once it was queued."""
         self._client_port = client_port
@@ -459,7 +480,7 @@ class RobotSession(_TcpUdpSession):
         elif isinstance(message, ClientUDPConnectionStatus):
             if self.state is not State.HANDSHAKING:
                 raise ProtocolError("clientUDPConnectionStatus was not due")
-            self._take_report(works=message.connected)
+            self._take_report(works=message.connected and now < self._heard_until)
         elif isinstance(message, ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
@@ -552,11 +573,13 @@ class RobotSession(_TcpUdpSession):
             self._limit_at = math.inf
             self.send_first(ServerStartUDP())
             self._probe.begin(now)
+            self._heard_until = now + HEARD * PROBE_S
         else:
             self._finish()
 
     def _take_report(self, *, works: bool) -> None:
-        """End the handshake with packet 7. Programs of 1.3 say true whatever happened; false is the truth.
+        """End the handshake with packet 7. Programs of 1.3 say true whatever happened, false is the truth, and who
+        heard a 6 answers at once: a 7 that comes when waiting for it has ended is of one that heard none.
 
         An HQ that got no 6 may not be who sent the 5 that was answered; nor one that never says.
         """

@@ -73,7 +73,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     udp: bool = True
-    gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
+    gap_s: Annotated[float, msgspec.Meta(ge=0, le=0.25)] = 0.01
     force: tuple[FeatureName | PacketId, ...] = ()
     announce: tuple[FeatureName, ...] = tuple(feature.value for feature in ANNOUNCED)
     combine: Literal["exclusive", "both"] = "exclusive"
@@ -205,6 +205,7 @@ class TcpUdpRobot(Robot):
         """Send packet 13, in mode 3 the pair 1, 13; what was still to be sent again is not, unless this is routine."""
         session = self._connected()
         session.withdraw_autonomous()
+        session.withdraw_raw()
         if until > now:
             session.send_nothing_again()
         self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
@@ -276,7 +277,7 @@ class TcpUdpRobot(Robot):
         return Outcome(telemetry=((topics.SCAN, command),))
 
     def _send_raw(self, command: Raw, now: float) -> None:
-        self._send(_raw_packet(command))
+        self._connected().send_raw(_raw_packet(command))
 
     def _send(self, message: Packet) -> None:
         self._connected().send(message)

@@ -253,8 +253,10 @@ class Wc2EcRobot(Robot):
         return Outcome()
 
     def stop(self, now: float, until: float) -> None:
-        """Let every rotational motor stand; linear ones hold their position by themselves."""
+        """Let every rotational motor stand; linear ones hold their position, and what waits for them is dropped."""
         if self._dialect is Dialect.DEPLOYED:
+            for device in self._table.motors(LINEAR):
+                self._connected().outbox.clear(_slot(device))
             for device in self._table.motors(ROTATIONAL):
                 self._stand(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
@@ -308,8 +310,7 @@ class Wc2EcRobot(Robot):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
         frame = session.encode(SetValue(device.type, device.number, value))
-        slot = f"motor {device.number}"
-        session.outbox.stand(slot, (frame,), now, period_s=period_s, until=until, urgent=urgent)
+        session.outbox.stand(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
 
     def _motor(self, name: str, value: float, now: float) -> None:
         device = self._table.named(name)
@@ -351,6 +352,11 @@ class Wc2EcRobot(Robot):
         if self._session is None:
             raise NotReady("offline")
         return self._session
+
+
+def _slot(device: Device) -> str:
+    """Name the place in the outbox where the newest value of a motor waits."""
+    return f"motor {device.number}"
 
 
 class Ring:

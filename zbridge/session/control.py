@@ -88,8 +88,6 @@ class Authority:
         """Whether the robot may have moved by itself since its last stop: no deadman, but every other stop."""
         self._autonomous = False
         """Whether its mode is autonomous, since its last stop or neutral."""
-        self._opaque = False
-        """Whether it was sent what nobody here can read, since its last stop or neutral: it may move by that."""
         self.verifier: Verifier | None = None
         """Of the lease that is held; other threads use it to sort what comes in."""
         self._random = random
@@ -118,7 +116,7 @@ class Authority:
     @property
     def driven(self) -> bool:
         """Whether somebody drives the robot, or lets it drive: else it is to be at rest."""
-        return bool(self._moving) or self._autonomous or self._opaque
+        return bool(self._moving) or self._autonomous
 
     # The lease
 
@@ -186,7 +184,7 @@ class Authority:
         else:
             self._moving.discard(part)
             if not self._moving:  # neutral takes the robot out of its mode too
-                self._autonomous = self._opaque = False
+                self._autonomous = False
             self._held_back = None
         deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
         self._stop_at = now + deadman_s if self._moving else math.inf
@@ -198,7 +196,7 @@ class Authority:
 
     def sent_opaque(self) -> None:
         """Take note that the holder had the robot sent what nobody here can read: it may move by it."""
-        self._opaque = self.on_its_own = True
+        self.on_its_own = True
 
     def refuse(
         self, command: str, refusal: Refused, who: str | None = None, *, by: str | None = None, count: int = 1
@@ -357,7 +355,7 @@ class Authority:
 
     def _still(self) -> None:
         self._moving.clear()
-        self.on_its_own = self._autonomous = self._opaque = False
+        self.on_its_own = self._autonomous = False
         self._stop_at = math.inf
 
 

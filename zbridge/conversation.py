@@ -255,10 +255,14 @@ class Conversation:
 
 
 class Accepted(Receiver):
-    """The receiver of a link that was accepted: its conversation is made by ``admit``, which may refuse one."""
+    """The receiver of a link that was accepted: its conversation is made by ``admit``, which may refuse one.
 
-    def __init__(self, admit: Callable[[Link], Conversation | None]) -> None:
+    ``level``: of the line of the log about the end of the link.
+    """
+
+    def __init__(self, admit: Callable[[Link], Conversation | None], level: int = logging.INFO) -> None:
         self._admit = admit
+        self._level = level
         self._conversation: Conversation | None = None
 
     def __repr__(self) -> str:
@@ -280,7 +284,7 @@ class Accepted(Receiver):
     def lost(self, reason: str) -> None:
         """Take note that the link is gone."""
         if self._conversation is not None:
-            log.debug("%s: %s", self._conversation.session.peer, reason)
+            log.log(self._level, "%s: %s", self._conversation.session.peer, reason)
             self._conversation.lost(reason)
 
     def received_datagram(self, datagram: bytes) -> None:

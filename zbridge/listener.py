@@ -148,7 +148,10 @@ class Listener:
         """Listen until cancelled; then take leave of every client, and give the robot back. Raises LinkError."""
         self._audience.follow(self._side.follows, self._on_message, self._on_gateway)
         async with listen(
-            self._plan.address, lambda: Accepted(self._admit), datagrams=self._side.datagrams, foreign=self._foreign
+            self._plan.address,
+            lambda: Accepted(self._admit, logging.DEBUG),  # what ended is told of the client
+            datagrams=self._side.datagrams,
+            foreign=self._foreign,
         ) as self.address:
             log.info("%s: HQ programs connect at %s", self.name, self.address)
             self.ready.set()

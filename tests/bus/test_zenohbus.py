@@ -385,9 +385,11 @@ async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called
             sender.put(key, bytes(payload), attachment=bytes(attachment), congestion_control=BLOCK)
         assert list(sender.get("fleet/r1/@rpc/pose", payload=bytes(1025), timeout=SOON_S)) == []
 
-    await asyncio.to_thread(put_all)
-    await seen.until(lambda: 1 in seen)
-    assert seen == [most - 10, 1]
-    assert called == [most, 1]
-    await asyncio.to_thread(sender.close)
-    await gateway.close()
+    try:
+        await asyncio.to_thread(put_all)
+        await seen.until(lambda: 1 in seen)
+        assert seen == [most - 10, 1]
+        assert called == [most, 1]
+    finally:
+        await asyncio.to_thread(sender.close)
+        await gateway.close()

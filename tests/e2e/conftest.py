@@ -19,6 +19,7 @@ import msgpack
 import pytest
 import zenoh
 
+from tests.e2e.machine import Withheld
 from tests.proofs import Holder, packed
 
 T = TypeVar("T")
@@ -188,6 +189,8 @@ class Bench:
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._stack = stack
+        self._processes: list[int] = []
+        self._withheld = Withheld()
         self.fleet = Fleet(self._stack.enter_context(self.router()))
         self._stack.callback(lambda: self.fleet.close())
 
@@ -200,8 +203,14 @@ class Bench:
 
     def zbridge(self, *arguments: str, **popen: Any) -> subprocess.Popen[str]:
         process = start(*arguments, **popen)
+        self._processes.append(process.pid)
         self._stack.callback(end, process, signal.SIGKILL)
         return process
+
+    @property
+    def withheld_s(self) -> float:
+        """The processor time that was withheld so far from this process and those it started: what excuses a delay."""
+        return self._withheld.seconds(self._processes)
 
     def simulator(self, port: int, protocol: str = "tcpudp", *more: str) -> subprocess.Popen[str]:
         process = self.zbridge("simulate", protocol, "--listen", f"tcp://127.0.0.1:{port}", *more)

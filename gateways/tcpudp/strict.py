@@ -183,7 +183,6 @@ class StrictRobot(Judge):
 
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
-        loop = asyncio.get_running_loop()
         try:
             settings = wire.server_settings(self.version, self.client_id, self.features)
             await self._send(wire.SERVER_SETTINGS, settings)
@@ -211,8 +210,8 @@ class StrictRobot(Judge):
     async def _read(self, data: bytes) -> None:
         """Take what one read gave as one packet: what piled up while this process stood still is lost.
 
-        Packets that were spaced as they are to be need a while to pile up. Those that came within less, after a moment at
-        which there was nothing to read, were not spaced: the HQ joined them, however late this process is.
+        Packets that were spaced as they are to be need a while to pile up. Those that came within less, after a moment
+        at which there was nothing to read, were not spaced: the HQ joined them, however late this process is.
         """
         received, problem = self._reads.take(data)
         joined = self._reads.joined

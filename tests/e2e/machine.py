@@ -30,6 +30,16 @@ class Withheld:
         return sum(self._known.values()) + _stolen_s()
 
 
+def contended_s() -> float:
+    """Give for how long so far anything at all on this machine was ready to run and had no processor.
+
+    A process that is killed ends only when each of its threads had one, and nobody can ask it afterwards.
+    """
+    with contextlib.suppress(OSError, ValueError, IndexError), open("/proc/pressure/cpu") as file:
+        return int(file.readline().rpartition("total=")[2]) / 1e6
+    return 0.0
+
+
 def _waited_s(pid: int) -> float:
     waited_s = 0.0
     with contextlib.suppress(OSError):  # it has ended, or the system does not tell

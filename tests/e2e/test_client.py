@@ -118,6 +118,13 @@ async def lost(drive: Any) -> str:
     return str(raised.value)
 
 
+async def drives_now_and_then(drive: Any) -> None:
+    """Drive less often than the deadman wants it, until that is refused."""
+    for _ in range(20):
+        await drive(turn=0.5)
+        await asyncio.sleep(0.3)
+
+
 # The client
 
 
@@ -192,9 +199,7 @@ async def test_an_idle_driver_keeps_the_robot_and_a_tired_one_must_send_neutral(
     async with client(bench) as fleet, fleet[ROBOT].control(ME, lease_s=1.0, deadman_s=0.1) as drive:
         await asyncio.sleep(2.0)
         with pytest.raises(Refused, match=rf"^{ROBOT}: drive: deadman: send a neutral drive first$"):
-            for _ in range(20):
-                await drive(turn=0.5)
-                await asyncio.sleep(0.3)
+            await drives_now_and_then(drive)
         before = heading(bench)
         async with asyncio.timeout(WAIT_S):
             while turned(bench, before) < 0.05:

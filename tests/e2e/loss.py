@@ -37,6 +37,8 @@ LATE_S = 0.05
 """Seconds after the deadman in which the stop must be at the robot."""
 FROZEN_S = 0.8
 """Seconds for which something is frozen after the deadman."""
+READ_S = 0.2
+"""Seconds that the robot is given to read what was written before that."""
 DISTURBED = 8
 """Repetitions that may be done again at least."""
 IN_HAND = 3
@@ -155,6 +157,12 @@ def kill(process: subprocess.Popen[str]) -> None:
     for stream in (process.stdin, process.stdout):
         if stream is not None:
             stream.close()
+
+
+def frozen(pid: int) -> bool:
+    """Tell whether every thread of a process stands still: on a busy machine some are told late."""
+    states = [(task / "stat").read_text().rpartition(")")[2].split()[0] for task in Path(f"/proc/{pid}/task").iterdir()]
+    return set(states) == {"T"}
 
 
 def part(name: str, *arguments: object) -> list[str]:
@@ -420,7 +428,8 @@ def let_driver_end(scene: Scene) -> float:
 def freeze_gateway(scene: Scene) -> float:
     """Freeze the gateway while the driver drives on; the time runs from when it goes on."""
     scene.gateway.send_signal(signal.SIGSTOP)
-    time.sleep(0.05)
+    until(lambda: frozen(scene.gateway.pid), what="a frozen gateway")
+    time.sleep(READ_S)
     quiet = len(scene.robot.frames)
     time.sleep(scene.deadman_s + FROZEN_S)
     if len(scene.robot.frames) > quiet:

@@ -29,8 +29,8 @@ _TICK_S = 0.02
 _DATAGRAM_BYTES = 65536
 _BIND_TRIES = 20
 _FROZEN_KEPT = 16
-_LATE_S = 0.1
-"""How late this process may be before what it reads is taken to have piled up."""
+_LOOK_S = 0.006
+"""Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
 _log = logging.getLogger(__name__)
 
 
@@ -97,6 +97,8 @@ class StrictRobot(Judge):
         self.client_id = client_id or random.Random(seed).randint(1, 255)
         self.received: list[tuple[float, Channel, int, bytes]] = []
         self.misread: list[tuple[float, Channel, int, bytes]] = []
+        self.piled: list[tuple[float, Channel, int, bytes]] = []
+        """What was lost in a read that this process itself joined, for it was late."""
         self.machine = wire.Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
@@ -111,9 +113,7 @@ class StrictRobot(Judge):
         self._udp: socket.socket | None = None
         self._sending = asyncio.Lock()
         self._tasks: asyncio.TaskGroup | None = None
-        self._late_s = 0.0
-        self._ticked_at = math.inf
-        self._pause_s, self._woke_at = 0.0, -math.inf
+        self._empty_at = self._unread_s = 0.0
         self._wake_at = 0.0
         self._closed_at = 0.0
         self._forget()
@@ -182,11 +182,11 @@ class StrictRobot(Judge):
 
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
-        loop = asyncio.get_running_loop()
         try:
             settings = wire.server_settings(self.version, self.client_id, self.features)
             await self._send(wire.SERVER_SETTINGS, settings)
-            while data := await loop.sock_recv(conn, wire.READ_BYTES):
+            self._empty_at = time.monotonic()
+            while data := await self._next(conn):
                 await self._read(data)
                 await self._nap()
             if self._broken:  # a send was told of it first, and the kernel tells once
@@ -200,27 +200,31 @@ class StrictRobot(Judge):
             with contextlib.suppress(OSError):
                 conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
 
+    async def _next(self, conn: socket.socket) -> bytes:
+        """Read as soon as there is anything; know at any time since when there was nothing."""
+        while (data := self._waiting()) is None:
+            await _readable(conn, _LOOK_S)
+        return data
+
     async def _read(self, data: bytes) -> None:
-        """Take what one read gave as one packet: what piled up while this process stood still is lost."""
+        """Take what one read gave as one packet: what piled up while this process stood still is lost.
+
+        Packets that were spaced as they are to be need a while to pile up. Those that came within less, after a moment
+        at which there was nothing to read, were not spaced: the HQ joined them, however late this process is.
+        """
         received, problem = self._reads.take(data)
+        joined = self._reads.joined
+        if joined and self._unread_s >= self._times.gap_s * (len(joined) - 1):
+            problem += f" (this process read nothing for {self._unread_s * 1000:.0f} ms)"
+            self.piled += [(time.monotonic(), "tcp", packet.kind, packet.body) for packet in joined]
+            del self.piled[: -self._keep]
         if problem:
-            late_s = max(self._late_s, self._stood_s())
-            late = late_s > 0.005 and "packets" in problem  # joined by this process rather than by the HQ?
-            self._violate(problem + f" (this process woke {late_s * 1000:.0f} ms late)" * late)
+            self._violate(problem)
         if received is not None:
             await self._take(received, "tcp")
 
-    def _stood_s(self) -> float:
-        """Tell for how long this process has just stood still; whichever of its tasks runs first may ask."""
-        now = time.monotonic()
-        since_tick_s = now - self._ticked_at
-        return since_tick_s if since_tick_s > _LATE_S else self._pause_s if now - self._woke_at < _LATE_S else 0.0
-
     async def _nap(self) -> None:
-        planned = self._sleeps.uniform(0, self._times.read_s)
-        start = time.monotonic()
-        await asyncio.sleep(planned)
-        self._late_s = time.monotonic() - start - planned
+        await asyncio.sleep(self._sleeps.uniform(0, self._times.read_s))
 
     async def _send(self, kind: int, body: bytes = b"") -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
@@ -430,9 +434,7 @@ class StrictRobot(Judge):
         last = time.monotonic()
         while True:
             await asyncio.sleep(_TICK_S)
-            self._ticked_at = now = time.monotonic()
-            if now - last > _LATE_S:
-                self._pause_s, self._woke_at = now - last, now
+            now = time.monotonic()
             self.machine.step(min(now - last, 0.1))
             last = now
 
@@ -464,11 +466,17 @@ class StrictRobot(Judge):
                     return
                 await self._send(kind, body or self.machine.body(kind))
 
-    def _waiting(self, flags: int = 0) -> bytes | None:
+    def _waiting(self) -> bytes | None:
         """Read what is there without waiting: none where nothing is, empty at the end of the stream."""
+        if self._conn is None:
+            return b""
+        looked_at, data = time.monotonic(), None
         with contextlib.suppress(BlockingIOError):
-            return self._conn.recv(wire.READ_BYTES, flags) if self._conn is not None else b""
-        return None
+            data = self._conn.recv(wire.READ_BYTES)
+            self._unread_s = time.monotonic() - self._empty_at
+        if data is None or len(data) < wire.READ_BYTES:
+            self._empty_at = looked_at
+        return data
 
 
 async def simulate_strict(
@@ -510,15 +518,18 @@ def _bind(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     return tcp, udp
 
 
-async def _readable(sock: socket.socket) -> None:
-    """Wait until a read would give something; the same with asyncio's and uvloop's loop."""
+async def _readable(sock: socket.socket, most_s: float = math.inf) -> None:
+    """Wait until a read would give something, or for ``most_s``; the same with asyncio's and uvloop's loop."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[None] = loop.create_future()
     loop.add_reader(sock.fileno(), _wake, future)
+    timer = loop.call_later(most_s, _wake, future) if most_s < math.inf else None
     try:
         await future
     finally:
         loop.remove_reader(sock.fileno())
+        if timer is not None:
+            timer.cancel()
 
 
 def _wake(future: asyncio.Future[None]) -> None:

@@ -75,6 +75,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
 
     read_s: float = 0.005
     """Longest sleep between two reads."""
+    gap_s: float = 0.01
+    """Least time between two packets of the HQ."""
     probe_s: float = 2.0
     """Sleep after packet 4, and the time a probe 5 may take."""
     silence_s: float = 2.5

@@ -19,19 +19,29 @@ import msgpack
 import pytest
 import zenoh
 
+from tests.e2e.machine import Withheld
 from tests.proofs import Holder, packed
 
 T = TypeVar("T")
 WAIT_S = 10.0
 
 
+_PORTS = range(20_000, 32_000)
+"""Below those that the kernel gives to connections."""
+_WORKERS = 16
 _given: set[int] = set()
+
+
+def _own_ports() -> range:
+    """Give the ports of this process: each worker of pytest-xdist has its own, as they know nothing of each other."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    return _PORTS if worker is None else _PORTS[int(worker.removeprefix("gw")) % _WORKERS :: _WORKERS]
 
 
 def free_port() -> int:
     """Find a port, for TCP and UDP, that nobody is given by chance: what listens there may be away for a while."""
     while True:
-        port = random.randrange(20_000, 32_000)
+        port = random.choice(_own_ports())
         if port in _given:
             continue
         _given.add(port)
@@ -179,6 +189,8 @@ class Bench:
         self.folder = folder
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._stack = stack
+        self._processes: list[int] = []
+        self._withheld = Withheld()
         self.fleet = Fleet(self._stack.enter_context(self.router()))
         self._stack.callback(lambda: self.fleet.close())
 
@@ -191,8 +203,14 @@ class Bench:
 
     def zbridge(self, *arguments: str, **popen: Any) -> subprocess.Popen[str]:
         process = start(*arguments, **popen)
+        self._processes.append(process.pid)
         self._stack.callback(end, process, signal.SIGKILL)
         return process
+
+    @property
+    def withheld_s(self) -> float:
+        """The processor time that was withheld so far from this process and those it started: what excuses a delay."""
+        return self._withheld.seconds(self._processes)
 
     def simulator(self, port: int, protocol: str = "tcpudp", *more: str) -> subprocess.Popen[str]:
         process = self.zbridge("simulate", protocol, "--listen", f"tcp://127.0.0.1:{port}", *more)

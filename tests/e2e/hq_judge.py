@@ -40,8 +40,6 @@ BETWEEN_S = 0.01
 """Seconds between the two wheels; the bytes of one take 6 ms besides. Deployed controllers take 11 to 20 ms."""
 IDLE_S = 0.3
 """Seconds between two neutrals of an external controller that idles."""
-EXCUSED = 2
-"""Violations at most that are put down to the judge's own process, which was late."""
 RANGES = tuple(120.0 + degree / 2 for degree in range(360))
 """Simulated lidar data: centimetres, one a degree."""
 ALF_FULL = {"text": 255, "binary": 100}
@@ -243,7 +241,7 @@ class Judgement:
     @property
     def clean(self) -> bool:
         """Whether nobody has anything to complain of."""
-        return not self.faults and len(self.excused) <= EXCUSED
+        return not self.faults
 
     def __str__(self) -> str:
         return (

@@ -50,8 +50,7 @@ class Judgement:
     @property
     def clean(self) -> bool:
         """Whether the robot has nothing to complain of and everything arrived."""
-        excused = len(self.excused) <= max(2, sum(self.sent.values()) // 50)
-        return self.alive and excused and not self.violations and not self.missing
+        return self.alive and not self.violations and not self.missing
 
     def __str__(self) -> str:
         commands = sum(self.sent.values())
@@ -132,17 +131,15 @@ class _Run:
         judgement = self.judgement
         judgement.alive = report["alive"]
         for text in report["violations"]:
-            (judgement.excused if "woke" in text else judgement.violations).append(text)
-        arrived = Counter((packet_id, body) for _, packet_id, body in report["received"])
-        excused = len(judgement.excused)
+            (judgement.excused if "(this process" in text else judgement.violations).append(text)
+        came = report["received"] + report["piled"]
+        arrived = Counter((packet_id, body) for _, packet_id, body in came)
         for packet_id, body in self._expected:
             if arrived[packet_id, body]:
                 arrived[packet_id, body] -= 1
-            elif excused:
-                excused -= 1
             else:
                 judgement.missing.append(f"packet {packet_id} {body[:40]}")
-        stops = sum(packet_id == 13 for _, packet_id, _ in report["received"])
+        stops = sum(packet_id == 13 for _, packet_id, _ in came)
         wanted = judgement.sent["stop"] + judgement.sent["neutral"]
         if stops < wanted:
             judgement.missing.append(f"stops: {stops} came of {wanted} at least")

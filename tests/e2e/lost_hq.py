@@ -47,6 +47,7 @@ from tests.e2e.loss import (
     stop_since,
     thaw_driver,
 )
+from tests.e2e.machine import contended_s
 
 KEPT_S = 1.6
 """The longest time for which a listener believes in a controller that is gone and is sent nothing: keep-alive's second,
@@ -210,10 +211,11 @@ def _expected(program: str, name: str) -> Result:
     return Result(label, driven.deadman_s + LATE_S)
 
 
-def hold_on(frozen_s: float) -> tuple[float, float]:
+def hold_on(frozen_s: float) -> tuple[float, float, float]:
     """Freeze a controller whose velocities are held, then kill it.
 
-    Give for how long after its freezing its robot was still told to move, and how long after its death it got its stop.
+    Give for how long after its freezing its robot was still told to move, how long after its death it got its stop, and
+    what of that excuses the machine.
     """
     with contextlib.ExitStack() as stack:
         scene = HqScene(stack, "wc2ec-holds")
@@ -222,9 +224,11 @@ def hold_on(frozen_s: float) -> tuple[float, float]:
         time.sleep(frozen_s)
         frames = scene.robot.frames[begun:]
         assert all(frame.moves for frame in frames), "stopped"
+        contended = contended_s()
         killed_at = kill_driver(scene)
         stop = until(lambda: stop_since(scene.robot.frames, begun, killed_at), what="stop")
-        return frames[-1].at - frozen_at, scene.robot.frames[stop].at - killed_at
+        contended = contended_s() - contended
+        return frames[-1].at - frozen_at, scene.robot.frames[stop].at - killed_at, contended
 
 
 def results(programs: Iterable[str], way: str | None, *, repetitions: int, seed: int) -> Iterator[Result | str]:

@@ -34,6 +34,7 @@ async def main() -> None:
                 "moving": robot.machine.moving,
                 "received": [(channel, packet_id, body.hex()) for _, channel, packet_id, body in robot.received],
                 "misread": [(channel, packet_id, body.hex()) for _, channel, packet_id, body in robot.misread],
+                "piled": [(channel, packet_id, body.hex()) for _, channel, packet_id, body in robot.piled],
             }
         )
     )

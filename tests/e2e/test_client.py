@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 import zbridge
-from tests.e2e.conftest import Bench, end, free_port, until
+from tests.e2e.conftest import WAIT_S, Bench, end, free_port, until
 from zbridge.client import Fleet
 from zbridge.errors import BusError, Held, LeaseLost, Refused
 
@@ -95,7 +95,9 @@ def stands(bench: Bench) -> bool:
 
 
 def stops_within(bench: Bench, seconds: float) -> None:
-    until(lambda: stands(bench), seconds + 0.5, what="a robot that stands")
+    withheld_s, began = bench.withheld_s, time.monotonic()
+    until(lambda: stands(bench), what="a robot that stands")
+    assert time.monotonic() - began < seconds + 0.5 + bench.withheld_s - withheld_s
 
 
 def zbridge_command(bench: Bench, *arguments: str, **more: Any) -> subprocess.CompletedProcess[str]:
@@ -108,12 +110,19 @@ def zbridge_command(bench: Bench, *arguments: str, **more: Any) -> subprocess.Co
     )
 
 
-async def lost(drive: Any, within_s: float = 1.0) -> str:
+async def lost(drive: Any) -> str:
     """Wait until a driver hears of its loss; give what it says."""
-    await asyncio.wait_for(drive.lost.wait(), within_s)
+    await asyncio.wait_for(drive.lost.wait(), WAIT_S)
     with pytest.raises(LeaseLost) as raised:
         await drive(turn=0.5)
     return str(raised.value)
+
+
+async def drives_now_and_then(drive: Any) -> None:
+    """Drive less often than the deadman wants it, until that is refused."""
+    for _ in range(20):
+        await drive(turn=0.5)
+        await asyncio.sleep(0.3)
 
 
 # The client
@@ -161,7 +170,7 @@ async def test_the_second_is_told_who_has_the_robot_and_can_take_it_over(bench: 
                 await taken.during(0.4, turn=-0.5)
                 until(lambda: turned(bench, before) > 0.1, what="the other one drives")
                 assert taken.loss is None
-        until(lambda: control(bench)["state"] == "free", 1.0, what="a robot that was given back")
+        until(lambda: control(bench)["state"] == "free", what="a robot that was given back")
 
 
 async def test_a_stop_of_a_passer_by_ends_the_lease_and_the_motion(bench: Bench) -> None:
@@ -173,7 +182,7 @@ async def test_a_stop_of_a_passer_by_ends_the_lease_and_the_motion(bench: Bench)
         with pytest.raises(Refused):
             await driving
         stops_within(bench, 0.5)
-        until(lambda: control(bench)["state"] == "stopped", 1.0, what="news of the stop")
+        until(lambda: control(bench)["state"] == "stopped", what="news of the stop")
 
 
 async def test_a_second_wish_of_the_same_program_costs_the_first_nothing(bench: Bench) -> None:
@@ -183,22 +192,21 @@ async def test_a_second_wish_of_the_same_program_costs_the_first_nothing(bench: 
         await asyncio.sleep(0.3)
         await drive(turn=0.1)
         assert drive.loss is None
-        until(lambda: control(bench)["holder"] == ME, 1.0, what="the holder")
+        until(lambda: control(bench)["holder"] == ME, what="the holder")
 
 
 async def test_an_idle_driver_keeps_the_robot_and_a_tired_one_must_send_neutral(bench: Bench) -> None:
-    async with client(bench) as fleet, fleet[ROBOT].control(ME, lease_s=0.3, deadman_s=0.1) as drive:
-        await asyncio.sleep(0.9)
-        await drive(turn=0.5)
-        await asyncio.sleep(0.3)
-        await drive(turn=0.5)
-        await asyncio.sleep(0.2)
+    async with client(bench) as fleet, fleet[ROBOT].control(ME, lease_s=1.0, deadman_s=0.1) as drive:
+        await asyncio.sleep(2.0)
         with pytest.raises(Refused, match=rf"^{ROBOT}: drive: deadman: send a neutral drive first$"):
-            await drive(turn=0.5)
-        await drive()
+            await drives_now_and_then(drive)
         before = heading(bench)
-        await drive.during(0.3, turn=0.5)
-        assert turned(bench, before) > 0.05
+        async with asyncio.timeout(WAIT_S):
+            while turned(bench, before) < 0.05:
+                with contextlib.suppress(Refused):  # on a busy machine the deadman comes between two drives
+                    await drive()
+                    await drive.during(0.3, turn=0.5)
+        assert drive.loss is None
 
 
 async def test_what_the_robot_cannot_do_is_said_by_the_next_command(bench: Bench) -> None:
@@ -229,9 +237,9 @@ def test_a_robot_whose_driver_is_ended_stops(bench: Bench, number: signal.Signal
         assert driver.stdout.readline() == b"driving\n"
         before = heading(bench)
         until(lambda: turned(bench, before) > 0.1, what="motion")
-        until(lambda: control(bench)["holder"] == ME, 1.0, what="the holder")
+        until(lambda: control(bench)["holder"] == ME, what="the holder")
         driver.send_signal(number)
-        until(lambda: control(bench)["state"] != "held", 1.5, what="the end of the lease")
+        until(lambda: control(bench)["state"] != "held", what="the end of the lease")
         stops_within(bench, 0.3)
 
 
@@ -335,16 +343,16 @@ def test_the_keyboard_drives_while_a_key_is_held_stops_and_takes_the_lease_again
         time.sleep(0.4)
         assert turned(bench, before) == 0, "a single press moves nothing"
         terminal.hold("a", 0.8)
-        until(lambda: turned(bench, before) > 0.2, 1.0, what="motion")
+        until(lambda: turned(bench, before) > 0.2, what="motion")
         terminal.shows("turn +0.50")
         stops_within(bench, 0.3)
         assert control(bench)["state"] == "held"
         before = heading(bench)
         terminal.hold("\x1b[C", 0.4)
-        until(lambda: turned(bench, before) > 0.05, 1.0, what="motion by an arrow")
+        until(lambda: turned(bench, before) > 0.05, what="motion by an arrow")
         terminal.hold("d", 0.4)
         terminal.type(" ")
-        until(lambda: control(bench)["state"] == "stopped", 1.0, what="the stop")
+        until(lambda: control(bench)["state"] == "stopped", what="the stop")
         terminal.shows(f"{ROBOT}: stopped")
         terminal.shows("Enter: take the lease again")
         stops_within(bench, 0.3)
@@ -354,11 +362,11 @@ def test_the_keyboard_drives_while_a_key_is_held_stops_and_takes_the_lease_again
         terminal.type("\r")
         until(lambda: control(bench).get("holder") == ME, what="the lease again")
         terminal.hold("a", 0.5)
-        until(lambda: turned(bench, before) > 0.05, 1.0, what="motion again")
+        until(lambda: turned(bench, before) > 0.05, what="motion again")
         terminal.type("x")
         assert terminal.ended() == 0
         assert "Traceback" not in terminal.shown
-        until(lambda: control(bench)["state"] == "free", 1.0, what="a robot that was given back")
+        until(lambda: control(bench)["state"] == "free", what="a robot that was given back")
 
 
 def test_the_keyboard_of_a_robot_that_somebody_drives(bench: Bench) -> None:
@@ -370,7 +378,7 @@ def test_the_keyboard_of_a_robot_that_somebody_drives(bench: Bench) -> None:
         assert drive.loss is None
         with Terminal(bench, "--who", ME, "--takeover") as terminal:
             until(lambda: control(bench).get("holder") == ME, what="the takeover")
-            until(lambda: drive.loss is not None, 1.0, what="news of the takeover")
+            until(lambda: drive.loss is not None, what="news of the takeover")
             fleet[ROBOT].stop()
             terminal.shows(f"{ROBOT}: the lease has ended (stop). Enter: take the lease again, x: end")
             terminal.type("x")
@@ -384,7 +392,7 @@ def test_the_keyboard_interrupted_gives_the_robot_back_and_the_terminal_too(benc
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.ended() == 0
         assert "Traceback" not in terminal.shown
-        until(lambda: control(bench)["state"] == "free", 1.0, what="a robot that was given back")
+        until(lambda: control(bench)["state"] == "free", what="a robot that was given back")
         stops_within(bench, 0.3)
 
 
@@ -403,7 +411,7 @@ def test_stop_says_for_each_robot_whether_it_stands(bench: Bench, tmp_path: Path
         drive(turn=0.5)
         ran = zbridge_command(bench, "stop", ROBOT)
         assert (ran.returncode, ran.stdout, ran.stderr) == (0, f"{ROBOT}: stopped\n", "")
-        until(lambda: drive.loss is not None, 1.0, what="news of the stop")
+        until(lambda: drive.loss is not None, what="news of the stop")
     stops_within(bench, 0.3)
     unreachable = bench.gateway("r2", free_port())
     until(lambda: bench.fleet.state("r2") is not None, what="the second gateway")

@@ -117,10 +117,12 @@ def test_sigterm_stops_the_robot_and_ends_within_two_seconds(bench: Bench, robot
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11), what="drive at the robot")
+    withheld_s = bench.withheld_s
     began = time.monotonic()
     gateway.send_signal(signal.SIGTERM)
-    assert gateway.wait(timeout=3) == 0
-    assert time.monotonic() - began < 2.0
+    until(lambda: (bench.withheld_s, gateway.poll() is not None)[1], what="the end of the gateway")
+    assert time.monotonic() - began < 2.0 + bench.withheld_s - withheld_s
+    assert gateway.returncode == 0
     assert robot.reads[-1][1] == bytes.fromhex("02000000020d")
     until(lambda: bench.fleet.state("r1") == "offline")
     assert bench.fleet.last("r1/status")["reason"] == "gateway stopped"
@@ -131,17 +133,18 @@ def test_driver_killed_the_robot_stops_within_the_deadman(bench: Bench, robot: S
     bench.gateway("r1", robot.port, DEADMAN)
     until(lambda: established(bench))
     with driving(bench, robot) as driver:
+        withheld_s = bench.withheld_s
         driver.kill()
         killed = time.monotonic()
-    moving = robot.packets(11)[0][0]
-    stop_at, stop = until(lambda: stops_since(robot, moving), what="stop")[0]
+        stop_at, stop = until(lambda: stops_since(robot, killed), what="stop")[0]
+        # The last accepted command came before the kill, so this is the stricter bound seen from outside.
+        assert stop_at - killed < 0.3 + 0.05 + bench.withheld_s - withheld_s
     assert stop == bytes.fromhex("02000000020d")
-    # The last accepted command came before the kill, so this is the stricter bound seen from outside.
-    assert stop_at - killed < 0.3 + 0.05
+    eighth_at, _ = until(lambda: stops_since(robot, killed)[7:], what="eight stops")[0]
+    assert eighth_at - stop_at < 1.0 + bench.withheld_s - withheld_s
     until(lambda: time.monotonic() > stop_at + 1.3)
-    stops = [at for at, _ in stops_since(robot, moving)]
-    assert 0.8 <= stops[-1] - stops[0] <= 1.1
-    assert len(stops) >= 8
+    stops = stops_since(robot, killed)
+    assert len(stops) <= 11 + time.monotonic() - stop_at, "ten a second for a second, then one a second"
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
 
@@ -169,11 +172,12 @@ def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman
     until(lambda: established(bench))
     with driving(bench, robot, "operator.1") as driver:
         assert bench.fleet.last("r1/control")["holder"] == "driver"
+        withheld_s = bench.withheld_s
         killed = time.monotonic()
         driver.kill()
-        moving = robot.packets(11)[0][0]
-        stop_at, _ = until(lambda: stops_since(robot, moving), what="stop")[0]
-    assert stop_at - killed < 0.5  # the deadman would take 2 s
+        stop_at, _ = until(lambda: stops_since(robot, killed), what="stop")[0]
+        late_s = bench.withheld_s - withheld_s
+    assert stop_at - killed < 0.5 + late_s  # the deadman would take 2 s
     until(lambda: bench.fleet.last("r1/control")["state"] == "stopped")
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
@@ -184,10 +188,11 @@ def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(
     bench.gateway("r1", robot.port, DEADMAN)
     until(lambda: established(bench))
     with driving(bench, robot, "operator.1") as driver:
+        withheld_s = bench.withheld_s
         os.kill(driver.pid, signal.SIGSTOP)
         frozen = time.monotonic()
-        stop_at, _ = until(lambda: stops_since(robot, robot.packets(11)[0][0]), what="stop")[0]
-        assert stop_at - frozen < 0.3 + 0.05
+        stop_at, _ = until(lambda: stops_since(robot, frozen), what="stop")[0]
+        assert stop_at - frozen < 0.3 + 0.05 + bench.withheld_s - withheld_s
         os.kill(driver.pid, signal.SIGCONT)
         until(lambda: refusals(bench).get("deadman: send a neutral drive first", {}).get("count", 0) > 10)
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
@@ -201,10 +206,11 @@ def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhil
     with driving(bench, robot):
         os.kill(gateway.pid, signal.SIGSTOP)
         time.sleep(1.0)
+        withheld_s = bench.withheld_s
         woken = time.monotonic()
         os.kill(gateway.pid, signal.SIGCONT)
         stop_at, _ = until(lambda: stops_since(robot, woken), what="stop")[0]
-        assert stop_at - woken < 0.2
+        assert stop_at - woken < 0.2 + bench.withheld_s - withheld_s
         until(lambda: refusals(bench).get("deadman: send a neutral drive first", {}).get("count", 0) > 10)
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
@@ -221,10 +227,11 @@ def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_
     time.sleep(1.0)
     assert stops_since(robot, sent_at) == []
     assert bench.fleet.last("r1/control")["state"] == "held"
+    withheld_s = bench.withheld_s
     left = time.monotonic()
     bench.fleet.let_go("r1")
     stop_at, _ = until(lambda: stops_since(robot, sent_at), what="stop")[0]
-    assert stop_at - left < 0.6 + 0.1
+    assert stop_at - left < 0.6 + 0.1 + bench.withheld_s - withheld_s
     until(lambda: bench.fleet.last("r1/control")["state"] == "stopped")
 
 
@@ -312,10 +319,11 @@ def test_the_bus_lost_while_driving_stops_the_robot_at_once(bench: Bench, robot:
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
+    withheld_s = bench.withheld_s
     cut = time.monotonic()
     bench.fleet.session.close()
-    stop_at, _ = until(lambda: stops_since(robot, robot.packets(11)[0][0]), what="stop")[0]
-    assert stop_at - cut < 0.5  # far below the deadman of 2 s
+    stop_at, _ = until(lambda: stops_since(robot, cut), what="stop")[0]
+    assert stop_at - cut < 0.5 + bench.withheld_s - withheld_s  # far below the deadman of 2 s
     bench.fleet = Fleet(bench.router())
     until(lambda: established(bench), what="the gateway on the bus again")
     assert bench.fleet.get("fleet/r1/control")[0]["state"] == "stopped"
@@ -334,9 +342,9 @@ def test_one_packet_per_write_and_never_back_to_back(bench: Bench, robot: Script
         assert len(data) == 4 + int.from_bytes(data[:4], "little")
     texts = [data[10:].decode() for _, data in robot.packets(1)]
     assert texts == [f"number {number}" for number in range(20)]
-    times = [at for at, _ in robot.reads[1:]]
-    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
-    assert sum(gap < 0.008 for gap in gaps) <= len(gaps) // 10  # a loaded reader may see two arrive together
+    # By the kernel's time of arrival, however late this process reads; what it joined took as long as its packets do
+    for (earlier, _), (later, packets) in itertools.pairwise(robot.arrivals[1:]):
+        assert later - earlier > 0.0095 * packets
 
 
 def test_refusals_show_on_control(bench: Bench, robot: ScriptedRobot) -> None:

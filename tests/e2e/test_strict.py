@@ -18,7 +18,6 @@ from tests.e2e.judge import VERSIONS, judge, strict_robot
 def test_a_fragile_robot_survives_fifty_mixed_commands(version: str, udp: bool) -> None:
     judgement = judge(version, udp=udp, commands=50)
     assert judgement.alive
-    assert len(judgement.excused) <= 2
     assert judgement.violations == []
     assert judgement.missing == []
     assert judgement.answered["no pose"] == judgement.answered["no map"] == 0

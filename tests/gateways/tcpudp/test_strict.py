@@ -320,7 +320,8 @@ async def test_what_piled_up_while_the_process_stood_still_is_read_as_one_packet
             hq.tcp.send(raw(STOP))
             time.sleep(0.05)  # noqa: ASYNC251 - nobody is to run meanwhile
         await violated(robot, "5 packets in one read")
-        assert "ms late" in robot.violations[0]
+        assert "(this process read nothing for" in robot.violations[0]
+        assert [row[1:] for row in robot.piled] == [("tcp", 13, b"")] * 5
         await asyncio.sleep(0.1)
         assert robot.machine.moving
         assert [row[2] for row in robot.received] == [3, 11]
@@ -533,6 +534,20 @@ async def test_packets_too_near_to_each_other_are_lost() -> None:
             await asyncio.get_running_loop().sock_sendall(hq.tcp, raw(STOP))
             await asyncio.sleep(0.001)
         await violated(robot, "packets in one read: 02 00 00 00 07 0d 02")
+
+
+async def test_packets_back_to_back_are_held_against_the_hq() -> None:
+    robot = quick(times=Times(read_s=0.002, gap_s=0.01, unasked_s=0))
+    async with facing(robot) as (hq, _):
+        await hq.greet("1.3", udp=False)
+        for number in range(50):  # a busy machine may excuse some
+            await asyncio.sleep(0.1)
+            await hq.send(STOP + STOP)
+            await violated(robot, "two packets in one read")
+            if "(this process" not in robot.violations[number]:
+                break
+        assert "(this process" not in robot.violations[-1]
+        assert len(robot.piled) == 2 * (len(robot.violations) - 1)
 
 
 async def test_a_split_packet_is_one_violation_and_the_next_packet_is_read() -> None:

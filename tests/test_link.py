@@ -24,7 +24,7 @@ class Recorder(Receiver):
     def __init__(self, mark: bytes = b"") -> None:
         self.link: Link | None = None
         self.mark = mark
-        self.data = b""
+        self.data = bytearray()
         self.datagrams: list[bytes] = []
         self.asked: list[int] = []
         """The ports of what it was asked whether it claims it."""

@@ -12,7 +12,7 @@ import pytest
 from tests.clock import jumping
 from zbridge.bus import Answer, Handle, Lane, Question
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import LaneOf
+from zbridge.bus.interface import Sort
 from zbridge.claim import ANNOUNCE_S, LOOKS, MOST_S, RIVALS, WATCH_S, Claim
 from zbridge.fleet.topics import KeySpace
 
@@ -377,7 +377,7 @@ class Distant(FakeBus):
 
         return Declared()
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | LaneOf = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         return self._later(lambda: super(Distant, self).answer(key, handler, lane=lane))
 
     def announce(self, key: str) -> Handle:

@@ -55,9 +55,9 @@ async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
             await running
 
 
-async def acquired_and_released(bus: FakeBus) -> dict[str, Any]:
+async def acquired_and_released(bus: FakeBus, who: str = "hq") -> dict[str, Any]:
     """Give the answer to an acquire whose lease is given back."""
-    lease = await asked(bus, "acquire", who="hq")
+    lease = await asked(bus, "acquire", who=who)
     await asked(bus, "release", Holder.of(lease).question("release"))
     return lease
 
@@ -120,8 +120,8 @@ async def test_the_audit_log_is_rotated_as_the_configuration_says(
 ) -> None:
     gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=0)
     async with serving(gateway, monkeypatch) as bus:
-        for _ in range(25):
-            await acquired_and_released(bus)
+        for number in range(25):
+            await acquired_and_released(bus, f"hq{number}")
     sizes = sizes_in(tmp_path)
     assert sorted(sizes) == ["r1.jsonl", "r1.jsonl.1", "r1.jsonl.2"]
     assert max(sizes.values()) <= 1000
@@ -134,7 +134,7 @@ async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
     gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=1)
     async with serving(gateway, monkeypatch) as bus:
         for number in range(50):
-            await asked(bus, "takeover", who=f"hq{number}")
+            await acquired_and_released(bus, f"hq{number}")
     assert {line["who"] for line in lines_in(tmp_path)} >= {f"hq{number}" for number in range(50)}
 
 
@@ -145,9 +145,9 @@ async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_en
     file = tmp_path / "r1.jsonl"
     async with serving(configured(audit=str(file)), monkeypatch) as bus:
         for _ in range(10):
-            await asked(bus, "takeover", who="hq")
+            await acquired_and_released(bus)
     lines = [json.loads(line) for line in file.read_text().splitlines()]
-    assert sum(line.get("count", 1) for line in lines if line["event"] == "taken over") == 10
+    assert sum(line.get("count", 1) for line in lines if line["event"] == "acquired") == 10
 
 
 @jumping

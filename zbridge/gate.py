@@ -159,7 +159,7 @@ class CommandGate:
     def _stop(self) -> Lane | None:
         """Let a stop through, unless it changes nothing: looked at in this order, as a new holder comes first."""
         fresh = self._clock() - self._stopped_at < SAME_STOP_S
-        if fresh and not self._authority.driven and self._authority.verifier is None:
+        if fresh and not self._authority.moving and self._authority.verifier is None:
             self.same_stops += 1
             return None
         return Lane.STOP

@@ -69,6 +69,7 @@ class Leases:
             "takeover": NameGate(clock),
             "renew": QuestionGate(authority, clock),
             "release": QuestionGate(authority, clock),
+            "refused": NameGate(clock),
         }
         self._takeovers = Allowance(TAKEOVERS_HZ)
         self._robot = robot

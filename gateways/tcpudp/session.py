@@ -54,8 +54,6 @@ SILENCE_S = 2.5
 """Seconds after packet 4 in which a robot may get nothing by TCP but one packet 7: it sleeps 2 s, and may be late."""
 CLIENT_PORT = 11000
 """The UDP port that deployed HQ programs bind."""
-HEARD = 0.9
-"""Of the time that an HQ waits for a 6, how much a 7 may take that answers one."""
 RIVAL = "another source of datagrams claims to be this client"
 LATE_START = "handshaking"
 AGAIN_S = 0.3
@@ -573,7 +571,7 @@ class RobotSession(_TcpUdpSession):
             self._limit_at = math.inf
             self.send_first(ServerStartUDP())
             self._probe.begin(now)
-            self._heard_until = now + HEARD * PROBE_S
+            self._heard_until = now + PROBE_S
         else:
             self._finish()
 

@@ -30,7 +30,9 @@ ME, OTHER = "ann@here", "bob@there"
 KEY_S = 1 / 30
 """Between two repetitions of a held key."""
 DRIVER = f"""
-import asyncio, sys, zbridge
+import asyncio, signal, sys, zbridge
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell runs in the background
 
 async def main():
     async with zbridge.connect([sys.argv[1]]) as fleet, fleet["{ROBOT}"].control("{ME}", deadman_s=0.3) as drive:

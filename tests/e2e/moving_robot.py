@@ -29,7 +29,7 @@ from zbridge.judge import Judge
 
 WHEEL_M, FULL_M_S = 0.05, 0.5
 """Radius of a Webots robot's wheels and its full speed; the gateway is configured with the same."""
-SEND_S = 60.0
+SEND_S = 3600.0
 """A robot waits for its send as long as its kernel does: deployed ones block in it."""
 
 HELD_UP_S = 0.1

@@ -66,6 +66,35 @@ async def test_a_doubt_is_told_when_it_comes_and_when_it_goes() -> None:
 
 
 @jumping
+async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_look() -> None:
+    """The look comes before everything that is written: it stops a robot whose driver is silent."""
+    clock_s, looks = [0.0], []
+
+    def look() -> None:
+        looks.append(clock_s[0])
+        if freezes:
+            clock_s[0] += freezes.pop()  # just after the look
+
+    freezes: list[float] = []
+    loop, session, link = asyncio.get_running_loop(), Toy(LIMITS, name="robot"), FakeLink("tcp://toy.test:1")
+    conversation = Conversation(session, loop, deliver=print, clock=lambda: clock_s[0], before=look)
+    conversation.attached(link)
+    conversation.received(WELCOME)
+    clock_s[0] = 1.0
+    session.outbox.stand("drive", (b"motion",), clock_s[0], period_s=0.25)
+    conversation.pump()
+    link.written.clear()
+    clock_s[0], freezes = 1.1, [2.0]
+    conversation.pump()
+    assert clock_s == [3.1]
+    assert link.written == []
+    conversation.pump()
+    assert link.written == [b"motion"]
+    assert looks[-1] == 3.1
+    conversation.abandon()
+
+
+@jumping
 async def test_a_read_without_a_whole_message_delivers_nothing() -> None:
     rig = established()
     rig.conversation.received(b"\x05ab")

@@ -135,7 +135,6 @@ class Conversation:
 
     def pump(self) -> None:
         """Write what may be written now, and set the timer for what may not."""
-        self._before()
         session, link = self.session, self._link
         outbox = session.outbox
         if session.drops_source and link is not None:
@@ -143,7 +142,9 @@ class Conversation:
             link.drop_source()
         writing = link is not None and (session.over or self._takes(link))  # last words are written in any case
         while writing and link is not None and link.ready:
-            frame = session.outgoing(self._clock())
+            now = self._clock()  # before the look: what becomes due after it, as the process froze, waits for another
+            self._before()
+            frame = session.outgoing(now)
             if frame is None:
                 break
             if type(frame) is Datagram:

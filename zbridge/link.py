@@ -195,7 +195,11 @@ class TcpLink(asyncio.BufferedProtocol):
             self._hub.send(self, data)
         elif self._transport is not None:
             if self._datagrams is None:
-                self._datagrams = DatagramSocket(self._transport, self._receiver)
+                try:
+                    self._datagrams = DatagramSocket(self._transport, self._receiver)
+                except OSError as error:  # no descriptor, no port: the datagram is lost, the next one tries again
+                    log.warning("%s: no socket for datagrams: %s", self.peer, error)
+                    return
             self._datagrams.send(data)
 
     def drop_source(self) -> None:

@@ -15,6 +15,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.session.control import NAMED
 from zbridge.session.proof import Signer
 
 RETRY_S = 0.1
@@ -48,7 +49,7 @@ class Driver:
     """
 
     def __init__(self, bus: Bus, keys: KeySpace, who: str, lease: Lease) -> None:
-        self.who = who
+        self.who = who[:NAMED]
         self.robot = keys.robot
         self.lost = asyncio.Event()
         self.loss: LeaseLost | None = None

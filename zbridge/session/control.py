@@ -24,7 +24,7 @@ ENDED = 16
 """Ended leases whose holders can still be told why, and whose ids are not given again."""
 LEAST_S = 0.01
 """The shortest lease or deadman that can be asked for, seconds."""
-_NAMED, _EXPLAINED = 64, 200
+NAMED, _EXPLAINED = 64, 200
 """Characters of a name and of a reason that are kept."""
 
 
@@ -202,7 +202,7 @@ class Authority:
         self, command: str, refusal: Refused, who: str | None = None, *, by: str | None = None, count: int = 1
     ) -> None:
         """Count a refusal; it shows on ``control``. by: the listener that refused it, and tells of it."""
-        who, command, reason = who and who[:_NAMED], command[:_NAMED], str(refusal)[:_EXPLAINED]
+        who, command, reason = who and who[:NAMED], command[:NAMED], str(refusal)[:_EXPLAINED]
         key = (who, command, refusal.code, reason, by)
         self._refusals[key] = self._refusals.pop(key, 0) + count
         if len(self._refusals) > REFUSALS:
@@ -304,13 +304,13 @@ class Authority:
     def _grant(self, request: Acquire, what: What, now: float) -> Lease:
         try:
             if not request.who or not request.who.isprintable():
-                raise Malformed(f"who = {request.who[:_NAMED]!r}: expected a name that others are shown")
+                raise Malformed(f"who = {request.who[:NAMED]!r}: expected a name that others are shown")
             lease_s = _wish("lease_s", request.lease_s, self.lease_s)
             deadman_s = _wish("deadman_s", request.deadman_s, self.deadman_s)
         except Refused as refusal:
             self.refuse("takeover" if what is What.TAKEN_OVER else "acquire", refusal, request.who)
             return self._denied(refusal, now)
-        who = request.who[:_NAMED]
+        who = request.who[:NAMED]
         if self._holder is not None:
             self._end(f"taken over by {who}", What.ENDED, stops=self.moving)
         lease, token = self._new_lease(), self._random(TOKEN_BYTES)

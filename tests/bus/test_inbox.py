@@ -215,3 +215,14 @@ async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile
     for _ in range(10):  # what is over is served after the loop has had its turn
         await rig.drained()
     assert sorted(rig.seen) == list(range(12_000))
+
+
+async def test_what_the_holder_says_keeps_its_order_whatever_it_comes_by() -> None:
+    """A release that overtook the neutral before it would have it refused."""
+    rig = Rig()
+    questions = rig.inbox.source(rig.seen.append, lambda value: value)
+    for number in range(3):
+        rig.put(number, first=True)
+    questions.put("release", Lane.COMMAND)
+    rig.put("acquired anew", first=True)
+    assert await rig.drained() == [0, 1, 2, "release", "acquired anew"]

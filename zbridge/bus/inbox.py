@@ -1,10 +1,12 @@
 """Carries what the bus's own threads bring to the event loop. Knows no zenoh.
 
 Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each lane
-it uses, so that a flood of one fills nobody else's queue. A queue that has items stands in the line of its lane. The
-event loop is woken once per batch; a batch serves the lanes in their order, one item of each queue in the line by
-turns, and of each lane no more than its share: so a stop waits for one item at most, and a lane that never empties
-leaves the others their part. What is over is served after the loop has had its turn with sockets and timers.
+it uses, so that a flood of one fills nobody else's queue. The lane of the holder's commands alone has one queue for all
+sources: what one program says keeps its order, and a release must not overtake the neutral before it. A queue that has
+items stands in the line of its lane. The event loop is woken once per batch; a batch serves the lanes in their order,
+one item of each queue in the line by turns, and of each lane no more than its share: so a stop waits for one item at
+most, and a lane that never empties leaves the others their part. What is over is served after the loop has had its turn
+with sockets and timers.
 
 A queue is filled by one thread (or several) and emptied by the loop's, without a lock: every step is one operation of a
 deque, and whoever adds an item has the queue stand in the line after it; a queue that stands there twice is harmless.
@@ -41,6 +43,7 @@ class Inbox:
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
         self._lines: dict[Lane, deque[_Queue]] = {lane: deque() for lane in Lane}
+        self.commands = _Queue()
         self._awake = False
         self._dropped = metrics.count("bus_in_dropped")
         self._folded = metrics.count("bus_in_folded")
@@ -86,14 +89,14 @@ class Inbox:
         queue = line.popleft()
         queue.listed = False  # before the item is taken: what comes from now on lists it anew
         try:
-            raw = queue.take()
+            source, raw = queue.take()
         except IndexError:  # it stood in the line twice, or its items had to make room
             return
         if queue.items and not queue.listed:
             queue.listed = True
             line.append(queue)
         try:
-            queue.source.handler(queue.source.read(raw))
+            source.handler(source.read(raw))
         except Exception:
             log.exception("a handler failed")
 
@@ -107,7 +110,7 @@ class Source:
         self._inbox = inbox
         self._dropped = dropped
         self._folded = folded
-        self._queues = {lane: _Queue(self) for lane in Lane}
+        self._queues = {lane: inbox.commands if lane is Lane.COMMAND else _Queue() for lane in Lane}
 
     def __repr__(self) -> str:
         waiting = ", ".join(f"{len(queue.items)} {lane.name}" for lane, queue in self._queues.items() if queue.items)
@@ -119,7 +122,7 @@ class Source:
         while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
             queue.forget()
             self._dropped.value += 1
-        queue.add(raw, size)
+        queue.add(self, raw, size)
         self._inbox.line_up(queue, lane)
 
     def fold(self, raw: Any, lane: Lane) -> None:
@@ -128,17 +131,16 @@ class Source:
         if queue.items:
             self._folded.value += 1
         else:
-            queue.add(raw, 0)
+            queue.add(self, raw, 0)
         self._inbox.line_up(queue, lane)
 
 
 class _Queue:
-    """Items of one source in one lane. Either side counts its bytes for itself: no sum is written by two threads."""
+    """Items of one lane, of one source or of all. Either side counts its bytes for itself."""
 
-    def __init__(self, source: Source) -> None:
-        self.source = source
+    def __init__(self) -> None:
         self.listed = False
-        self.items: deque[tuple[Any, int]] = deque()
+        self.items: deque[tuple[Source, Any, int]] = deque()
         self._added = 0
         self._forgotten = 0
         self._taken = 0
@@ -148,17 +150,17 @@ class _Queue:
         """Bytes that wait."""
         return self._added - self._forgotten - self._taken
 
-    def add(self, raw: Any, size: int) -> None:
+    def add(self, source: Source, raw: Any, size: int) -> None:
         self._added += size
-        self.items.append((raw, size))
+        self.items.append((source, raw, size))
 
     def forget(self) -> None:
         """Forget the oldest item, on the thread that adds."""
         with contextlib.suppress(IndexError):  # the loop was quicker
-            self._forgotten += self.items.popleft()[1]
+            self._forgotten += self.items.popleft()[2]
 
-    def take(self) -> Any:
+    def take(self) -> tuple[Source, Any]:
         """Take the oldest item, on the loop's thread; raise IndexError where there is none."""
-        raw, size = self.items.popleft()
+        source, raw, size = self.items.popleft()
         self._taken += size
-        return raw
+        return source, raw

@@ -30,6 +30,9 @@ from tests.e2e.conftest import Bench, until
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 PACE_S = 0.03
 """Seconds between two commands: more than the gap, so that no drive has a reason to replace another."""
+GAP_S = 0.01
+"""Seconds between two packets: of two drives that the gateway is given within it, the newer wins."""
+DRIVES = {11, 12}
 HAS_LIDAR_SIM = {"1.2", "1.3", "1.4"}
 
 
@@ -43,6 +46,9 @@ class Judgement:
     violations: list[str] = field(default_factory=list)
     excused: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    overtaken: list[str] = field(default_factory=list)
+    """Drives that did not arrive, as far as the machine was late enough to have a newer one replace them."""
+    late_s: float = 0.0
     answered: Counter[str] = field(default_factory=Counter)
     alive: bool = False
     seconds: float = 0.0
@@ -57,7 +63,7 @@ class Judgement:
         return (
             f"{self.version} {'udp' if self.udp else 'tcp'}: {commands} commands in {self.seconds:.0f} s, "
             f"{len(self.violations)} violations, {len(self.excused)} excused (the robot's process was late), "
-            f"{len(self.missing)} missing, answered {dict(self.answered)}"
+            f"{len(self.missing)} missing, {len(self.overtaken)} drives overtaken, answered {dict(self.answered)}"
         )
 
 
@@ -71,12 +77,13 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
         until(lambda: bench.fleet.state("r1") == "established", what="established")
         bench.fleet.hold("r1", "judge")
         run = _Run(bench, Judgement(version, udp), random.Random(seed))
-        began = time.monotonic()
+        began, withheld_s = time.monotonic(), bench.withheld_s
         for number in range(commands):
             run.command(number)
             time.sleep(PACE_S)
         run.end()
         run.judgement.seconds = time.monotonic() - began
+        run.judgement.late_s = bench.withheld_s - withheld_s
         report = json.loads(robot.communicate("end\n", timeout=20)[0])
     run.compare(report)
     return run.judgement
@@ -137,6 +144,8 @@ class _Run:
         for packet_id, body in self._expected:
             if arrived[packet_id, body]:
                 arrived[packet_id, body] -= 1
+            elif packet_id in DRIVES and (len(judgement.overtaken) + 1) * (PACE_S - GAP_S) < judgement.late_s:
+                judgement.overtaken.append(f"packet {packet_id} {body[:40]}")
             else:
                 judgement.missing.append(f"packet {packet_id} {body[:40]}")
         stops = sum(packet_id == 13 for _, packet_id, _ in came)

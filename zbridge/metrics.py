@@ -1,6 +1,6 @@
 """Counters of one process: what was received, sent, dropped and refused. Every drop has one.
 
-Knows no clock, loop or socket; :mod:`zbridge.exporter` shows the registry to Prometheus.
+Knows no clock, loop or socket; :mod:`zbridge.app.prometheus` shows the registry to Prometheus.
 """
 
 from __future__ import annotations

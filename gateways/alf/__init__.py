@@ -2,7 +2,7 @@
 
 ``messages`` declares the five messages for both dialects, ``session`` holds the conversation in both roles,
 ``translate`` turns messages into fleet messages and commands into messages, ``simulator`` is a vehicle to play with,
-``strict`` one that is as fragile as the deployed ones and shares no code with the others.
+``fragile`` one that is as fragile as the deployed ones and shares no code with the others.
 """
 
 from __future__ import annotations
@@ -10,20 +10,13 @@ from __future__ import annotations
 from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import Dialect
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
+from zbridge.address import Address
 from zbridge.errors import ConfigError
-from zbridge.link import Address
-from zbridge.protocol import HqSimulation, Protocol, Simulation
+from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
-TEMPLATE = (
-    """\
-# A gateway for one ALF vehicle. Start it with: zbridge run FILE
-
-"""
-    + ROBOT_TEMPLATE
-    + """\
+TEMPLATE = """\
 [device]
 protocol = "alf"
 connect = ["tcp://127.0.0.1:6666"]      # the vehicle; or its drive server, then its laser server
@@ -36,17 +29,10 @@ speed_full = 100                        # the speed that is full scale
 # acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
 gap_s = 0.0                             # least time between two messages
-
 """
-    + COMMON_TEMPLATE
-)
-HQ_TEMPLATE = (
-    """\
+HQ_TEMPLATE = """\
 protocol = "alf"
 listen = "tcp://127.0.0.1:6667"
-"""
-    + LISTENER_TEMPLATE
-    + """\
 [hq.options]
 dialect = "text"                        # what programs in the field speak; "binary": the document's packed fields
 serve = "auto"                          # 1 and 2 until a client sends its first 3, from then on 4 and no 1; or always
@@ -56,7 +42,6 @@ points = 769                            # points of a measurement; scans of anot
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary
 gap_s = 0.0                             # least time between two messages
 """
-)
 
 
 def _dialect(name: str | None) -> Dialect:
@@ -73,8 +58,8 @@ async def _simulate(simulation: Simulation) -> None:
     if len(simulation.addresses) > LINKS:
         raise ConfigError(f"an ALF vehicle has at most {LINKS} links")
     dialect = _dialect(simulation.dialect)
-    if simulation.strict:
-        from gateways.alf.strict import simulate_strict
+    if simulation.fragile:
+        from gateways.alf.conformance.fragile_robot import simulate_fragile
 
         host, port = simulation.addresses[0].host, simulation.addresses[0].port
         laser = simulation.addresses[1].port if len(simulation.addresses) > 1 else None
@@ -83,7 +68,7 @@ async def _simulate(simulation: Simulation) -> None:
             ports = (drive_port,) if laser_port is None else (drive_port, laser_port)
             simulation.ready(tuple(Address(host, port) for port in ports))
 
-        await simulate_strict(host, port, dialect=dialect.value, laser_port=laser, seed=simulation.seed, ready=ready)
+        await simulate_fragile(host, port, dialect=dialect.value, laser_port=laser, seed=simulation.seed, ready=ready)
     else:
         from gateways.alf.simulator import simulate
 
@@ -91,12 +76,12 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.alf.strict_hq import simulate_strict_hq
+    from gateways.alf.conformance.fragile_hq import simulate_fragile_hq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("ALF HQ programs have no versions and no datagrams")
     dialect = _dialect(simulation.dialect)
-    await simulate_strict_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
+    await simulate_fragile_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
 
 
 PROTOCOL = Protocol(

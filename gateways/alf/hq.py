@@ -33,8 +33,8 @@ from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol import HqSide, Send, Telemetry
-from zbridge.session.session import Limits
+from zbridge.protocol.plugin import HqSide, Send, Telemetry
+from zbridge.protocol.session import Limits
 
 DEADMAN_S = 0.3
 """Deployed HQ programs repeat their command every 20 ms."""

@@ -29,7 +29,7 @@ from gateways.alf.messages import (
     write_text,
 )
 from zbridge.errors import Code, NotReady, ProtocolError
-from zbridge.session.session import Limits, Role, Session, State
+from zbridge.protocol.session import Limits, Role, Session, State
 
 REPEAT_S = 0.02
 """Seconds between repetitions of the drive command."""

@@ -17,12 +17,13 @@ import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleSession
-from zbridge.conversation import Accepted, Conversation
 from zbridge.errors import EncodeError, Refused
-from zbridge.link import Link, Receiver, listen
-from zbridge.protocol import Simulation
-from zbridge.session.session import State
-from zbridge.world import Body, cast
+from zbridge.protocol.plugin import Simulation
+from zbridge.protocol.session import State
+from zbridge.simulation.world import Body, cast
+from zbridge.transport.conversation import Accepted, Conversation
+from zbridge.transport.link import Link, Receiver
+from zbridge.transport.tcp import listen
 
 log = logging.getLogger("gateways.alf.simulator")
 

@@ -30,8 +30,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol import Outcome, Robot, Telemetry, Translate
-from zbridge.session.deviceclock import DeviceClock
+from zbridge.protocol.device_clock import DeviceClock
+from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
 
 NAME = "alf"
 STANDARD_GRAVITY = 9.80665

@@ -1,7 +1,7 @@
 """The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
 
 ``messages`` declares the packets, ``session`` holds the conversation in both roles, ``translate`` turns
-packets into fleet messages and commands into packets, ``simulator`` is a robot to play with, ``strict`` one that
+packets into fleet messages and commands into packets, ``simulator`` is a robot to play with, ``fragile`` one that
 is as fragile as the deployed ones and shares no code with the others.
 """
 
@@ -11,18 +11,11 @@ from gateways.tcpudp.hq import HqOptions, TcpUdpHq
 from gateways.tcpudp.settings import HQ_BLOCKS
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
+from zbridge.address import Address
 from zbridge.errors import ConfigError
-from zbridge.link import Address
-from zbridge.protocol import HqSimulation, Protocol, Simulation
+from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
 
-TEMPLATE = (
-    """\
-# A gateway for one robot of the TCP/UDP package protocol. Start it with: zbridge run FILE
-
-"""
-    + ROBOT_TEMPLATE
-    + """\
+TEMPLATE = """\
 [device]
 protocol = "tcpudp"
 connect = ["tcp://127.0.0.1:11001"]     # the robot's address
@@ -40,17 +33,10 @@ length_unit_m = 0.01                    # the robot's unit of length in metres
 heading_offset = 1.5707963267948966     # added to the robot's heading, radians
 map_cell_m = 0.01                       # side of a map cell where the robot does not announce it
 # map_origin = [0.0, 0.0]               # x, y of map cell (0, 0) in metres; left out: the map is centred
-
 """
-    + COMMON_TEMPLATE
-)
-HQ_TEMPLATE = (
-    """\
+HQ_TEMPLATE = """\
 protocol = "tcpudp"
 listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and hear datagrams from this address and port
-"""
-    + LISTENER_TEMPLATE
-    + """\
 [hq.options]
 versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
 udp = true                              # offer datagrams: 1.3 programs drive by nothing else
@@ -71,7 +57,6 @@ heading_offset = 1.5707963267948966     # what is subtracted from the robot's he
 # map_origin = [0.0, 0.0]               # x, y of map cell (0, 0) in metres, as the programs take it; left out: centred,
                                         # and a robot of this protocol as its own programs see it
 """
-)
 
 
 async def _simulate(simulation: Simulation) -> None:
@@ -79,15 +64,15 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError("a TCP/UDP robot has one link and no dialects")
     if simulation.version is not None and simulation.version not in VERSIONS:
         raise ConfigError(f"version {simulation.version!r}: expected one of {', '.join(VERSIONS)}")
-    if simulation.strict:
-        from gateways.tcpudp.strict import simulate_strict
+    if simulation.fragile:
+        from gateways.tcpudp.conformance.fragile_robot import simulate_fragile
 
         (address,), version = simulation.addresses, simulation.version or "1.3"
 
         def ready(port: int) -> None:
             simulation.ready((Address(address.host, port),))
 
-        await simulate_strict(
+        await simulate_fragile(
             address.host, address.port, version=version, udp=simulation.udp, seed=simulation.seed, ready=ready
         )
     else:
@@ -97,7 +82,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.strict_hq import simulate_strict_hq
+    from gateways.tcpudp.conformance.fragile_hq import simulate_fragile_hq
 
     version = simulation.version or "1.3"
     if simulation.dialect is not None:
@@ -105,7 +90,7 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
     udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
-    await simulate_strict_hq(simulation.address.host, simulation.address.port, version=version, udp=udp)
+    await simulate_fragile_hq(simulation.address.host, simulation.address.port, version=version, udp=udp)
 
 
 PROTOCOL = Protocol(

@@ -55,9 +55,9 @@ from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, 
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol import HqSide, Send, Telemetry
-from zbridge.session.negotiation import newest
-from zbridge.session.session import Datagram, Limits
+from zbridge.protocol.negotiation import newest
+from zbridge.protocol.plugin import HqSide, Send, Telemetry
+from zbridge.protocol.session import Datagram, Limits
 
 DEADMAN_S = 1.3
 """Deployed HQ programs repeat what their stick says every 0.5 s."""

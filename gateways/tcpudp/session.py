@@ -38,10 +38,10 @@ from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings,
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
 from zbridge.errors import EncodeError, Malformed, NotReady, ProtocolError, Unsupported
-from zbridge.session.negotiation import agree, newest, parse_versions
-from zbridge.session.outbox import LIMIT
-from zbridge.session.probe import Probe, Verdict
-from zbridge.session.session import Datagram, Limits, Role, Session, State
+from zbridge.protocol.negotiation import agree, newest, parse_versions
+from zbridge.protocol.outbox import LIMIT
+from zbridge.protocol.session import Datagram, Limits, Role, Session, State
+from zbridge.protocol.udp_probe import Probe, Verdict
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""

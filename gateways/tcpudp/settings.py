@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import Enum
 
 from zbridge.errors import ProtocolError
-from zbridge.session.negotiation import newest, parse_versions
+from zbridge.protocol.negotiation import newest, parse_versions
 from zbridge.wire import I32, BinaryCodec, Bool, Message
 
 

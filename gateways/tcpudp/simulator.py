@@ -38,13 +38,14 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.conversation import Accepted, Conversation
 from zbridge.errors import EncodeError, Refused
-from zbridge.link import Link, listen
-from zbridge.protocol import Simulation
-from zbridge.session.manager import ClientIds
-from zbridge.session.session import State
-from zbridge.world import Body, Grid, cast
+from zbridge.protocol.plugin import Simulation
+from zbridge.protocol.session import State
+from zbridge.protocol.session_table import ClientIds
+from zbridge.simulation.world import Body, Grid, cast
+from zbridge.transport.conversation import Accepted, Conversation
+from zbridge.transport.link import Link
+from zbridge.transport.tcp import listen
 
 log = logging.getLogger("gateways.tcpudp.simulator")
 

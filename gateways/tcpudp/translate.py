@@ -43,7 +43,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
 
 NAME = "tcpudp"
 ON, OFF = 1, 2

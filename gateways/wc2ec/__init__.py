@@ -2,7 +2,7 @@
 
 ``messages`` declares the messages of both dialects, ``devices`` the table of what a robot has, ``session`` holds the
 conversation in both roles, ``translate`` turns readings into fleet messages and commands into motor values,
-``simulator`` is a robot to play with, ``strict`` one that is as fragile as the deployed ones and shares no code with
+``simulator`` is a robot to play with, ``fragile`` one that is as fragile as the deployed ones and shares no code with
 the others.
 """
 
@@ -11,18 +11,11 @@ from __future__ import annotations
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect
 from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
-from zbridge.config import COMMON_TEMPLATE, LISTENER_TEMPLATE, ROBOT_TEMPLATE
+from zbridge.address import Address
 from zbridge.errors import ConfigError
-from zbridge.link import Address
-from zbridge.protocol import HqSimulation, Protocol, Simulation
+from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
 
-TEMPLATE = (
-    """\
-# A gateway for one Webots robot. Start it with: zbridge run FILE
-
-"""
-    + ROBOT_TEMPLATE
-    + """\
+TEMPLATE = """\
 [device]
 protocol = "wc2ec"
 connect = ["tcp://127.0.0.1:27015"]     # the Webots controller: one port per robot
@@ -47,17 +40,10 @@ motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors
 # track_m = 0.3
 # speed_full_m_s = 0.5                  # over ground at a drive of 1
 # turn_full_rad_s = 1.0
-
 """
-    + COMMON_TEMPLATE
-)
-HQ_TEMPLATE = (
-    """\
+HQ_TEMPLATE = """\
 protocol = "wc2ec"
 listen = "tcp://127.0.0.1:27016"
-"""
-    + LISTENER_TEMPLATE
-    + """\
 [hq.options]
 dialect = "deployed"                    # what controllers in the field speak; "draft": the document's, without names
 hold = true                             # repeat what a controller set once while its connection lives: one that hangs
@@ -78,7 +64,6 @@ track_m = 0.3
 speed_full_m_s = 0.5                    # over ground at a drive of 1
 turn_full_rad_s = 1.0
 """
-)
 SIMULATED = {
     "bounds_default": [0.0, 1000.0],
     "differential": {"left": ["left wheel"], "right": ["right wheel"], "wheel_radius_m": 0.05, "track_m": 0.3},
@@ -103,13 +88,13 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError("a Webots robot has one link")
     dialect = _dialect(simulation.dialect)
     (address,) = simulation.addresses
-    if simulation.strict:
-        from gateways.wc2ec.strict import simulate_strict
+    if simulation.fragile:
+        from gateways.wc2ec.conformance.fragile_robot import simulate_fragile
 
         def ready(port: int) -> None:
             simulation.ready((Address(address.host, port),))
 
-        await simulate_strict(address.host, address.port, dialect=dialect.value, seed=simulation.seed, ready=ready)
+        await simulate_fragile(address.host, address.port, dialect=dialect.value, seed=simulation.seed, ready=ready)
     else:
         from gateways.wc2ec.simulator import simulate
 
@@ -117,12 +102,12 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.strict_hq import simulate_strict_hq
+    from gateways.wc2ec.conformance.fragile_hq import simulate_fragile_hq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")
     dialect = _dialect(simulation.dialect)
-    await simulate_strict_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
+    await simulate_fragile_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
 
 
 PROTOCOL = Protocol(

@@ -46,8 +46,8 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol import HqSide, Send, Telemetry
-from zbridge.session.session import Limits
+from zbridge.protocol.plugin import HqSide, Send, Telemetry
+from zbridge.protocol.session import Limits
 
 DEADMAN_S = 0.5
 MOST_POINTS = 100_000

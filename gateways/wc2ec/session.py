@@ -20,7 +20,7 @@ from gateways.wc2ec.messages import (
     write,
 )
 from zbridge.errors import EncodeError
-from zbridge.session.session import Limits, Role, Session, State
+from zbridge.protocol.session import Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
 SETTLE_S = 0.1

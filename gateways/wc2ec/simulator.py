@@ -25,12 +25,13 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerSession
-from zbridge.conversation import Accepted, Conversation
 from zbridge.errors import EncodeError, Refused
-from zbridge.link import Link, listen
-from zbridge.protocol import Simulation
-from zbridge.session.session import State
-from zbridge.world import Body, cast
+from zbridge.protocol.plugin import Simulation
+from zbridge.protocol.session import State
+from zbridge.simulation.world import Body, cast
+from zbridge.transport.conversation import Accepted, Conversation
+from zbridge.transport.link import Link
+from zbridge.transport.tcp import listen
 
 log = logging.getLogger("gateways.wc2ec.simulator")
 

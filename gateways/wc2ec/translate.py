@@ -42,7 +42,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Text
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
 
 NAME = "wc2ec"
 STOP_REPEAT_S = 0.1

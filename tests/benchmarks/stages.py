@@ -18,10 +18,10 @@ from gateways.tcpudp.translate import TcpUdpRobot
 from tests.benchmarks.drives import number
 from zbridge.bus.inbox import Inbox
 from zbridge.cli import main as zbridge
-from zbridge.commands import Commands
-from zbridge.leases import Leases
-from zbridge.link import TcpLink
-from zbridge.session.control import Authority
+from zbridge.control.authority import Authority
+from zbridge.control.lease_server import LeaseServer
+from zbridge.robot.commands import Commands
+from zbridge.transport.tcp import TcpLink
 
 STAGES = {
     "callback": "Zenoh called back",
@@ -74,7 +74,7 @@ def main() -> None:
     out = Path(sys.argv[1])
     sys.argv = ["zbridge", *sys.argv[2:]]
     stages = Stages()
-    stages.wrap(Leases, "lane", before="callback")
+    stages.wrap(LeaseServer, "lane", before="callback")
     stages.wrap(Inbox, "_drain", before="woken")
     stages.wrap(Commands, "take", before="taken", after="done")
     stages.wrap(Authority, "admit", after="admitted")

@@ -9,23 +9,23 @@ from typing import Any
 import msgspec
 
 from tests.proofs import Holder, numbered
-from zbridge.audit import Audit
 from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
-from zbridge.commands import Commands
 from zbridge.conditions import Conditions
+from zbridge.control.audit_log import Audit
+from zbridge.control.authority import Authority
+from zbridge.control.lease_server import LeaseServer
+from zbridge.control.motion_limits import MotionLimits
+from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Authorization, Control, FleetMessage, Status
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.leases import Leases
 from zbridge.metrics import Metrics
-from zbridge.protocol import Outcome, Robot
-from zbridge.session.control import Authority
-from zbridge.session.motion import MotionLimits
-from zbridge.session.session import State
-from zbridge.standstill import Standstill
+from zbridge.protocol.plugin import Outcome, Robot
+from zbridge.protocol.session import State
+from zbridge.robot.commands import Commands
 
 LEASE_S, DEADMAN_S = 3.0, 2.0
 
@@ -82,7 +82,7 @@ class Gateway:
         self._loop = asyncio.get_running_loop()
         metrics = Metrics()
         self.authority = Authority(lease_s, DEADMAN_S, numbered())
-        self.leases = Leases(
+        self.leases = LeaseServer(
             self.machine,
             self.authority,
             self.keys,

@@ -1,4 +1,4 @@
-"""HQ programs of every protocol and version at once at one robot, all of them strict judges, and so is the robot.
+"""HQ programs of every protocol and version at once at one robot, all of them fragile judges, and so is the robot.
 
     python -m tests.e2e.hq_judge --seconds 60                # every robot: each drives, then one for a minute
     python -m tests.e2e.hq_judge --robot alf --driver ec --seconds 10
@@ -23,13 +23,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gateways.alf.strict_hq import StrictHq as AlfHq
-from gateways.alf.strict_parser import Dialect
-from gateways.tcpudp.strict_hq import StrictHq as TcpHq
-from gateways.tcpudp.strict_parser import Feature
-from gateways.wc2ec.strict_hq import StrictController
+from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
+from gateways.alf.conformance.parser import Dialect
+from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
+from gateways.tcpudp.conformance.parser import Feature
+from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e.conftest import Bench
-from tests.e2e.hq_robot import ROBOTS, strict_robot
+from tests.e2e.hq_robot import ROBOTS, fragile_robot
 from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener, playing, ports, soon
 
 LEASE_S = 1.2
@@ -172,7 +172,7 @@ class Ec:
     """On a busy machine its two wheels are further apart than elsewhere."""
 
     def __init__(self) -> None:
-        self.judge = StrictController(split=True)
+        self.judge = FragileController(split=True)
         self._forward = 0.0
 
     @property
@@ -328,7 +328,7 @@ class Stage:
             return bool((fleet.last("r1/motion").get("speed") or 0.0) * forward > 0.0)
         if self.robot == "wc2ec":
             return any(abs(now - then) > 0.03 for now, then in zip(self._readings(), before[1], strict=True))
-        pose = fleet.last("r1/pose")  # the strict robot looks along x
+        pose = fleet.last("r1/pose")  # the fragile robot looks along x
         return bool((pose["x"] - before[0]["x"]) * forward > 0.03)
 
     def _idle(self) -> bool:
@@ -373,7 +373,7 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
     """Judge one robot: let each of ``drivers`` drive a moment, then ``driver`` for a time."""
     judgement = Judgement(robot, [*drivers])
     began = time.monotonic()
-    with strict_robot(robot) as process:
+    with fragile_robot(robot) as process:
         async with stage(robot, process) as on:
             await on.all_see()
             for name in judgement.drove:

@@ -1,4 +1,4 @@
-"""A strict robot of any protocol as a process of its own, so that nothing but the machine makes it late.
+"""A fragile robot of any protocol as a process of its own, so that nothing but the machine makes it late.
 
 ``python -m tests.e2e.hq_robot NAME``: prints its port; a line on stdin ends it, and it prints what it received and
 what was violated as one JSON object. It says more often than deployed robots where it is: tests are short.
@@ -14,30 +14,30 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gateways.alf import strict as alf
-from gateways.alf import strict_parser as alf_parser
-from gateways.tcpudp import strict as tcpudp
-from gateways.tcpudp import strict_parser as tcpudp_parser
-from gateways.wc2ec import strict as wc2ec
+from gateways.alf import fragile as alf
+from gateways.alf.conformance import parser as alf_parser
+from gateways.tcpudp import fragile as tcpudp
+from gateways.tcpudp.conformance import parser as tcpudp_parser
+from gateways.wc2ec import fragile as wc2ec
 
 SEED = 1
 ROBOTS: dict[str, Callable[[], Any]] = {
     "tcpudp-1.1": lambda: _tcpudp("1.1", udp=False),
     "tcpudp-1.2": lambda: _tcpudp("1.2", udp=False),
     "tcpudp-1.3": lambda: _tcpudp("1.3", udp=True),
-    "alf": lambda: alf.StrictVehicle("text", laser=True, drive=True, seed=SEED, times=alf_parser.Times(info_s=0.2)),
-    "wc2ec": lambda: wc2ec.StrictController("deployed", seed=SEED),
+    "alf": lambda: alf.FragileVehicle("text", laser=True, drive=True, seed=SEED, times=alf_parser.Times(info_s=0.2)),
+    "wc2ec": lambda: wc2ec.FragileController("deployed", seed=SEED),
 }
 
 
-def _tcpudp(version: str, *, udp: bool) -> tcpudp.StrictRobot:
+def _tcpudp(version: str, *, udp: bool) -> tcpudp.FragileRobot:
     times = tcpudp_parser.Times(unasked_s=0.05)
-    return tcpudp.StrictRobot(version=version, udp=udp, seed=SEED, misnamed=0.0, times=times)
+    return tcpudp.FragileRobot(version=version, udp=udp, seed=SEED, misnamed=0.0, times=times)
 
 
 @contextlib.contextmanager
-def strict_robot(name: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a strict robot; its first line is its port."""
+def fragile_robot(name: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a fragile robot; its first line is its port."""
     command = [sys.executable, "-m", "tests.e2e.hq_robot", name]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:

@@ -29,7 +29,7 @@ track_m = 0.3
 speed_full_m_s = 0.5
 turn_full_rad_s = 1.0
 """
-"""The options of the strict Webots controller's robot: 10 rad/s of both wheels are full scale."""
+"""The options of the fragile Webots controller's robot: 10 rad/s of both wheels are full scale."""
 ANSWER = bytes.fromhex("18000000 00 03 0b000000") + b"1.1,1.2,1.3" + bytes(7)
 """Packet 3 of a program of version 1.3 that has no feature, and no UDP."""
 NEUTRAL = bytes.fromhex("02000000 00 0d")

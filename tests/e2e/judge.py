@@ -1,4 +1,4 @@
-"""Mixed commands through a real gateway against the strict robot: no violation, and everything arrives.
+"""Mixed commands through a real gateway against the fragile robot: no violation, and everything arrives.
 
     python -m tests.e2e.judge                     # every version, with and without UDP, 2000 commands each
     python -m tests.e2e.judge --commands 300 --version 1.4 --udp
@@ -68,10 +68,10 @@ class Judgement:
 
 
 def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement:
-    """Run one gateway against one strict robot."""
+    """Run one gateway against one fragile robot."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
-        robot = stack.enter_context(strict_robot(version, udp=udp, seed=seed))
+        robot = stack.enter_context(fragile_robot(version, udp=udp, seed=seed))
         assert robot.stdout is not None
         bench.gateway("r1", int(robot.stdout.readline()))
         until(lambda: bench.fleet.state("r1") == "established", what="established")
@@ -90,10 +90,10 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
 
 
 @contextlib.contextmanager
-def strict_robot(version: str, *, udp: bool = False, seed: int = 1, **options: Any) -> Any:
-    """Start a strict robot as a process; its first line is its port."""
+def fragile_robot(version: str, *, udp: bool = False, seed: int = 1, **options: Any) -> Any:
+    """Start a fragile robot as a process; its first line is its port."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.e2e.strict_robot", version, str(int(udp)), str(seed), json.dumps(options)],
+        [sys.executable, "-m", "tests.e2e.fragile_robot", version, str(int(udp)), str(seed), json.dumps(options)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -1,4 +1,4 @@
-"""A strict robot as a process of its own that tells each change of its commanded motion.
+"""A fragile robot as a process of its own that tells each change of its commanded motion.
 
 ``python -m tests.e2e.moving_robot ROBOT HOST SEED``: prints its port, then a line ``AT SPEED`` (monotonic seconds,
 fraction of full scale) for each change of what it last obeyed. A line on stdin, or its end, ends it; it then prints
@@ -19,13 +19,13 @@ import time
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, NamedTuple
 
-from gateways.alf import strict_parser as alf_wire
-from gateways.alf.strict import StrictVehicle
-from gateways.tcpudp import strict_parser as tcpudp_wire
-from gateways.tcpudp.strict import StrictRobot
-from gateways.wc2ec import strict_parser as wc2ec_wire
-from gateways.wc2ec.strict import StrictController
-from zbridge.judge import Judge
+from gateways.alf.conformance import parser as alf_wire
+from gateways.alf.conformance.fragile_robot import FragileVehicle
+from gateways.tcpudp.conformance import parser as tcpudp_wire
+from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.wc2ec.conformance import parser as wc2ec_wire
+from gateways.wc2ec.conformance.fragile_robot import FragileController
+from zbridge.simulation.judge import Judge
 
 WHEEL_M, FULL_M_S = 0.05, 0.5
 """Radius of a Webots robot's wheels and its full speed; the gateway is configured with the same."""
@@ -92,7 +92,7 @@ class _Wheels(wc2ec_wire.Robot):
 
 def _package(version: str, udp: bool) -> Callable[[Tell, int], tuple[Judge, Serve]]:
     def make(tell: Tell, seed: int) -> tuple[Judge, Serve]:
-        robot = StrictRobot(version=version, udp=udp, seed=seed, times=_TCPUDP)
+        robot = FragileRobot(version=version, udp=udp, seed=seed, times=_TCPUDP)
         robot.machine = _Package(tell, seed)
         return robot, robot.serve
 
@@ -101,13 +101,13 @@ def _package(version: str, udp: bool) -> Callable[[Tell, int], tuple[Judge, Serv
 
 def _vehicle(dialect: alf_wire.Dialect) -> Callable[[Tell, int], tuple[Judge, Serve]]:
     def make(tell: Tell, seed: int) -> tuple[Judge, Serve]:
-        vehicle = StrictVehicle(dialect, laser=True, drive=True, seed=seed, times=_ALF, machine=_Vehicle(tell, seed))
+        vehicle = FragileVehicle(dialect, laser=True, drive=True, seed=seed, times=_ALF, machine=_Vehicle(tell, seed))
         return vehicle, vehicle.serve
 
     return make
 
 
-class _Controller(StrictController):
+class _Controller(FragileController):
     """Tells when it goes on after its own send held it up: it sends and reads one after the other.
 
     Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.

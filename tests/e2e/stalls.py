@@ -3,7 +3,7 @@
     python -m tests.e2e.stalls                                    # everything, 30 repetitions; about an hour and a half
     python -m tests.e2e.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
 
-Each sitting has a real gateway process, a strict robot in a process of its own that tells its commanded motion
+Each sitting has a real gateway process, a fragile robot in a process of its own that tells its commanded motion
 (:mod:`tests.e2e.moving_robot`), and a driver on the bus in a process of its own. It is driven for a moment; then
 
 stall: the robot's process is stopped (SIGSTOP) and goes on after some seconds (SIGCONT);
@@ -267,7 +267,7 @@ def _ip(prefix: str, *lines: str) -> None:
 
 
 class MovingRobot:
-    """The strict robot's process, and what it told of its motion."""
+    """The fragile robot's process, and what it told of its motion."""
 
     def __init__(self, process: _Process) -> None:
         self.process = process

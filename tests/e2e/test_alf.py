@@ -399,7 +399,7 @@ def test_without_the_lease_nothing_moves_and_with_it_one_program_drives(bench: B
 @pytest.mark.parametrize("dialect", ["text", "binary"])
 def test_a_fragile_vehicle_finds_nothing_to_complain_of(bench: Bench, dialect: str) -> None:
     vehicle = bench.zbridge(
-        *("simulate", "alf", "--strict", "--dialect", dialect),
+        *("simulate", "alf", "--fragile", "--dialect", dialect),
         *(argument for _ in range(2) for argument in ("--listen", f"tcp://127.0.0.1:{free_port()}")),
     )
     assert vehicle.stdout is not None

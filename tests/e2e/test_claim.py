@@ -16,9 +16,9 @@ import zenoh
 from tests.e2e.conftest import WAIT_S, Bench, Fleet, end, free_port, until
 from tests.e2e.robots import ScriptedRobot
 from zbridge.bus import Bus, BusSettings, open_bus
-from zbridge.claim import WATCH_S, Claim
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
+from zbridge.robot.ownership import WATCH_S, Ownership
 
 KEYS = KeySpace("fleet", "r1")
 CLAIM = "fleet/r1/@rpc/claim/gateway"
@@ -145,10 +145,10 @@ def told(bench: Bench) -> bool:
 
 
 @contextlib.asynccontextmanager
-async def claims(settings: list[BusSettings]) -> AsyncIterator[list[Claim]]:
+async def claims(settings: list[BusSettings]) -> AsyncIterator[list[Ownership]]:
     buses: list[Bus] = list(await asyncio.gather(*(open_bus(each, Metrics()) for each in settings)))
     try:
-        yield [Claim(bus, KEYS) for bus in buses]
+        yield [Ownership(bus, KEYS) for bus in buses]
     finally:
         await asyncio.gather(*(bus.close() for bus in buses))
 
@@ -157,14 +157,14 @@ async def settled(settings: list[BusSettings], apart_s: float) -> int:
     """Start gateways at nearly the same moment; count how many serve the robot when all has settled."""
     async with claims(settings) as contending:
 
-        async def serve(claim: Claim, after_s: float) -> None:
+        async def serve(claim: Ownership, after_s: float) -> None:
             await asyncio.sleep(after_s)
             await claim.take()
             await claim.watch(lambda: False, lambda zids: None)
 
         tasks = [asyncio.create_task(serve(claim, random.uniform(0.0, apart_s))) for claim in contending]
         await asyncio.sleep(2.0 + apart_s)
-        held = [repr(claim) for claim in contending].count("<Claim r1 held>")
+        held = [repr(claim) for claim in contending].count("<Ownership r1 held>")
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.conftest import Bench, end, free_port, start, until
-from zbridge.protocol import protocol_names
+from zbridge.protocol.plugin import protocol_names
 
 ROOT = Path(__file__).parents[2]
 TOML = '[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://x:1"]\n'

@@ -1,4 +1,4 @@
-"""HQ programs at a gateway, end to end: strict judges and programs written by hand, real processes and sockets."""
+"""HQ programs at a gateway, end to end: fragile judges and programs written by hand, real processes and sockets."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 import zenoh
 
-from gateways.alf.strict_hq import StrictHq as AlfHq
-from gateways.tcpudp.strict_hq import StrictHq as TcpHq
-from gateways.wc2ec.strict_hq import StrictController
+from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.captures import Record, payloads
 from tests.e2e.conftest import Bench
 from tests.e2e.hq_churn import CLIENTS, Churn, churn, crowd
 from tests.e2e.hq_judge import RANGES, judge, stage
-from tests.e2e.hq_robot import strict_robot
+from tests.e2e.hq_robot import fragile_robot
 from tests.e2e.hq_scene import HOST, NEUTRAL, ByHand, device, gateway, listener, playing, ports, sessions, soon
 from tests.e2e.robots import SETTINGS, ScriptedRobot, position
 
@@ -58,7 +58,7 @@ async def test_programs_of_every_protocol_see_one_robot_and_drive_it_in_turn_and
 
 
 async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_bus_sees_it() -> None:
-    with strict_robot("tcpudp-1.2") as process:
+    with fragile_robot("tcpudp-1.2") as process:
         async with stage("tcpudp-1.2", process) as on:
             await on.all_see()
             asked = {program.name: program.judge for program in on.programs if isinstance(program.judge, TcpHq)}
@@ -93,7 +93,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
     )
     bench.simulator(robot)
     await soon(lambda: hq.listens(3), "listeners")
-    program, vehicle, controller = TcpHq(), AlfHq(), StrictController()
+    program, vehicle, controller = TcpHq(), AlfHq(), FragileController()
     async with playing(program.run(HOST, tcp), vehicle.run(HOST, alf), controller.run(HOST, ec)):
         await soon(lambda: "no gateway serves the robot" in program.texts, "told that there is none")
         first = gateway(bench, stack, device("tcpudp", robot))

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from gateways.alf.strict_hq import StrictHq as AlfHq
-from gateways.tcpudp.strict_hq import StrictHq as TcpHq
-from gateways.wc2ec.strict_hq import StrictController
+from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e.conftest import Bench, start
 from tests.e2e.hq_judge import LET_GO_S
 from tests.e2e.hq_scene import HOST, device, gateway, listener, playing, ports, soon
@@ -72,7 +72,7 @@ async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their
     bench.simulator(robot, "toy")
     parts = [listener("tcp", "tcpudp", tcp), listener("alf", "alf", alf), listener("ec", "wc2ec", ec)]
     process = gateway(bench, stack, *parts, device("toy", robot), lease_s=1.2)
-    program, vehicle, controller = TcpHq(), AlfHq(deployed="driving"), StrictController()
+    program, vehicle, controller = TcpHq(), AlfHq(deployed="driving"), FragileController()
     await soon(lambda: process.listens(3), "listeners")
     await soon(lambda: bench.fleet.state("r1") == "established", "established")
 

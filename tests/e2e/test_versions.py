@@ -121,9 +121,9 @@ def test_probe_of_nothing_says_why(bench: Bench) -> None:
     assert "refused" in asked.stderr
 
 
-def test_a_strict_simulator_names_what_killed_it(bench: Bench) -> None:
+def test_a_fragile_simulator_names_what_killed_it(bench: Bench) -> None:
     port = free_port()
-    robot = bench.simulator(port, "tcpudp", "--strict", "--version", "1.1")
+    robot = bench.simulator(port, "tcpudp", "--fragile", "--version", "1.1")
     with socket.create_connection(("127.0.0.1", port)) as client:
         client.recv(4096)
         client.sendall(bytes.fromhex("0e000000000303000000312e310000000000"))

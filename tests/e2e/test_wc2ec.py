@@ -1,4 +1,4 @@
-"""Webots robots end to end: simulator, scripted controller or strict one, real sockets, real Zenoh."""
+"""Webots robots end to end: simulator, scripted controller or fragile one, real sockets, real Zenoh."""
 
 from __future__ import annotations
 
@@ -241,9 +241,9 @@ def test_the_simulated_robot_of_the_document_measures_and_is_configured(bench: B
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_the_strict_simulator_has_nothing_to_complain_of_and_ends_with_its_gateway(bench: Bench, dialect: str) -> None:
+def test_the_fragile_simulator_has_nothing_to_complain_of_and_ends_with_its_gateway(bench: Bench, dialect: str) -> None:
     port = free_port()
-    simulator = bench.simulator(port, "wc2ec", "--dialect", dialect, "--strict")
+    simulator = bench.simulator(port, "wc2ec", "--dialect", dialect, "--fragile")
     wheels = WHEELS.replace('"left"', '"left wheel motor"').replace('"right"', '"right wheel motor"')
     listed = 'devices = [{ name = "light0", number = 0 }, { name = "light1", number = 1 }]'
     process = gateway(bench, port, wheels if dialect == "deployed" else listed, dialect=dialect)

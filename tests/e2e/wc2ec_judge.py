@@ -1,4 +1,4 @@
-"""Mixed commands through a real gateway against the strict Webots controller: no violation, and everything arrives.
+"""Mixed commands through a real gateway against the fragile Webots controller: no violation, and everything arrives.
 
     python -m tests.e2e.wc2ec_judge                     # both dialects, 2000 commands each
     python -m tests.e2e.wc2ec_judge --commands 300 --dialect draft
@@ -24,14 +24,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gateways.wc2ec.strict import StrictController
+from gateways.wc2ec.conformance.fragile_robot import FragileController
 from tests.e2e.conftest import Bench, until
 
 DIALECTS = ("deployed", "draft")
 PACE_S = 0.01
 """Seconds between two commands."""
 LEFT, RIGHT, LIFT = 8, 9, 10
-"""Numbers of the strict robot's motors."""
+"""Numbers of the fragile robot's motors."""
 LIGHTS, VALUES = 4, 3
 FORBIDDEN = 1e6
 """Every value of a command that must be refused is greater."""
@@ -97,7 +97,7 @@ class Judgement:
 
 
 def judge(dialect: str, *, commands: int, seed: int = 1) -> Judgement:
-    """Run one gateway against one strict controller."""
+    """Run one gateway against one fragile controller."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
         robot = stack.enter_context(_robot(dialect, seed))
@@ -125,7 +125,7 @@ def judge(dialect: str, *, commands: int, seed: int = 1) -> Judgement:
 
 @contextlib.contextmanager
 def _robot(dialect: str, seed: int) -> Iterator[subprocess.Popen[str]]:
-    """Run the strict controller as a process of its own, so that nothing but the machine makes it late."""
+    """Run the fragile controller as a process of its own, so that nothing but the machine makes it late."""
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.e2e.wc2ec_judge", "--dialect", dialect, "--seed", str(seed), "--robot"],
         stdin=subprocess.PIPE,
@@ -141,7 +141,7 @@ def _robot(dialect: str, seed: int) -> Iterator[subprocess.Popen[str]]:
 
 async def _serve(dialect: str, seed: int) -> None:
     """Be the robot: print the port; a line on stdin ends it, and it prints what came of it as one JSON object."""
-    controller = StrictController(dialect, seed=seed, values=VALUES)  # type: ignore[arg-type]
+    controller = FragileController(dialect, seed=seed, values=VALUES)  # type: ignore[arg-type]
     serving = asyncio.create_task(controller.serve("127.0.0.1", 0, lambda port: print(port, flush=True)))
     await asyncio.to_thread(sys.stdin.readline)
     ended = serving.done()

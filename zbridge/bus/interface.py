@@ -11,7 +11,7 @@ import msgspec
 from zbridge.errors import BusError, Refused
 from zbridge.fleet.topics import Topic
 
-Endpoint = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
+Connection = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
 """Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
 
 
@@ -27,8 +27,8 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The ``[bus]`` table of a configuration."""
 
     mode: Literal["peer", "client", "router"] | None = None
-    connect: tuple[Endpoint, ...] = ()
-    listen: tuple[Endpoint, ...] = ()
+    connect: tuple[Connection, ...] = ()
+    listen: tuple[Connection, ...] = ()
     multicast: bool = True
     stream: Literal["drop", "block"] = "drop"
     tls: Tls | None = None

@@ -35,7 +35,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Denied
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, SizeBounds, Topic, is_concrete
 from zbridge.metrics import Count, Metrics
-from zbridge.session.allowance import Allowance
+from zbridge.protocol.rate_limit import RateLimit
 
 log = logging.getLogger("zbridge.bus")
 
@@ -373,7 +373,7 @@ def _store_by(lane: Lane, source: Source) -> Callable[[Any], None]:
 
 def _sparing(lane: Lane, clock: Callable[[], float]) -> Sort:
     """Let so many questions a second go by a lane; what asks more often gets no answer."""
-    allowance = Allowance(QUESTIONS_HZ)
+    allowance = RateLimit(QUESTIONS_HZ)
 
     def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
         return lane if allowance.take(clock()) else None

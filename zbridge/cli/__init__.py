@@ -15,9 +15,9 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, NoReturn
 
-from zbridge.config import load
+from zbridge.app.config import load
+from zbridge.app.gateway import Gateway, until_signal
 from zbridge.errors import ConfigError, ZbridgeError
-from zbridge.gateway import Gateway, until_signal
 from zbridge.text import shown
 
 

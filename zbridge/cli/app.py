@@ -8,12 +8,13 @@ from typing import Annotated
 
 import typer
 
+from zbridge.address import Address
+from zbridge.app.config import load
+from zbridge.app.gateway import until_signal
+from zbridge.app.templates import listener_template, robot_template
 from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
-from zbridge.config import listener_template, load
-from zbridge.gateway import until_signal
-from zbridge.link import Address
-from zbridge.protocol import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
+from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
 app = typer.Typer(
     help=__doc__,
@@ -64,7 +65,7 @@ def init(
     found = find_protocol(protocol)
     if hq and found.hq is None:
         give_up(2, f"{protocol} serves no HQ programs")
-    template = listener_template(found.hq_template) if hq else found.template
+    template = listener_template(found) if hq else robot_template(found)
     typer.echo(template.replace("{name}", name), nl=False)
 
 
@@ -81,7 +82,7 @@ def simulate(
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
-    strict: Annotated[bool, typer.Option("--strict", help="be as fragile as a deployed robot")] = False,
+    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as a deployed robot")] = False,
     verbose: Verbose = False,
 ) -> None:
     """Be a robot to play with, or an HQ program, until SIGTERM or SIGINT."""
@@ -98,7 +99,7 @@ def simulate(
         version or None,
         dialect or None,
         udp,
-        strict,
+        fragile,
         lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
     )
     run_loop(until_signal(simulated.simulate(simulation)))

@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from zbridge.app.gateway import until_signal
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
@@ -29,9 +30,8 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Pose, Status
 from zbridge.fleet.topics import split_key
-from zbridge.gateway import until_signal
 from zbridge.metrics import Metrics
-from zbridge.protocol import Protocol, find_protocol, protocol_names
+from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
 from zbridge.text import shown
 
 REFRESH_S = 0.5

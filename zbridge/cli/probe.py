@@ -8,18 +8,19 @@ import json
 
 import msgspec
 
+from zbridge.address import Address
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import console, errors, joined
-from zbridge.conversation import Conversation
 from zbridge.errors import BusError, LinkError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Status
 from zbridge.fleet.topics import split_key
-from zbridge.link import Address, connect
 from zbridge.metrics import Metrics
-from zbridge.protocol import Protocol
-from zbridge.session.session import State
+from zbridge.protocol.plugin import Protocol
+from zbridge.protocol.session import State
 from zbridge.text import shown
+from zbridge.transport.conversation import Conversation
+from zbridge.transport.tcp import connect
 
 PROBE_S = 15.0
 """Longest time a handshake may take."""

@@ -9,14 +9,14 @@ import socket
 from typing import Any
 
 from zbridge.bus import Answer, Bus, Publisher, Sample
+from zbridge.control.authority import NAMED
+from zbridge.control.proof import Signer
 from zbridge.errors import BusError, Code, Held, LeaseLost, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.session.control import NAMED
-from zbridge.session.proof import Signer
 
 RETRY_S = 0.1
 """Seconds between two questions to a gateway that does not answer."""

@@ -270,7 +270,7 @@ class Lease(FleetMessage, frozen=True):
 
 
 class Authorization(FleetMessage, frozen=True):
-    """What shows that a command, or a question about the lease, is the holder's: see :mod:`zbridge.session.proof`.
+    """What shows that a command, or a question about the lease, is the holder's: see :mod:`zbridge.control.proof`.
 
     The attachment of a command, and what is asked at ``renew`` and ``release``. seq: rises with each of the lease.
     """

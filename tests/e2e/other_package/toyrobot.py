@@ -12,14 +12,14 @@ from typing import Any
 
 import msgspec
 
+from zbridge.address import Address
 from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Pose
 from zbridge.fleet.topics import Topic
-from zbridge.link import Address
 from zbridge.metrics import Metrics
-from zbridge.protocol import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
-from zbridge.session.session import Limits, Role, Session
+from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
+from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\
 [robot]

@@ -15,7 +15,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 DRIVE, DRIVE_PORT = "alf-drive.hex", 16668
 LASER, LASER_PORT = "alf-laser.hex", 16667

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gateways.alf import hq as module
+from gateways.alf.conformance.fragile_hq import Reader
+from gateways.alf.conformance.parser import INIT, SCAN
 from gateways.alf.hq import AlfHq, HqClient, HqOptions
 from gateways.alf.messages import AlfMessage
-from gateways.alf.strict_hq import Reader
-from gateways.alf.strict_parser import INIT, SCAN
 from gateways.alf.translate import AlfRobot, Options
 from tests.captures import payloads, stream
 from zbridge.errors import EncodeError, ProtocolError
@@ -26,9 +26,9 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import Telemetry
-from zbridge.session.intent import Do, Intent
-from zbridge.session.session import Limits, Role, State
+from zbridge.hq.intent import Action, Intent
+from zbridge.protocol.plugin import Telemetry
+from zbridge.protocol.session import Limits, Role, State
 
 NAN, INF = math.nan, math.inf
 LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)
@@ -779,14 +779,14 @@ def test_the_recorded_hq_acquires_with_its_first_motion_and_keeps_the_robot_to_i
         for _, command in scene.says(record.payload):
             assert isinstance(command, Drive)
             done.append(intent.motion(now) if command.moving else intent.neutral(now))
-            if done[-1] is Do.ACQUIRE:
+            if done[-1] is Action.ACQUIRE:
                 assert record.payload == b"3|80|0|30|1;"
                 assert now == 0.5049
             if intent.asking and now > 0.6:
                 intent.granted(3.0)
-    assert done[:25] == [Do.NOTHING] * 25
-    asked = done[25:].count(Do.WAIT)
-    assert done[25:] == [Do.ACQUIRE] + [Do.WAIT] * asked + [Do.SEND] * (89 - asked)
+    assert done[:25] == [Action.NOTHING] * 25
+    asked = done[25:].count(Action.WAIT)
+    assert done[25:] == [Action.ACQUIRE] + [Action.WAIT] * asked + [Action.SEND] * (89 - asked)
     assert 3 <= asked <= 6, "what came in a tenth of a second, every 20 ms"
     assert not intent.wants_release(2.3017 + 2.6)
     assert intent.wants_release(2.3017 + 2.71)

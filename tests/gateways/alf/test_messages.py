@@ -34,7 +34,7 @@ from gateways.alf.messages import (
 )
 from gateways.alf.session import AlfSession, HqSession, VehicleSession
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 from zbridge.wire import FrameBuffer
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY

@@ -12,7 +12,7 @@ import pytest
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, End, Measurement, ScannerInit
 from gateways.alf.session import AlfSession, HqSession, VehicleSession
 from zbridge.errors import Refused
-from zbridge.session.session import Role, State
+from zbridge.protocol.session import Role, State
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
 NEUTRAL, AHEAD, BACK = (DriveCommand(0, 0, 0, False), DriveCommand(80, 0, -30, True), DriveCommand(50, 1, 30, False))

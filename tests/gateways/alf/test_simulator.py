@@ -11,10 +11,10 @@ from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
 from gateways.alf.session import HqSession, VehicleSession
 from gateways.alf.simulator import SCANNER, STEP_S, Car
+from zbridge.address import Address
 from zbridge.errors import ConfigError
-from zbridge.link import Address
-from zbridge.protocol import Simulation
-from zbridge.world import BOXES, HALF_SIDE_M
+from zbridge.protocol.plugin import Simulation
+from zbridge.simulation.world import BOXES, HALF_SIDE_M
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
 STRAIGHT = {TEXT: 0, BINARY: 90}

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateways.alf import PROTOCOL, TEMPLATE
+from gateways.alf import PROTOCOL
 from gateways.alf.messages import DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import HqSession
 from gateways.alf.translate import AlfRobot, Options, points_of, ranges_m
-from zbridge import config
+from zbridge.app import config
+from zbridge.app.templates import robot_template
 from zbridge.errors import ConfigError, ProtocolError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -33,7 +34,7 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 STAMP = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -817,17 +818,21 @@ def test_every_option_can_be_set() -> None:
 
 
 def test_the_template_is_a_configuration_with_the_defaults() -> None:
-    plan = config.plan(tomllib.loads(TEMPLATE.format(name="r1")))
+    plan = config.plan(tomllib.loads(robot_template(PROTOCOL).format(name="r1")))
     assert plan.device is not None
     assert plan.device.protocol is PROTOCOL
     assert plan.device.options == Options()
     assert [str(address) for address in plan.device.addresses] == ["tcp://127.0.0.1:6666"]
     for name in Options.__struct_fields__:
-        assert f"\n{name} = " in TEMPLATE or f"\n# {name} = " in TEMPLATE
+        assert f"\n{name} = " in robot_template(PROTOCOL) or f"\n# {name} = " in robot_template(PROTOCOL)
 
 
 def test_the_units_that_the_template_shows_as_left_out_are_those_of_text() -> None:
-    shown = dict(line[2:].split("=")[:2] for line in TEMPLATE.splitlines() if line.startswith(("# acc", "# gyro")))
+    shown = dict(
+        line[2:].split("=")[:2]
+        for line in robot_template(PROTOCOL).splitlines()
+        if line.startswith(("# acc", "# gyro"))
+    )
     acceleration, gyro = (float(value.split("#")[0]) for value in shown.values())
     given = motion_of(AlfRobot(Options(acceleration_m_s2=acceleration, gyro_rad_s=gyro)), info(vertical=1, gyro_z=90))
     assert given == motion_of(AlfRobot(Options()), info(vertical=1, gyro_z=90))

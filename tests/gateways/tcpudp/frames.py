@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqSession, RobotSession
-from zbridge.session.session import Datagram
+from zbridge.protocol.session import Datagram
 
 LISTED = b"1.1,1.2,1.3"
 ALL = "01010101010101"

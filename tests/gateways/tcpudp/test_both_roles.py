@@ -25,7 +25,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import HqSession, RobotSession, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
 from tests.gateways.tcpudp.frames import server_settings
-from zbridge.session.session import Datagram, State
+from zbridge.protocol.session import Datagram, State
 
 VERSIONS = {
     "1.1": (("1.1",), Settings(joystick=True, lidar=True)),

@@ -20,7 +20,7 @@ from gateways.tcpudp.session import HqSession, RobotSession, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
 from tests.gateways.tcpudp.frames import Timed
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 OLD, NEW = "tcpudp-1.1-tcp.hex", "tcpudp-1.3-udp.hex"
 ROBOT = 11001

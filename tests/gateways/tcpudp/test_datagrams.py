@@ -19,18 +19,18 @@ from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp import session as sessions
 from gateways.tcpudp.hq import HqOptions
 from tests.test_helm import Gateway
-from zbridge import link
-from zbridge.audience import Audience
+from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
-from zbridge.config import HqSettings, ListenerPlan
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Status
 from zbridge.fleet.topics import KeySpace
-from zbridge.link import Address
-from zbridge.listener import Listener
+from zbridge.hq.listener import Listener
+from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
-from zbridge.session.manager import SessionManager
+from zbridge.protocol.session_table import SessionTable
+from zbridge.transport import tcp as link
 
 KEYS = KeySpace("fleet", "r1")
 SOON_S = 5.0
@@ -77,7 +77,7 @@ class Scene:
         )
         self.gateway.bus.announce(KEYS.alive("gateway"))
         self.metrics = Metrics()
-        self.manager = SessionManager()
+        self.manager = SessionTable()
         self.listener: Listener
         self.client_port = free_port()
 
@@ -116,7 +116,7 @@ class Scene:
 @contextlib.asynccontextmanager
 async def serving(**options: Any) -> AsyncIterator[Scene]:
     scene = Scene()
-    audience = Audience(scene.bus, KEYS, scene.metrics)
+    audience = RobotSubscription(scene.bus, KEYS, scene.metrics)
     audience.open()
     plan = ListenerPlan(
         PROTOCOL,

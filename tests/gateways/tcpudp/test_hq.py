@@ -34,8 +34,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, Raw, Scan, Status, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.session.intent import Do, Intent
-from zbridge.session.session import Limits, State
+from zbridge.hq.intent import Action, Intent
+from zbridge.protocol.session import Limits, State
 
 BOUNDS = Limits(frame_bytes=65536, handshake_s=5.0)
 POSE = Pose(0.015, -0.0225, math.pi)
@@ -1228,9 +1228,9 @@ def test_the_shown_robot_is_what_the_captured_one_showed(name: str) -> None:
     assert recorded <= shown
 
 
-def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]]) -> list[Do | str]:
+def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]]) -> list[Action | str]:
     """What the intent makes of motion and modes; a refusal by its reason."""
-    done: list[Do | str] = []
+    done: list[Action | str] = []
     for at, _, command in commands:
         try:
             match command:
@@ -1249,12 +1249,12 @@ def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> 
     assert (listener.deadman_s, listener.modes) == (1.3, True)
     intent = Intent(listener.deadman_s, modes=listener.modes)
     owed = "connected: let go of the stick first"
-    assert carry_out(intent, replay(listener, client, name)) == [Do.NOTHING, owed, owed, Do.NOTHING]
+    assert carry_out(intent, replay(listener, client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
     again = replay(listener, client, name, late=10.0)
-    assert carry_out(intent, again) == [Do.NOTHING, Do.ACQUIRE, Do.WAIT, Do.WAIT]
+    assert carry_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]
     intent.granted(3.0)
     third = replay(listener, client, name, late=20.0)
-    assert carry_out(intent, third) == [Do.SEND] * 4
+    assert carry_out(intent, third) == [Action.SEND] * 4
 
 
 @pytest.mark.parametrize("name", [OLD, NEW])
@@ -1266,7 +1266,7 @@ def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> Non
     moved, rotated, stopped = carry_out(intent, commands)
     assert moved == "control mode is none"
     assert str(rotated).startswith("control mode is none")
-    assert stopped is Do.NOTHING
+    assert stopped is Action.NOTHING
 
 
 def test_ids_are_those_of_clients() -> None:

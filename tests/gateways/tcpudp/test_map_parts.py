@@ -16,7 +16,7 @@ from tests.test_device import serving
 from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 LISTED_14 = b"1.1,1.2,1.3,1.4"
 SIZE_30_10 = "1e000000 0a000000"

@@ -25,7 +25,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import HqSession, RobotSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13
 from zbridge.errors import EncodeError, Refused
-from zbridge.session.session import Role, State
+from zbridge.protocol.session import Role, State
 
 LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
 ALL = "00010101010101"  # UDP, Cam, Joystick, Chat, Lidar, LidarSim, SLAMMap

@@ -26,7 +26,7 @@ from gateways.tcpudp.messages import (
     encode_packet,
 )
 from gateways.tcpudp.simulator import SIDE, SILENCE_S, SPEED_M_S, STEP_S, TURN_RAD_S, Vehicle
-from zbridge.world import BOXES, HALF_SIDE_M
+from zbridge.simulation.world import BOXES, HALF_SIDE_M
 
 FORWARD = ClientJoystickMove(0.0, 1.0, 1.0)
 

@@ -17,7 +17,7 @@ from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Switch, Text
 from zbridge.fleet.topics import Topic
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 NONE, MANUAL, AUTONOMOUS = (bytes.fromhex(f"06000000 02 0a 0{mode}000000") for mode in (1, 2, 3))
 STOP = bytes.fromhex("02000000 02 0d")

@@ -46,7 +46,7 @@ from tests.gateways.tcpudp.frames import (
     server_settings,
 )
 from zbridge.errors import NotReady, Refused
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 POSE = ServerPosition(1.5, -2.25, 90.0)
 PORT = 11000

@@ -27,7 +27,7 @@ from tests.gateways.tcpudp.frames import (
     server_settings,
 )
 from zbridge.errors import Refused
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 LISTED_14 = LISTED + b",1.4"
 

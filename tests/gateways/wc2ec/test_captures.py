@@ -15,7 +15,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 NAME, PORT = "wc2ec-deployed.hex", 27515
 BEGAN_NS = 1_700_000_000_000_000_000

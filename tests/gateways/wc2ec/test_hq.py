@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateways.wc2ec import hq as module
+from gateways.wc2ec.conformance.fragile_hq import Reader
 from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect as WireDialect
 from gateways.wc2ec.messages import Wc2EcMessage
-from gateways.wc2ec.strict_hq import Reader
 from gateways.wc2ec.translate import DeviceOption, Options, Wc2EcRobot
 from tests.captures import payloads, stream
 from zbridge.errors import ConfigError, ProtocolError
@@ -35,8 +35,8 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import Send, Telemetry
-from zbridge.session.session import Limits, Role, State
+from zbridge.protocol.plugin import Send, Telemetry
+from zbridge.protocol.session import Limits, Role, State
 
 NAN, INF = math.nan, math.inf
 LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)

@@ -11,17 +11,18 @@ import msgpack
 
 from gateways.wc2ec.translate import Options, Wc2EcRobot
 from tests.clock import jumping
-from zbridge.audit import Audit
+from zbridge.address import Address
 from zbridge.bus import Publisher
 from zbridge.bus.fake import FakeBus
-from zbridge.conversation import Conversation
-from zbridge.device import Device
+from zbridge.control.audit_log import Audit
+from zbridge.control.authority import Authority
 from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.link import Address, FakeLink
 from zbridge.metrics import Metrics
-from zbridge.names import HOUR_S, NAMES
-from zbridge.session.control import Authority
-from zbridge.session.manager import SessionManager
+from zbridge.protocol.session_table import SessionTable
+from zbridge.robot.device import Device
+from zbridge.robot.names import HOUR_S, NAMES
+from zbridge.transport.conversation import Conversation
+from zbridge.transport.fake import FakeLink
 
 SENSORS = 255
 TEXT = "more than 1024 different names within an hour: the others are not published"
@@ -68,7 +69,7 @@ class Webots:
             keys=KeySpace("fleet", "r1"),
             bus=self.bus,
             authority=Authority(3.0, 2.0, lambda: bytes(16)),
-            manager=SessionManager(),
+            manager=SessionTable(),
             metrics=self.metrics,
             audit=Audit("r1", lambda line: None),
             connect=self._connect,

@@ -21,7 +21,7 @@ from gateways.wc2ec.messages import (
 )
 from gateways.wc2ec.session import ControllerSession, ExternalSession, Wc2EcSession
 from zbridge.errors import EncodeError
-from zbridge.session.session import Role, State
+from zbridge.protocol.session import Role, State
 
 DRAFT, DEPLOYED = Dialect.DRAFT, Dialect.DEPLOYED
 WHEEL = bytes.fromhex("00 35 00 06 77 68 65 65 6c 31")

@@ -18,10 +18,10 @@ from gateways.wc2ec.messages import (
     SetValue,
 )
 from gateways.wc2ec.simulator import DEVICES, STEP_S, Machine
+from zbridge.address import Address
 from zbridge.errors import ConfigError
-from zbridge.link import Address
-from zbridge.protocol import Simulation
-from zbridge.world import HALF_SIDE_M, SOLID
+from zbridge.protocol.plugin import Simulation
+from zbridge.simulation.world import HALF_SIDE_M, SOLID
 
 NUMBERS = {device.name: device.number for device in DEVICES}
 LEFT, RIGHT, LIFT = NUMBERS[b"left wheel"], NUMBERS[b"right wheel"], NUMBERS[b"lift"]

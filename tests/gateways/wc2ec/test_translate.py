@@ -11,10 +11,11 @@ import msgpack
 import numpy as np
 import pytest
 
-from gateways.wc2ec import PROTOCOL, TEMPLATE
+from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalSession
 from gateways.wc2ec.translate import Options, Wc2EcRobot
-from zbridge import config
+from zbridge.app import config
+from zbridge.app.templates import robot_template
 from zbridge.errors import ConfigError, EncodeError, PayloadError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -34,7 +35,7 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.session.session import State
+from zbridge.protocol.session import State
 
 STAMP = 1_700_000_000_000_000_000
 DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
@@ -1005,7 +1006,7 @@ def test_options_that_contradict_themselves_are_an_error_that_names_them(options
 
 
 def template() -> str:
-    return TEMPLATE.replace("{name}", "r1")
+    return robot_template(PROTOCOL).replace("{name}", "r1")
 
 
 def test_the_template_is_a_configuration_and_names_every_option() -> None:
@@ -1014,7 +1015,7 @@ def test_the_template_is_a_configuration_and_names_every_option() -> None:
     assert plan.device.protocol is PROTOCOL
     assert [str(address) for address in plan.device.addresses] == ["tcp://127.0.0.1:27015"]
     for name in Options.__struct_fields__:
-        assert f"{name} = " in TEMPLATE or f"[device.options.{name}]" in TEMPLATE
+        assert f"{name} = " in robot_template(PROTOCOL) or f"[device.options.{name}]" in robot_template(PROTOCOL)
 
 
 @pytest.mark.parametrize("dialect", ["deployed", "draft"])

@@ -1,0 +1,537 @@
+"""A simulated TCP/UDP robot as fragile as the deployed ones: the judge of a gateway that plays HQ.
+
+It notes each thing the protocol page ``tcpudp.md`` forbids towards robots, and dies of what kills them. By intention it
+shares no code with the gateway: not its messages, session, settings or translation. Section names in the docstrings
+are those of that page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import logging
+import math
+import random
+import socket
+import sys
+import time
+from collections.abc import Callable, Collection
+from typing import Literal
+
+from gateways.tcpudp.conformance import parser as wire
+from gateways.tcpudp.conformance.parser import Feature, Loss, Packet, Times, show
+from zbridge.simulation.judge import Judge
+
+Channel = Literal["tcp", "udp"]
+
+_TICK_S = 0.02
+_DATAGRAM_BYTES = 65536
+_BIND_TRIES = 20
+_FROZEN_KEPT = 16
+_LOOK_S = 0.006
+"""Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
+_log = logging.getLogger(__name__)
+
+
+class _Phase(enum.Enum):
+    LISTENING = enum.auto()
+    GREETED = enum.auto()
+    ASLEEP = enum.auto()
+    WOKEN = enum.auto()
+    ESTABLISHED = enum.auto()
+    FROZEN = enum.auto()
+
+
+class _Crash(Exception):
+    """The robot's process has died."""
+
+
+_DEPLOYED = Times()
+_EXPECTED = {
+    _Phase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
+    _Phase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
+    _Phase.WOKEN: {wire.UDP_PROBE, wire.UDP_STATUS},
+}
+
+
+class FragileRobot(Judge):
+    """A robot of one version that serves one connection, notes every violation and dies of the deadly ones."""
+
+    _DEATH = _Crash
+
+    def __init__(
+        self,
+        *,
+        version: str,
+        udp: bool,
+        seed: int,
+        features: Collection[Feature] | None = None,
+        obeys: Collection[Feature] = (),
+        client_id: int | None = None,
+        times: Times = _DEPLOYED,
+        loss: Loss = Loss.NOTHING,
+        parts: int = 4096,
+        misnamed: float = 0.25,
+        misread: float = 0.0,
+        again: bool = False,
+        keep: int = 10_000,
+        note: Callable[[str], None] | None = None,
+    ) -> None:
+        """Set up the robot.
+
+        ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
+        announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
+        fraction of positions sent as id 53; ``misread``: the fraction of what is dropped after the handshake, of
+        each packet id in an order of its own; ``again``: take a connection after the first, which loses half of all
+        packets in both directions and gets no telemetry ("One usable connection"); ``keep``: bound of every list;
+        ``note``: called with each violation.
+        """
+        known = frozenset(list(Feature)[: wire.FLAGS[version]])
+        others = known if features is None else frozenset(features)
+        if not others <= known:
+            raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
+        super().__init__(keep=keep, note=note)
+        self.version = version
+        self.features = (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
+        self.client_id = client_id or random.Random(seed).randint(1, 255)
+        self.received: list[tuple[float, Channel, int, bytes]] = []
+        self.misread: list[tuple[float, Channel, int, bytes]] = []
+        self.piled: list[tuple[float, Channel, int, bytes]] = []
+        """What was lost in a read that this process itself joined, for it was late."""
+        self.machine = wire.Machine(random.Random(f"{seed} talk"))
+        self._registered = wire.registered(version, self.features | frozenset(obeys))
+        self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
+        self._sleeps, self._answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
+        self._pauses = random.Random(f"{seed} pause")
+        self._misreads = {kind: random.Random(f"{seed} misread {kind}") for kind in range(256)}
+        self._losses = random.Random(f"{seed} loss")
+        self._misread, self._again, self._poor = misread, again, False
+        self._phase = _Phase.LISTENING
+        self._conn: socket.socket | None = None
+        self._broken: ConnectionResetError | None = None
+        self._udp: socket.socket | None = None
+        self._sending = asyncio.Lock()
+        self._tasks: asyncio.TaskGroup | None = None
+        self._empty_at = self._unread_s = 0.0
+        self._wake_at = 0.0
+        self._closed_at = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        """Know nothing of an HQ."""
+        self._reads = wire.Reads()
+        self._awake = asyncio.Event()
+        self._hq_features: frozenset[Feature] = frozenset()
+        self._source: tuple[str, int] | None = None
+        self._probes = 0
+        self._offered = self._answered = self._asked_map = False
+        self._quiet_until = -math.inf
+        self._status: bool | None = None
+        self._parts_since = math.inf
+
+    def __repr__(self) -> str:
+        return f"<FragileRobot {self.version} {self._phase.name} violations={len(self.violations)} alive={self.alive}>"
+
+    async def serve(self, host: str, port: int, ready: Callable[[int], None]) -> None:
+        """Serve on TCP and UDP port ``port`` (0: any, told to ``ready``) until cancelled or dead."""
+        tcp, self._udp = _bind(host, port)
+        with contextlib.ExitStack() as sockets:
+            sockets.enter_context(tcp)
+            sockets.enter_context(self._udp)
+            ready(tcp.getsockname()[1])
+            try:
+                async with asyncio.TaskGroup() as self._tasks:
+                    self._tasks.create_task(self._accept(tcp, sockets))
+                    self._tasks.create_task(self._hear(self._udp))
+                    self._tasks.create_task(self._move())
+            except* _Crash:
+                self._event(f"died: {self.death}")
+
+    # TCP
+
+    async def _accept(self, tcp: socket.socket, sockets: contextlib.ExitStack) -> None:
+        """Serve the first connection; take all others and say nothing ("One usable connection per start")."""
+        assert self._tasks is not None
+        loop = asyncio.get_running_loop()
+        frozen: list[socket.socket] = []
+        while True:
+            conn, peer = await loop.sock_accept(tcp)
+            if self._phase is _Phase.LISTENING or (self._again and self._conn is None):
+                self._begin(conn)
+                self._tasks.create_task(self._converse(sockets.enter_context(conn)))
+                continue
+            self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase.name.lower()}")
+            frozen.append(sockets.enter_context(conn))
+            for old in frozen[:-_FROZEN_KEPT]:
+                old.close()
+            del frozen[:-_FROZEN_KEPT]
+
+    def _begin(self, conn: socket.socket) -> None:
+        """Begin with an HQ; with one that is not the first, poorly."""
+        conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._phase is not _Phase.LISTENING:
+            self._poor, self.client_id = True, max(2, self.client_id) % 255 + 1
+            self._forget()
+        self._phase, self._conn = _Phase.GREETED, conn
+
+    def cut(self) -> None:
+        """Break the connection."""
+        if self._conn is not None:
+            self._conn.shutdown(socket.SHUT_RDWR)
+
+    async def _converse(self, conn: socket.socket) -> None:
+        """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
+        try:
+            settings = wire.server_settings(self.version, self.client_id, self.features)
+            await self._send(wire.SERVER_SETTINGS, settings)
+            self._empty_at = time.monotonic()
+            while data := await self._next(conn):
+                await self._read(data)
+                await self._nap()
+            if self._broken:  # a send was told of it first, and the kernel tells once
+                raise self._broken
+            self._event("the HQ closed the connection")
+        except OSError as error:
+            self._event(f"the connection broke: {error!r}")
+        finally:
+            self._phase, self._conn, self._closed_at = _Phase.FROZEN, None, time.monotonic()
+            self._awake.set()
+            with contextlib.suppress(OSError):
+                conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
+
+    async def _next(self, conn: socket.socket) -> bytes:
+        """Read as soon as there is anything; know at any time since when there was nothing."""
+        while (data := self._waiting()) is None:
+            await _readable(conn, _LOOK_S)
+        return data
+
+    async def _read(self, data: bytes) -> None:
+        """Take what one read gave as one packet: what piled up while this process stood still is lost.
+
+        Packets that were spaced as they are to be need a while to pile up. Those that came within less, after a moment
+        at which there was nothing to read, were not spaced: the HQ joined them, however late this process is.
+        """
+        received, problem = self._reads.take(data)
+        joined = self._reads.joined
+        if joined and self._unread_s >= self._times.gap_s * (len(joined) - 1):
+            problem += f" (this process read nothing for {self._unread_s * 1000:.0f} ms)"
+            self.piled += [(time.monotonic(), "tcp", packet.kind, packet.body) for packet in joined]
+            del self.piled[: -self._keep]
+        if problem:
+            self._violate(problem)
+        if received is not None:
+            await self._take(received, "tcp")
+
+    async def _nap(self) -> None:
+        await asyncio.sleep(self._sleeps.uniform(0, self._times.read_s))
+
+    async def _send(self, kind: int, body: bytes = b"") -> None:
+        """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
+        data = wire.packet(kind, body)
+        if self._phase is _Phase.ESTABLISHED and self._loses():
+            return
+        if kind in wire.BY_UDP and self._status:
+            self._send_datagram(data)
+        elif (conn := self._conn) is not None:
+            try:
+                async with asyncio.timeout(self._times.send_s), self._sending:
+                    await asyncio.get_running_loop().sock_sendall(conn, data)
+            except TimeoutError:
+                self._event(f"the HQ read nothing for {self._times.send_s:g} s")
+                conn.shutdown(socket.SHUT_RDWR)
+            except ConnectionResetError as error:
+                self._broken = error
+                raise
+
+    # UDP
+
+    async def _hear(self, udp: socket.socket) -> None:
+        while True:
+            await _readable(udp)
+            try:
+                data, source = udp.recvfrom(_DATAGRAM_BYTES)
+            except OSError:  # another one's, or the news that ours was not delivered
+                continue
+            await self._datagram(data, source[:2])
+
+    async def _datagram(self, data: bytes, source: tuple[str, int]) -> None:
+        """Take one datagram ("The gateway as HQ": no UDP before TCP, no wrong length field)."""
+        if self._loses():
+            return
+        if self._phase is _Phase.FROZEN:
+            if time.monotonic() - self._closed_at > self._times.flight_s:
+                self._violate(f"a datagram after the TCP connection ended: {show(data)}")
+            return
+        if not self._offered:
+            before = "TCP" if self._phase is _Phase.LISTENING else "the robot sent 4"
+            self._die(f"a datagram before {before}: {show(data)}")
+        received = wire.datagram(data)
+        if received is None:
+            self._die(f"a datagram whose length field is wrong: {show(data)}")
+        if time.monotonic() >= self._wake_at:
+            await self._awake.wait()  # the loop may run the two readers in the wrong order
+        if received.kind == wire.UDP_PROBE and self._source is None:
+            self._source = source
+        if self._source is None:
+            self._violate(f"a datagram before the probe 5: {show(data)}")
+        elif source != self._source:
+            self._violate(f"a datagram from {source}, not from where 5 came from: {show(data)}")
+        else:
+            await self._take(received, "udp")
+
+    def _send_datagram(self, data: bytes) -> None:
+        if self._udp is not None and self._source is not None:
+            with contextlib.suppress(OSError):
+                self._udp.sendto(data, self._source)
+
+    def _probe(self) -> None:
+        """Answer the first 5 with 6(true) from the TCP port's number, to where it came from ("Handshake" 5)."""
+        self._probes += 1
+        if self._probes > 1:
+            self._violate(f"{self._probes} probes 5 by UDP instead of one")
+        elif self._phase is not _Phase.ASLEEP:
+            self._violate(f"the probe 5 came later than {self._times.probe_s:g} s after the 4")
+        elif self._loss is Loss.NOTHING and not self._loses():
+            self._answered = True
+            self._send_datagram(wire.packet(wire.UDP_ANSWER, b"\x01"))
+
+    # Packets
+
+    async def _take(self, received: Packet, channel: Channel) -> None:
+        kind, body = received.kind, received.body
+        raw = f"{channel} packet {kind}, body {show(body)}"
+        if self._phase is _Phase.ESTABLISHED and self._misreads[kind].random() < self._misread:
+            self.misread.append((time.monotonic(), channel, kind, body))
+            del self.misread[: -self._keep]
+            return
+        if self._phase is _Phase.ESTABLISHED and channel == "tcp" and self._loses():
+            return
+        self.received.append((time.monotonic(), channel, kind, body))
+        del self.received[: -self._keep]
+        if kind not in self._registered:
+            self._die(f"unregistered packet id {kind} for a robot {self.version} with these flags: {raw}")
+        senders = {0, self.client_id} if self._phase is _Phase.GREETED else {self.client_id}
+        if received.sender not in senders:
+            self._violate(f"id byte {received.sender} instead of {self.client_id}: {raw}")
+        if kind == wire.DEBUG and body == bytes(4):
+            self._die(f"a debugMessage with an empty text: {raw}")
+        problem = self._problem(kind, body, channel)
+        if problem:
+            self._violate(f"{problem}: {raw}")
+        elif kind == wire.UDP_PROBE:
+            self._probe()
+        else:
+            await self._obey(kind, body)
+
+    def _problem(self, kind: int, body: bytes, channel: Channel) -> str:
+        by_udp = kind == wire.UDP_PROBE or (kind in wire.BY_UDP and bool(self._status))
+        expected = _EXPECTED.get(self._phase)
+        if expected is not None and kind not in expected:
+            return f"packet {kind} while the robot waits for {' or '.join(map(str, sorted(expected)))}"
+        if by_udp != (channel == "udp"):
+            return f"packet {kind} by {channel.upper()} instead of {'UDP' if by_udp else 'TCP'}"
+        if channel == "tcp" and kind != wire.UDP_STATUS and time.monotonic() < self._quiet_until:
+            return f"packet {kind} by TCP within {self._times.silence_s:g} s of the 4"
+        if kind == wire.GET_MAP and time.monotonic() - self._parts_since > self._times.flight_s:
+            return "packet 52 to a robot that sends its map in parts by itself"
+        return wire.body_problem(kind, body)
+
+    async def _obey(self, kind: int, body: bytes) -> None:
+        if kind == wire.CLIENT_SETTINGS:
+            await self._settle(body)
+        elif kind == wire.UDP_STATUS:
+            self._conclude(any(body))
+        elif kind in (wire.MOVE, wire.ROTATE, wire.STOP):
+            self.machine.steer(body)
+        elif kind == wire.MODE:
+            self.machine.choose(body)
+        elif kind == wire.LIDAR_MODE:
+            self.machine.lidar_on = body[0] == 1
+            await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
+        elif kind == wire.GET_POSITION:
+            misnamed = self._answers.random() < self._misnamed
+            await self._send(wire.MAP if misnamed else wire.POSITION, self.machine.body(wire.POSITION))
+        elif kind == wire.GET_MAP:
+            await self._send_map()
+
+    # Handshake
+
+    async def _settle(self, body: bytes) -> None:
+        """Take the HQ's settings; harm comes from version strings ("Settings and version negotiation")."""
+        if self._phase is not _Phase.GREETED:
+            return self._violate(f"a second clientSettings: {show(body)}")
+        settings = wire.client_settings(body)
+        if wire.deadly(self.version, settings):
+            self._die(f"a version list of {settings.versions.count(',') + 1} entries to a {self.version}: {show(body)}")
+        if settings.versions == (safe := wire.UNDERSTOOD[self.version]):
+            self._hq_features = settings.features
+        else:
+            self._violate(f"versions {settings.versions!r} to a robot that understands {safe!r} only: {show(body)}")
+        if settings.problem:
+            self._violate(f"{settings.problem}: {show(body)}")
+        if Feature.UDP in self.features & self._hq_features:
+            return await self._offer_udp()
+        return self._establish()
+
+    async def _offer_udp(self) -> None:
+        """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake" 3 to 6)."""
+        assert self._tasks is not None
+        self._offered, self._phase = True, _Phase.ASLEEP
+        self._wake_at = time.monotonic() + self._times.probe_s
+        self._quiet_until = time.monotonic() + self._times.silence_s
+        await self._send(wire.START_UDP)
+        self._tasks.create_task(self._miss_status())
+        await asyncio.sleep(self._times.probe_s)
+        self._phase = _Phase.WOKEN
+        self._awake.set()
+        data = self._waiting()
+        if data == b"":
+            return
+        if not self._answered and self._loss is not Loss.ANSWER:
+            await self._send(wire.UDP_ANSWER, b"\x00")
+        if not self._probes:
+            self._violate(f"no 5 by UDP within {self._times.probe_s:g} s of the 4")
+        if data is not None:
+            packets, rest, _ = wire.cut(data)
+            if rest or [packet.kind for packet in packets] != [wire.UDP_STATUS]:
+                self._violate(f"TCP other than one 7 within {self._times.probe_s:g} s of the 4: {show(data)}")
+            await self._read(data)
+
+    async def _miss_status(self) -> None:
+        await asyncio.sleep(2 * self._times.probe_s)
+        if self._status is None and self._conn is not None:
+            self._violate(f"no 7 within {2 * self._times.probe_s:g} s of the 4")
+
+    def _conclude(self, connected: bool) -> None:
+        if not self._offered or self._status is not None:
+            return self._violate("a second 7" if self._offered else "a 7 though the robot sent no 4")
+        if connected and not self._answered:
+            self._violate("7(true) though no 6(true) was received")
+        if not connected and self._answered:
+            self._event("7(false) though 6(true) was sent by UDP")
+        self._status = connected and self._answered
+        return self._establish()
+
+    def _establish(self) -> None:
+        assert self._tasks is not None
+        self._phase = _Phase.ESTABLISHED
+        if self._poor:
+            return
+        if self._times.unasked_s:
+            self._tasks.create_task(self._chatter(self._conn))
+        if self.version == "1.4" and Feature.LIDAR_SIM in self._hq_features:
+            self._tasks.create_task(self._send_parts(self._conn))
+
+    def _loses(self) -> bool:
+        """Tell whether a poor connection loses the packet."""
+        return self._poor and self._losses.random() < 0.5
+
+    # Motion, maps, talk
+
+    async def _move(self) -> None:
+        """Move as told, for ever: a deployed robot does not stop by itself."""
+        last = time.monotonic()
+        while True:
+            await asyncio.sleep(_TICK_S)
+            now = time.monotonic()
+            self.machine.step(min(now - last, 0.1))
+            last = now
+
+    async def _send_map(self) -> None:
+        """Answer 52; the first answer of a 1.1 robot says no map yet, the handler of a "1.4" is empty ("Packets")."""
+        if self.version == "1.1" and not self._asked_map:
+            await self._send(wire.MAP)
+        elif self.version != "1.4":
+            await self._send(wire.MAP, self.machine.body(wire.MAP))
+        self._asked_map = True
+
+    async def _send_parts(self, conn: socket.socket | None) -> None:
+        """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
+        with contextlib.suppress(OSError):
+            while True:
+                for body in self.machine.parts(self._parts):
+                    if self._conn is not conn:
+                        return
+                    await self._send(wire.MAP_PART, body)
+                    self._parts_since = min(self._parts_since, time.monotonic())
+                    await asyncio.sleep(self._times.part_s)
+
+    async def _chatter(self, conn: socket.socket | None) -> None:
+        mean = self._times.unasked_s
+        with contextlib.suppress(OSError):
+            for kind, body in self.machine.unasked(self.version, self.features, self._hq_features):
+                await asyncio.sleep(self._pauses.uniform(0.5 * mean, 1.5 * mean))
+                if self._conn is not conn:
+                    return
+                await self._send(kind, body or self.machine.body(kind))
+
+    def _waiting(self) -> bytes | None:
+        """Read what is there without waiting: none where nothing is, empty at the end of the stream."""
+        if self._conn is None:
+            return b""
+        looked_at, data = time.monotonic(), None
+        with contextlib.suppress(BlockingIOError):
+            data = self._conn.recv(wire.READ_BYTES)
+            self._unread_s = time.monotonic() - self._empty_at
+        if data is None or len(data) < wire.READ_BYTES:
+            self._empty_at = looked_at
+        return data
+
+
+async def simulate_fragile(
+    host: str,
+    port: int,
+    *,
+    version: str,
+    udp: bool,
+    seed: int,
+    ready: Callable[[int], None],
+    times: Times = _DEPLOYED,
+) -> None:
+    """Run a fragile robot until cancelled or dead; log each violation, and print what it died of."""
+    robot = FragileRobot(
+        version=version, udp=udp, seed=seed, times=times, note=lambda text: _log.error("violation: %s", text)
+    )
+    await robot.serve(host, port, ready)
+    if not robot.alive:
+        sys.stdout.write(f"died: {robot.death}\n")
+        sys.stdout.flush()
+
+
+def _bind(host: str, port: int) -> tuple[socket.socket, socket.socket]:
+    """Bind TCP and UDP to the same number ("Handshake", Ports)."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for left in reversed(range(_BIND_TRIES)):
+        tcp, udp = socket.create_server((host, port), family=family), socket.socket(family, socket.SOCK_DGRAM)
+        tcp.setblocking(False)
+        udp.setblocking(False)
+        try:
+            udp.bind((host, tcp.getsockname()[1]))
+        except OSError:
+            tcp.close()
+            udp.close()
+            if port or not left:
+                raise
+        else:
+            break
+    return tcp, udp
+
+
+async def _readable(sock: socket.socket, most_s: float = math.inf) -> None:
+    """Wait until a read would give something, or for ``most_s``; the same with asyncio's and uvloop's loop."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[None] = loop.create_future()
+    loop.add_reader(sock.fileno(), _wake, future)
+    timer = loop.call_later(most_s, _wake, future) if most_s < math.inf else None
+    try:
+        await future
+    finally:
+        loop.remove_reader(sock.fileno())
+        if timer is not None:
+            timer.cancel()
+
+
+def _wake(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)

@@ -1,0 +1,506 @@
+"""The sans-IO half of both judges.
+
+Reads cut into packets, packets judged, the machine of the simulated robot.
+
+By intention it shares nothing with the gateway's messages.
+Section names in the docstrings are those of the protocol page ``tcpudp.md``.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+from collections.abc import Callable, Collection, Iterator
+from random import Random
+
+import msgspec
+import numpy as np
+
+from zbridge.simulation.world import Body, Grid, cast
+
+READ_BYTES = 4096
+"""Most bytes of one read, and so of one packet ("The gateway as HQ": nothing over 4096 bytes)."""
+SERVER_ID = 1
+DEBUG, SERVER_SETTINGS, CLIENT_SETTINGS = 1, 2, 3
+START_UDP, UDP_PROBE, UDP_ANSWER, UDP_STATUS = 4, 5, 6, 7
+MODE, MOVE, ROTATE, STOP, MOVE_AI = 10, 11, 12, 13, 21
+CAMERA, CHAT = 31, 40
+LIDAR_MODE, LIDAR_STATUS, GET_MAP, MAP, GET_POSITION, POSITION, MAP_PART = 50, 51, 52, 53, 54, 55, 56
+GET_SCAN, SCAN = 60, 61
+BY_UDP = frozenset({MOVE, ROTATE, SCAN, MAP, POSITION, MAP_PART})
+"""The packets marked UDP* ("Packets")."""
+MAP_CM, CELL_CM = 1000, 10
+"""SLAMMapSize and SLAMMapIntervall of the simulated map."""
+_TAIL_BYTES = 1 << 20
+_SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
+_RANGE_M = 8.0
+_PROGRAM = (0.2, 0.0, 0.3)
+"""How the robot's own program drives: m/s forward and left, rad/s."""
+
+
+class Feature(enum.IntEnum):
+    """A feature flag; the value is its place in the settings ("Settings and version negotiation")."""
+
+    UDP = 0
+    CAM = 1
+    JOYSTICK = 2
+    CHAT = 3
+    LIDAR = 4
+    LIDAR_SIM = 5
+    SLAM_MAP = 6
+
+
+FLAGS = {"1.1": 5, "1.2": 6, "1.3": 7, "1.4": 7}
+"""How many flags a settings body of a version has."""
+SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3,1.4"}
+"""The version string a robot sends."""
+UNDERSTOOD = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3"}
+"""The version string a robot takes without harm."""
+DEADLY_ENTRIES = frozenset({1, 2, 4, 8})
+"""Lengths of a version list that crash robots 1.3 and "1.4"."""
+HQ_LOSES_BYTES = 2200
+"""An HQ loses TCP packets of so many bytes and more ("The gateway as robot")."""
+HQ_SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3"}
+"""The version string an HQ sends."""
+ANSWERS = {MAP: GET_MAP, POSITION: GET_POSITION}
+"""What an HQ asks for, and how."""
+_TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS, MAP, POSITION})
+KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
+"""The packet ids that do not cripple an HQ of a version."""
+
+
+class Times(msgspec.Struct, frozen=True, kw_only=True):
+    """The robot's times in seconds; the defaults are those of the deployed robots."""
+
+    read_s: float = 0.005
+    """Longest sleep between two reads."""
+    gap_s: float = 0.01
+    """Least time between two packets of the HQ."""
+    probe_s: float = 2.0
+    """Sleep after packet 4, and the time a probe 5 may take."""
+    silence_s: float = 2.5
+    """Time after packet 4 in which nothing but the 7 may come by TCP: a loaded robot sleeps longer than it wants."""
+    part_s: float = 1.0
+    """Time from one map part to the next."""
+    unasked_s: float = 0.4
+    """Mean time between packets sent unasked; 0: nothing unasked."""
+    flight_s: float = 0.1
+    """How long what the HQ sent before it could know better may still arrive."""
+    send_s: float = 5.0
+    """Longest wait for its own send."""
+
+
+class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
+    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
+
+    answer_s: float = 0.015
+    """From packet 2 to the answer 3 (as captured)."""
+    probe_s: float = 2.0
+    """How long it waits for 4 and, after its 5, for 6."""
+    gap_s: float = 0.01
+    """Spacing of the robot's packets that exculpates it where this process read later than that."""
+
+
+class Loss(enum.Enum):
+    """Which datagram of the UDP probe gets lost."""
+
+    NOTHING = enum.auto()
+    PROBE = enum.auto()
+    ANSWER = enum.auto()
+
+
+class Packet(msgspec.Struct, frozen=True):
+    """One packet as it was read."""
+
+    sender: int
+    kind: int
+    body: bytes
+
+
+class Settings(msgspec.Struct, frozen=True):
+    """What an HQ says about itself in packet 3."""
+
+    versions: str
+    features: frozenset[Feature]
+    problem: str = ""
+    readable: bool = True
+
+
+class Announced(msgspec.Struct, frozen=True):
+    """What a robot says about itself in packet 2, as one HQ reads it."""
+
+    client: int
+    versions: str
+    block: bytes
+    understood: str = ""
+    """The version whose block the HQ read; empty: it keeps its old flags."""
+    features: frozenset[Feature] = frozenset()
+    map_size: int = 0
+    map_interval: int = 0
+
+    @property
+    def udp(self) -> bool:
+        """Whether the robot set the UDP flag, read or not."""
+        return any(self.block[:1])
+
+    @property
+    def meant(self) -> tuple[int, int]:
+        """Size and interval of the map as a 1.3 HQ should have read them, zeros for others."""
+        size, interval = struct.unpack("<ii", self.block[-8:]) if self.understood == "1.3" else (0, 0)
+        return size, interval
+
+    @property
+    def side(self) -> int:
+        """Cells along a side of the map as announced to a 1.3 HQ, 0 if not."""
+        size, interval = self.meant
+        return max(size // interval, 0) if interval else 0
+
+
+def show(data: bytes, limit: int = 40) -> str:
+    """Write bytes in hex for a sentence, shortened."""
+    rest = f"... ({len(data)} bytes)" if len(data) > limit else ""
+    return (data[:limit].hex(" ") or "(no bytes)") + rest
+
+
+def cut(data: bytes) -> tuple[list[Packet], bytes, bool]:
+    """Cut packets off the front ("Framing"); give them, what is left, and whether that is hopeless."""
+    packets: list[Packet] = []
+    while len(data) >= 4:
+        (length,) = struct.unpack_from("<i", data)
+        if not 2 <= length <= _TAIL_BYTES:
+            return packets, data, True
+        if len(data) < 4 + length:
+            break
+        packets.append(Packet(data[4], data[5], data[6 : 4 + length]))
+        data = data[4 + length :]
+    return packets, data, False
+
+
+class Reads:
+    """The reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
+
+    def __init__(self, most: int = READ_BYTES) -> None:
+        self.joined: list[Packet] = []
+        """The packets of the last read if they were several and whole."""
+        self.hopeless = False
+        """The last read had a wrong length field."""
+        self._tail = b""
+        self._most = most
+
+    def take(self, data: bytes) -> tuple[Packet | None, str]:
+        """Give the packet that one read is, or what is wrong with it; neither for the rest of a split packet."""
+        late = bool(self._tail)
+        packets, self._tail, self.hopeless = cut(self._tail + data)
+        self.joined = packets if len(packets) > 1 and not self._tail else []
+        if self.hopeless:
+            self._tail = b""
+            return None, f"no packet in one read, its length field is wrong: {show(data)}"
+        if late and len(packets) + bool(self._tail) == 1:
+            return None, ""
+        if len(packets) > 1 or (packets and self._tail):
+            count = f"{len(packets)} packets" if len(packets) != 2 else "two packets"
+            some = f"{count} and a part of one" if self._tail else count
+            return None, f"{some} in one read: {show(data)}"
+        if self._tail:
+            return None, self._incomplete(data)
+        return (packets[0], "") if len(data) <= self._most else (None, self._large(len(data), data))
+
+    def _incomplete(self, data: bytes) -> str:
+        if len(data) < 4:
+            return f"a split packet, {len(data)} bytes in one read: {show(data)}"
+        size = 4 + int(struct.unpack_from("<i", data)[0])
+        if size > self._most:
+            return self._large(size, data)
+        return f"a split packet, {len(data)} of {size} bytes in one read: {show(data)}"
+
+    def _large(self, size: int, data: bytes) -> str:
+        return f"a packet of {size} bytes, over {self._most}: {show(data)}"
+
+
+def datagram(data: bytes) -> Packet | None:
+    """Read a datagram as exactly one packet; none where its length field is wrong ("Framing")."""
+    packets, rest, _ = cut(data)
+    return packets[0] if len(packets) == 1 and not rest else None
+
+
+def packet(kind: int, body: bytes = b"", sender: int = SERVER_ID) -> bytes:
+    """Write a packet, of the robot unless told otherwise ("Framing")."""
+    return struct.pack("<iBB", 2 + len(body), sender, kind) + body
+
+
+def string(text: str) -> bytes:
+    """Write a string ("Framing")."""
+    return struct.pack("<i", len(text)) + text.encode("ascii")
+
+
+def server_settings(version: str, client: int, features: Collection[Feature]) -> bytes:
+    """Write the body of packet 2 as a robot of ``version`` does ("Settings and version negotiation")."""
+    flags = bytes(flag in features for flag in list(Feature)[: FLAGS[version]])
+    sizes = struct.pack("<ii", MAP_CM, CELL_CM) if FLAGS[version] == 7 else b""
+    return bytes([client]) + string(SENT[version]) + flags + sizes
+
+
+def client_settings(body: bytes) -> Settings:
+    """Read the body of packet 3 ("Settings and version negotiation")."""
+    nothing: frozenset[Feature] = frozenset()
+    count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
+    if not 0 <= count <= len(body) - 4 or not body[4 : 4 + count].isascii():
+        return Settings("", nothing, "no version string", readable=False)
+    versions, flags = body[4 : 4 + count].decode("ascii"), body[4 + count :]
+    expected = FLAGS.get(max(versions.split(",")), 0)
+    problem = (
+        "" if len(flags) == expected else f"{len(flags)} flags for the versions {versions!r} instead of {expected}"
+    )
+    return Settings(versions, frozenset(flag for flag in Feature if any(flags[flag : flag + 1])), problem)
+
+
+def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Announced:
+    """Read the body of packet 2 as an HQ of ``version`` does; ValueError for what cripples it.
+
+    ``skips_map_flag``: it looks for the map's size where the SLAMMap flag is ("The gateway as robot").
+    """
+    count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
+    if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
+        raise ValueError("no version string")
+    told = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
+    understood = _understood(version, told.versions)
+    if not understood:
+        return told
+    sized = understood == "1.3"
+    flags = FLAGS[understood] - (sized and skips_map_flag)
+    size = flags + 8 * sized
+    if len(told.block) < size:
+        raise ValueError(f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}")
+    features = frozenset(flag for flag in list(Feature)[:flags] if told.block[flag])
+    length, interval = struct.unpack_from("<ii", told.block, flags) if sized else (0, 0)
+    if sized and not interval:
+        raise ValueError("SLAMMapIntervall 0, a division by zero")
+    return Announced(told.client, told.versions, told.block, understood, features, length, interval)
+
+
+def _understood(version: str, versions: str) -> str:
+    """Tell as which version's an HQ reads settings, empty if as none ("Settings and version negotiation")."""
+    if version != "1.3":
+        return version if versions == version else ""
+    return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
+
+
+def announced_problem(told: Announced, *, skips_map_flag: bool = False) -> str:
+    """Tell what is wrong with packet 2 though it cripples nobody ("Settings and version negotiation")."""
+    newest = max((known for known in told.versions.split(",") if known in FLAGS), default="")
+    size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(told.block)
+    if len(told.block) != size and not (skips_map_flag and len(told.block) == size - 1 == 14):
+        return f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}"
+    return f"client id {told.client}" if told.client < 2 else ""
+
+
+def deadly(version: str, settings: Settings) -> bool:
+    """Tell whether a version list crashes a robot ("Settings and version negotiation")."""
+    return "," in SENT[version] and settings.readable and len(settings.versions.split(",")) in DEADLY_ENTRIES
+
+
+def registered(version: str, features: Collection[Feature]) -> frozenset[int]:
+    """Tell which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
+    ids = {DEBUG, CLIENT_SETTINGS}
+    if Feature.UDP in features:
+        ids |= {UDP_PROBE, UDP_STATUS}
+    if Feature.JOYSTICK in features:
+        ids |= {MODE, MOVE, ROTATE, STOP, MOVE_AI}
+    if Feature.CHAT in features:
+        ids |= {CHAT}
+    if Feature.LIDAR in features:
+        ids |= {LIDAR_MODE}
+    if maps(version, features):
+        ids |= {GET_MAP, GET_POSITION}
+    if Feature.LIDAR_SIM in features and FLAGS[version] > Feature.LIDAR_SIM:
+        ids |= {SCAN}
+    return frozenset(ids)
+
+
+def maps(version: str, features: Collection[Feature]) -> bool:
+    """Tell whether a robot knows map and position: SLAMMap where the version has that flag, else Lidar."""
+    return (Feature.SLAM_MAP if FLAGS[version] > Feature.SLAM_MAP else Feature.LIDAR) in features
+
+
+def body_problem(kind: int, body: bytes) -> str:
+    """Tell what is wrong with a body from the HQ, empty if nothing ("Packets")."""
+    size = _SIZES.get(kind, len(body))
+    if len(body) != size:
+        return f"a body of {len(body)} bytes instead of {size}"
+    check = _CHECKS.get(kind)
+    return check(body) if check else ""
+
+
+def hq_body_problem(kind: int, body: bytes) -> str:
+    """Tell what cripples an HQ that reads this body, empty if nothing ("Packets", "The gateway as robot")."""
+    size = _HQ_SIZES.get(kind, len(body))
+    if len(body) != size:
+        return f"a body of {len(body)} bytes instead of {size}"
+    if kind == DEBUG:
+        return _text(body) or ("" if body != bytes(4) else "an empty text")
+    return _map(body) if kind == MAP else ""
+
+
+def hq_value_problem(kind: int, body: bytes, side: int) -> str:
+    """Tell what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
+    if kind == LIDAR_STATUS and body not in _ON_OFF:
+        return f"lidar status {struct.unpack('<i', body)[0]}"
+    if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):
+        return "numbers that are not finite"
+    if kind == MAP and len(body) > 4:
+        count = len(body) - 4
+        if side not in (0, math.isqrt(count)):
+            return f"{count} cells of a map announced with {side} x {side}"
+        return "a cell that is neither 0, 1 nor 2" if body[4:].translate(None, b"\0\1\2") else ""
+    return ""
+
+
+class Machine:
+    """What moves, sees and talks: no channel, no clock."""
+
+    def __init__(self, random: Random) -> None:
+        self.place = Body()
+        self.lidar_on = self.camera_on = False
+        self._random = random
+        self._drive = (0.0, 0.0, 0.0)
+        self._on_its_own = False
+        grid, angles = Grid(MAP_CM // CELL_CM, CELL_CM / 100), np.radians(np.arange(360.0))
+        grid.see(0.0, 0.0, angles, cast(0.0, 0.0, angles, _RANGE_M), _RANGE_M)
+        self._map = grid.cells.tobytes()
+
+    def steer(self, body: bytes) -> None:
+        """Take the body of 11 (12 bytes), 12 (4 bytes) or 13 (none): y forward, x right, + right ("Packets")."""
+        if self._on_its_own:
+            return
+        x, y, speed = struct.unpack("<3f", body) if len(body) == 12 else (0.0, 0.0, 0.0)
+        turn = struct.unpack("<f", body)[0] if len(body) == 4 else 0.0
+        speed, turn = (min(max(value, -1.0), 1.0) for value in (speed, turn))
+        self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
+
+    def choose(self, body: bytes) -> None:
+        """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
+
+        When it ends, the motors go on as they went: only a 13 after it stops them.
+        """
+        self._on_its_own = body[0] == 3
+        if self._on_its_own:
+            self._drive = _PROGRAM
+
+    @property
+    def moving(self) -> bool:
+        """Whether the robot moves, and will go on: it never stops by itself."""
+        return any(self._drive)
+
+    def step(self, dt: float) -> None:
+        """Move for ``dt`` seconds as steered, in mode 3 as the robot's own program wants."""
+        if self._on_its_own:
+            self._drive = _PROGRAM
+        self.place.step(*self._drive, dt)
+
+    def body(self, kind: int) -> bytes:
+        """Give the body of a packet about the robot as it is ("Packets", "Translation")."""
+        if kind == DEBUG:
+            return string(f"battery {self._random.randint(0, 100)} %")
+        if kind == CHAT:
+            return self._random.randbytes(self._random.randint(1, 40))
+        if kind == CAMERA:
+            self.camera_on = not self.camera_on
+            return struct.pack("<i", 1 if self.camera_on else 2)
+        if kind == LIDAR_STATUS:
+            return struct.pack("<i", 1 if self.lidar_on else 2)
+        if kind == POSITION:  # centimetres; heading = radians(h) + pi/2
+            degrees = math.degrees(self.place.heading - math.pi / 2)
+            return struct.pack("<3f", self.place.x * 100, self.place.y * 100, degrees)
+        return struct.pack("<i", len(self._map)) + self._map if kind == MAP else b""
+
+    def parts(self, count: int) -> Iterator[bytes]:
+        """Give the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
+        size = len(self._map) // count + 1
+        for start in range(0, len(self._map), size):
+            yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")
+
+    def unasked(
+        self, version: str, features: Collection[Feature], hq_features: Collection[Feature]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Give what the robot says unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
+
+        An empty body: ask :meth:`body` for it when it is sent.
+        """
+        told = [(DEBUG, packet(DEBUG, string("two headers")))]
+        kinds = [DEBUG] + [CAMERA] * (Feature.CAM in features) + [CHAT] * (Feature.CHAT in features)
+        kinds += [LIDAR_STATUS] * (Feature.LIDAR in features)
+        if maps(version, features):
+            kinds += [POSITION] + [MAP] * (version != "1.4")
+        kinds += [GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
+        while True:
+            told += [(kind, b"") for kind in kinds]
+            self._random.shuffle(told)
+            yield from told
+            told = []
+
+
+def _text(body: bytes) -> str:
+    if len(body) < 4 or struct.unpack_from("<i", body)[0] != len(body) - 4:
+        return "a wrong byte count of the string"
+    return "" if body.isascii() else "a text that is not ASCII"
+
+
+def _mode(body: bytes) -> str:
+    (value,) = struct.unpack("<i", body)
+    return "" if value in (1, 2, 3) else f"control mode {value}"
+
+
+def _lidar(body: bytes) -> str:
+    (value,) = struct.unpack("<i", body)
+    return "" if value in (1, 2) else f"lidar mode {value}"
+
+
+def _move(body: bytes) -> str:
+    x, y, speed = struct.unpack("<3f", body)
+    if not all(map(math.isfinite, (x, y, speed))):
+        return "numbers that are not finite"
+    return "" if math.hypot(x, y) <= 1.001 else f"a direction of length {math.hypot(x, y):.3f}"
+
+
+def _rotate(body: bytes) -> str:
+    return "" if math.isfinite(struct.unpack("<f", body)[0]) else "a number that is not finite"
+
+
+def _scan(body: bytes) -> str:
+    count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
+    if count != 360:
+        return f"n = {count} instead of 360"
+    return "" if len(body) == 4 + 4 * 360 else f"{len(body)} bytes for 360 floats"
+
+
+def _map(body: bytes) -> str:
+    if not body:
+        return "a 53 without its int, on which it throws for good"
+    count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
+    if count != len(body) - 4:
+        return f"n = {count} and {max(len(body) - 4, 0)} bytes of a map"
+    return "" if math.isqrt(count) ** 2 == count else f"a map of {count} cells, no square"
+
+
+_ON_OFF = (b"\1\0\0\0", b"\2\0\0\0")
+_HQ_SIZES = {START_UDP: 0, UDP_ANSWER: 1, LIDAR_STATUS: 4, POSITION: 12, GET_SCAN: 0}
+_SIZES = {
+    UDP_PROBE: 0,
+    UDP_STATUS: 1,
+    MODE: 4,
+    MOVE: 12,
+    ROTATE: 4,
+    STOP: 0,
+    LIDAR_MODE: 4,
+    GET_MAP: 0,
+    GET_POSITION: 0,
+}
+_CHECKS: dict[int, Callable[[bytes], str]] = {
+    DEBUG: _text,
+    MODE: _mode,
+    MOVE: _move,
+    ROTATE: _rotate,
+    LIDAR_MODE: _lidar,
+    SCAN: _scan,
+}

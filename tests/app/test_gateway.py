@@ -1,0 +1,278 @@
+"""What a gateway process makes of its configuration, and how it ends: a signal cancels the work once."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import pytest
+
+from tests.clock import jumping
+from tests.proofs import Holder
+from zbridge.app.config import plan
+from zbridge.app.gateway import Gateway, until_signal
+from zbridge.bus import Bus
+from zbridge.bus.fake import FakeBus
+from zbridge.errors import ConfigError
+
+SOON_S = 5.0
+NOWHERE = "tcp://127.0.0.1:1"
+
+
+def configured(**control: Any) -> Gateway:
+    return Gateway(
+        plan(
+            {
+                "robot": {"name": "r1"},
+                "device": {"protocol": "tcpudp", "connect": [NOWHERE]},
+                "control": control,
+            }
+        )
+    )
+
+
+@contextlib.asynccontextmanager
+async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[FakeBus]:
+    """Run a gateway on a fake bus; its robot is not there."""
+    bus = FakeBus("1")
+
+    async def open_bus(*_: object, **__: object) -> Bus:
+        return bus
+
+    monkeypatch.setattr("zbridge.app.gateway.open_bus", open_bus)
+    running = asyncio.create_task(gateway.run())
+    await asyncio.sleep(1.0)
+    try:
+        yield bus.join("2")
+    finally:
+        running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+
+
+async def acquired_and_released(bus: FakeBus, who: str = "hq") -> dict[str, Any]:
+    """Give the answer to an acquire whose lease is given back."""
+    lease = await asked(bus, "acquire", who=who)
+    await asked(bus, "release", Holder.of(lease).question("release"))
+    return lease
+
+
+async def asked(bus: FakeBus, name: str, payload: bytes = b"", **fields: Any) -> dict[str, Any]:
+    path = f"{name}/{fields['who']}" if fields else name
+    (reply,) = await bus.ask(f"fleet/r1/@rpc/control/{path}", payload or msgpack.packb(fields))
+    assert reply.error is None
+    lease: dict[str, Any] = msgpack.unpackb(reply.payload)
+    return lease
+
+
+def last(bus: FakeBus, path: str) -> dict[str, Any]:
+    fields: dict[str, Any] = msgpack.unpackb(bus.values(f"fleet/r1/{path}")[-1])
+    return fields
+
+
+def lines_in(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for file in folder.iterdir() for line in file.read_text().splitlines()]
+
+
+def sizes_in(folder: Path) -> dict[str, int]:
+    return {file.name: file.stat().st_size for file in folder.iterdir()}
+
+
+@jumping
+async def test_the_configuration_says_how_long_a_lease_lasts(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving(configured(lease_s=1.5), monkeypatch) as bus:
+        assert (await asked(bus, "acquire", who="hq", lease_s=60.0))["expires_in_s"] == 1.5
+
+
+@jumping
+async def test_every_lease_has_an_id_and_a_token_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with serving(configured(), monkeypatch) as bus:
+        leases = [await acquired_and_released(bus) for _ in range(20)]
+        tokens, ids = ({lease[name] for lease in leases} for name in ("token", "lease"))
+        assert ({len(token) for token in tokens}, {len(each) for each in ids}) == ({32}, {8})
+        assert len(tokens) == len(ids) == 20
+        assert len({byte for token in tokens for byte in token}) > 100, "nothing that could be guessed"
+
+
+@jumping
+async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "log" / "r1.jsonl"
+    async with serving(configured(audit=str(file)), monkeypatch) as bus:
+        held = Holder.of(await asked(bus, "acquire", who="hq"))
+        await asked(bus, "release", held.question("release"))
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert [(line["robot"], line["event"], line["who"]) for line in lines] == [
+        ("r1", "acquired", "hq"),
+        ("r1", "released", "hq"),
+    ]
+
+
+@jumping
+async def test_the_audit_log_is_rotated_as_the_configuration_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=0)
+    async with serving(gateway, monkeypatch) as bus:
+        for number in range(25):
+            await acquired_and_released(bus, f"hq{number}")
+    sizes = sizes_in(tmp_path)
+    assert sorted(sizes) == ["r1.jsonl", "r1.jsonl.1", "r1.jsonl.2"]
+    assert max(sizes.values()) <= 1000
+
+
+@jumping
+async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=1)
+    async with serving(gateway, monkeypatch) as bus:
+        for number in range(50):
+            await acquired_and_released(bus, f"hq{number}")
+    assert {line["who"] for line in lines_in(tmp_path)} >= {f"hq{number}" for number in range(50)}
+
+
+@jumping
+async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_ended(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / "r1.jsonl"
+    async with serving(configured(audit=str(file)), monkeypatch) as bus:
+        for _ in range(10):
+            await acquired_and_released(bus)
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert sum(line.get("count", 1) for line in lines if line["event"] == "acquired") == 10
+
+
+@jumping
+async def test_an_audit_log_that_cannot_be_written_keeps_the_gateway_from_starting(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(ConfigError, match=r"control\.audit = '.*/file/r1\.jsonl': "):
+        await configured(audit=str(file / "r1.jsonl")).run()
+
+
+@jumping
+async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("zbridge.robot.device.Device.reached", True)
+    text = "another gateway serves this robot too: beef"
+    async with serving(configured(), monkeypatch) as bus:
+        forged = bus.join("beef").answer(
+            "fleet/r1/@rpc/claim/gateway",
+            lambda question: question.answer(msgpack.packb({"held_s": 3600.0, "has": True})),
+        )
+        await asyncio.sleep(20.0)
+        assert last(bus, "status")["reason"].endswith(f"; {text}")
+        (refused,) = last(bus, "control")["refusals"]
+        assert refused == {
+            "who": "beef",
+            "command": "claim",
+            "code": "held",
+            "reason": "this gateway serves the robot",
+            "count": 1,
+            "by": None,
+        }
+        forged.close()
+        await asyncio.sleep(10.0)
+        assert text not in last(bus, "status")["reason"]
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"r1: {text}"]
+
+
+@jumping
+async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with serving(configured(), monkeypatch) as bus:
+        bus.join("beef").answer(
+            "fleet/r1/@rpc/claim/gateway",
+            lambda question: question.answer(msgpack.packb({"held_s": 1e-3, "has": True})),
+        )
+        bus.join("beef").announce("fleet/r1/@alive/gateway")
+        await asyncio.sleep(10.0)
+        shown = len(bus.values("fleet/r1/status"))
+        await asyncio.sleep(10.0)
+        assert len(bus.values("fleet/r1/status")) == shown, "nothing more is said of the robot"
+        assert last(bus, "status")["reason"] == "gateway stopped"
+    assert "another gateway served r1 before this one: leaving it alone" in caplog.text
+
+
+class Work:
+    """Something that runs until it is cancelled and then has something to tidy up."""
+
+    def __init__(self) -> None:
+        self.started = asyncio.Event()
+        self.tidying = asyncio.Event()
+        self.go_on = asyncio.Event()
+        self.tidy = False
+
+    async def run(self) -> None:
+        self.started.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self.tidying.set()
+            await self.go_on.wait()
+            self.tidy = True
+
+
+async def received(number: signal.Signals) -> None:
+    """Send this process a signal, and wait until the event loop has handled it."""
+    handled = asyncio.Event()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, handled.set)
+    os.kill(os.getpid(), number)
+    os.kill(os.getpid(), signal.SIGUSR1)  # handled after it
+    await handled.wait()
+
+
+@pytest.mark.parametrize("first", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_ends_the_work_and_its_tidying_up_is_waited_for(first: signal.Signals) -> None:
+    async with asyncio.timeout(SOON_S):
+        work = Work()
+        ending = asyncio.ensure_future(until_signal(work.run()))
+        await work.started.wait()
+        await received(first)
+        await work.tidying.wait()
+        assert not ending.done()
+        work.go_on.set()
+        await ending
+    assert work.tidy
+
+
+@pytest.mark.parametrize("first", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
+async def test_a_second_signal_does_not_cut_the_tidying_up_short(first: signal.Signals, second: signal.Signals) -> None:
+    async with asyncio.timeout(SOON_S):
+        work = Work()
+        ending = asyncio.ensure_future(until_signal(work.run()))
+        await work.started.wait()
+        await received(first)
+        await work.tidying.wait()
+        await received(second)
+        await received(second)
+        work.go_on.set()
+        await ending
+    assert work.tidy
+
+
+async def test_work_that_ends_by_itself_is_not_waited_for_any_longer() -> None:
+    async def work() -> None:
+        return
+
+    async with asyncio.timeout(SOON_S):
+        await until_signal(work())
+
+
+async def test_work_that_fails_shows_why() -> None:
+    async def work() -> None:
+        raise OSError("no bus")
+
+    with pytest.raises(OSError, match="no bus"):
+        await until_signal(work())

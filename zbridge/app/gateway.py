@@ -1,0 +1,240 @@
+"""One gateway process: the bus, the claim on the robot, its device side, and the counters' endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import secrets
+import signal
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+from zbridge.app.config import Plan
+from zbridge.app.prometheus import serve_metrics
+from zbridge.bus import Bus, Handle, Question, open_bus
+from zbridge.conditions import Conditions
+from zbridge.control.audit_log import Audit, AuditFile
+from zbridge.control.authority import Authority
+from zbridge.control.motion_limits import MotionLimits
+from zbridge.errors import BusError, Held
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Sessions
+from zbridge.fleet.topics import KeySpace
+from zbridge.hq.listener import Listener
+from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.metrics import Metrics
+from zbridge.protocol.session_table import SessionTable
+from zbridge.robot.device import Device
+from zbridge.robot.ownership import Ownership
+from zbridge.robot.settings import DevicePlan
+
+log = logging.getLogger("zbridge.app.gateway")
+
+_ZID = 6
+"""Characters of the session id that tell listeners of different processes apart."""
+RETRY_S = 1.0
+"""Seconds between attempts to open the bus."""
+TELL_S = 60.0
+"""Seconds between two lines of the log about other gateways that serve the robot."""
+_NAMED = 3
+"""Other gateways that are named."""
+_RIVALS = "rivals"
+
+
+class Gateway:
+    """A gateway from its plan to its end."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
+        self.left = True
+        """Whether the bus was left in order; if not, its threads may hang."""
+        self.metrics = Metrics()
+        self.sessions = SessionTable()
+        self.conditions = Conditions()
+
+    def __repr__(self) -> str:
+        return f"<Gateway {self._plan.config.robot.name}>"
+
+    async def run(self) -> None:
+        """Serve the robot and its HQ programs until cancelled; leave the robot standing still and the bus in order."""
+        with self._audit() as audit:
+            bus = await self._open_bus()
+            try:
+                await self._run(bus, audit)
+            finally:
+                self.left = await bus.close()
+
+    async def _run(self, bus: Bus, audit: Audit) -> None:
+        async with contextlib.AsyncExitStack() as stack:
+            if self._plan.metrics is not None:
+                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+            audience = RobotSubscription(bus, self._keys, self.metrics)
+            work: list[Coroutine[Any, Any, None]] = [
+                Listener(listener, name, audience, bus, self._keys, self.sessions, self.metrics, time.monotonic).run()
+                for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
+            ]
+            if work:
+                audience.open()
+                stack.callback(audience.close)
+            if self._plan.device is not None:
+                work.append(self._robot(bus, audit, self._plan.device))
+            else:
+                stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
+            await together(*work)
+
+    def _listener_names(self, bus: Bus) -> list[str]:
+        """Name the listeners as nobody else on the bus does, where the configuration does not."""
+        names: list[str] = []
+        for number, listener in enumerate(self._plan.listeners, 1):
+            own = f"{listener.protocol.name}-{bus.zid[:_ZID]}"
+            names.append(listener.settings.name or (f"{own}-{number}" if own in names else own))
+        return names
+
+    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
+        """Serve the robot whenever no other gateway does."""
+        claim = Ownership(bus, self._keys)
+        try:
+            while True:
+                shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
+                await claim.take()
+                if shown is not None:
+                    shown.close()
+                shown = self._show_sessions(bus, "gateway")
+                try:
+                    await self._serve(claim, self._device(bus, audit, plan))
+                finally:
+                    shown.close()
+        finally:
+            claim.release()
+
+    def _show_sessions(self, bus: Bus, who: str) -> Handle:
+        """Answer who asks for the session table of this process."""
+
+        def answer(question: Question) -> None:
+            question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
+
+        return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
+
+    async def _serve(self, claim: Ownership, device: Device) -> None:
+        """Serve the robot until it has to be left to another gateway."""
+        serving = asyncio.ensure_future(device.run())
+        watching = asyncio.ensure_future(claim.watch(lambda: device.reached, self._rival_teller(device)))
+        try:
+            await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
+            for task in (serving, watching):
+                if task.done():
+                    task.result()
+        finally:
+            for task in (serving, watching):
+                task.cancel()
+            await asyncio.shield(asyncio.gather(serving, watching, return_exceptions=True))
+            self.conditions.set(_RIVALS, None)
+
+    def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:
+        """Make the function that tells of other gateways: ``status`` always, ``control`` and the log once a while."""
+        robot, told_at = self._plan.config.robot.name, -math.inf
+
+        def tell(zids: tuple[str, ...]) -> None:
+            nonlocal told_at
+            more = f" and {len(zids) - _NAMED} more" if len(zids) > _NAMED else ""
+            text = f"another gateway serves this robot too: {', '.join(zids[:_NAMED])}{more}"
+            self.conditions.set(_RIVALS, text if zids else None)
+            if zids and time.monotonic() - told_at >= TELL_S:
+                told_at = time.monotonic()
+                log.error("%s: %s", robot, text)
+                for zid in zids[:_NAMED]:
+                    device.refuse("claim", Held("this gateway serves the robot"), zid)
+
+        return tell
+
+    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+        control = self._plan.config.control
+        return Device(
+            plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
+            plan.addresses,
+            protocol=plan.protocol.name,
+            keys=self._keys,
+            bus=bus,
+            authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes),
+            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf),
+            manager=self.sessions,
+            metrics=self.metrics,
+            audit=audit,
+            conditions=self.conditions,
+            idle_stop_s=control.idle_stop_s,
+            clock=time.monotonic,  # the time line of every event loop on Linux, without its rounding
+        )
+
+    @contextlib.contextmanager
+    def _audit(self) -> Iterator[Audit]:
+        """Keep the audit log open: a file where the configuration names one, always the gateway's own log."""
+        control, name = self._plan.config.control, self._plan.config.robot.name
+        if control.audit is None or self._plan.device is None:
+            yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
+            return
+        loop = asyncio.get_running_loop()
+
+        def tell(text: str | None) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(self.conditions.set, "audit", text)
+
+        file = AuditFile(
+            Path(control.audit),
+            self.metrics,
+            file_bytes=control.audit_bytes,
+            files=control.audit_files,
+            days=control.audit_days,
+            tell=tell,
+        )
+        audit = Audit(name, file.write)
+        try:
+            yield audit
+        finally:
+            audit.close()
+            file.close()
+
+    async def _open_bus(self) -> Bus:
+        while True:
+            try:
+                return await open_bus(self._plan.config.bus, self.metrics, bounds=topics.size_bounds())
+            except BusError as error:
+                log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
+                await asyncio.sleep(RETRY_S)
+
+
+async def together(*work: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until all have ended, or one fails: then cancel the others, and raise what failed."""
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in tasks:
+            if task.done():
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until_signal(work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends or SIGTERM or SIGINT comes; then cancel it and wait for it to tidy up."""
+    task = asyncio.ensure_future(work)
+    loop = asyncio.get_running_loop()
+    asked: list[int] = []
+
+    def end(number: int) -> None:
+        """Cancel once: a second signal must not cut the tidying up short."""
+        if not asked:
+            task.cancel()
+        asked.append(number)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, end, number)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task

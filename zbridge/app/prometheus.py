@@ -1,0 +1,110 @@
+"""Shows the counters to Prometheus: one page over HTTP/1.0, nothing else."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator
+
+from zbridge.address import Address
+from zbridge.metrics import Metrics
+
+log = logging.getLogger("zbridge.metrics")
+
+REQUEST_S = 2.0
+"""Seconds a client has to send its request and to take the answer."""
+CLIENTS = 4
+"""Clients that are served at a time."""
+WAITING = 16
+"""Clients that may wait for their turn, in the operating system; the others have to come again."""
+_REQUEST_BYTES = 8192
+
+
+@contextlib.asynccontextmanager
+async def serve_metrics(address: Address, metrics: Metrics) -> AsyncIterator[None]:
+    """Serve ``GET /metrics`` while the context lasts; without the address the gateway runs all the same.
+
+    Connections are accepted only while there is room: a server of asyncio's takes in all that come, and nobody else has
+    a turn meanwhile.
+    """
+    try:
+        sockets = await _listen(address)
+    except OSError as error:
+        log.error("metrics endpoint %s: %s", address, error.strerror or error)
+        yield
+        return
+    room = asyncio.Semaphore(CLIENTS)
+    tasks = [asyncio.create_task(_accept(each, room, metrics)) for each in sockets]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for listening in sockets:
+            listening.close()
+
+
+async def _listen(address: Address) -> list[socket.socket]:
+    """Listen at every address that the host's name stands for; raise OSError where one cannot be had."""
+    loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
+    try:
+        for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
+            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
+            listening.setblocking(False)
+    except OSError:
+        for listening in sockets:
+            listening.close()
+        raise
+    return sockets
+
+
+async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics) -> None:
+    """Serve whoever connects, while there is room, until cancelled."""
+    loop, clients = asyncio.get_running_loop(), dict[asyncio.Task[None], socket.socket]()
+
+    def gone(task: asyncio.Task[None]) -> None:
+        clients.pop(task).close()
+        room.release()
+
+    try:
+        while True:
+            await room.acquire()
+            try:
+                client, _ = await loop.sock_accept(listening)
+            except OSError as error:  # no descriptor left: asked again at once, it would be all this process does
+                log.debug("metrics endpoint: %s", error)
+                room.release()
+                await asyncio.sleep(REQUEST_S)
+                continue
+            task = asyncio.create_task(_serve(client, metrics))
+            clients[task] = client
+            task.add_done_callback(gone)
+    finally:
+        for task in tuple(clients):
+            task.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+
+
+async def _serve(client: socket.socket, metrics: Metrics) -> None:
+    """Read one request and answer it."""
+    loop, request = asyncio.get_running_loop(), b""
+    with contextlib.suppress(OSError, TimeoutError):
+        async with asyncio.timeout(REQUEST_S):
+            while b"\r\n\r\n" not in request:
+                data = await loop.sock_recv(client, _REQUEST_BYTES)
+                request += data
+                if not data or len(request) > _REQUEST_BYTES:
+                    return
+            await loop.sock_sendall(client, _response(request, metrics))
+
+
+def _response(request: bytes, metrics: Metrics) -> bytes:
+    if request.startswith((b"GET /metrics ", b"GET / ")):
+        body, status = metrics.exposition().encode(), "200 OK"
+    else:
+        body, status = b"see /metrics\n", "404 Not Found"
+    head = f"HTTP/1.0 {status}\r\nContent-Type: text/plain; version=0.0.4\r\nContent-Length: {len(body)}\r\n\r\n"
+    return head.encode() + body

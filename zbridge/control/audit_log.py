@@ -1,0 +1,317 @@
+"""The audit log: who acquired, released, was refused, stopped the robot, and why. JSON lines, rotated, never rewritten.
+
+What repeats itself is folded, so that noise neither fills the disk nor pushes out what happened before it:
+
+- The same again (event, who, command, reason) is a line, then one a second with its count.
+- An actor that varies what it does has :data:`BURST` lines for each kind of event, then its share of one a second; all
+  else it does is counted together, as ``others``. So is what strangers do while :data:`ACTORS` others are at it: an
+  actor may take any name. Each kind of event has budgets of its own, so that no flood of one hides another.
+- Counts have a budget too (:data:`COUNTS`); where it is used up, they go on and are written later. None is lost.
+
+Lines are written by a thread of their own: a disk that stands still delays no stop. What cannot be written waits, and
+people are told so.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import queue
+import stat
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from zbridge.control.authority import Event, EventKind
+from zbridge.errors import ConfigError
+from zbridge.metrics import Metrics
+from zbridge.text import as_json
+
+log = logging.getLogger("zbridge.control")
+
+CLOSE_S = 1.0
+"""Longest time the disk is given at the end, twice."""
+RETRY_S = 1.0
+"""Seconds between two attempts to write what could not be written."""
+WAITING = 4096
+"""Lines that may wait for the disk; what is more is dropped and counted."""
+KINDS = 256
+"""Different events counted at a time; the rest is counted as others."""
+ACTORS = 64
+"""Actors that have a budget of their own at a time, for each kind of event."""
+BURST = 20.0
+"""Lines of one kind of event that an actor has at once."""
+COUNTS = 200.0
+"""Lines with counts that may be written one a second; then there are :data:`COUNTS_HZ`."""
+COUNTS_HZ = 0.5
+LINES_HZ = 1.0
+"""Lines a second of one kind of event that its actors share when their bursts are used up."""
+MOST = 20
+"""How many times ``audit_files`` there are at most, however young."""
+OTHERS = "others"
+_DAY_S = 86_400.0
+_MAY_PASS = (errno.ENXIO, errno.ENOSPC, errno.EDQUOT, errno.EIO)
+"""What keeps a file from being opened now and may pass: a pipe that nobody reads, a full disk."""
+
+_Kind = tuple[EventKind, str | None, str | None, str | None, bool]
+
+
+class _Folded(msgspec.Struct):
+    """An event that was written, and how often it happened since."""
+
+    event: Event
+    count: int = 0
+
+
+class Audit:
+    """Writes events down, by ``write`` and in the gateway's log; :meth:`flush` is to be called about once a second."""
+
+    def __init__(self, robot: str, write: Callable[[str], None], clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self._robot = robot
+        self._write = write
+        self._clock_ns = clock_ns
+        self._folded: dict[_Kind, _Folded] = {}
+        self._budgets: dict[EventKind, dict[str | None, float]] = {what: {} for what in EventKind}
+        self._strangers = dict.fromkeys(EventKind, BURST)
+        self._counts = COUNTS
+
+    def __repr__(self) -> str:
+        return f"<Audit {self._robot}>"
+
+    def write(self, event: Event) -> None:
+        """Write one event down: now, or where it is one of many, with a later :meth:`flush`."""
+        kind = (event.what, event.who, event.command, event.reason, event.stops)
+        folded = self._folded.get(kind)
+        if folded is not None:
+            folded.count += 1
+        elif len(self._folded) < KINDS and self._affords(event):
+            self._line(event, 1)
+            self._folded[kind] = _Folded(event)
+        else:
+            who = event.who if event.who in self._budgets[event.what] else None
+            others = Event(event.what, who, OTHERS, stops=event.stops)
+            self._folded.setdefault((event.what, who, None, OTHERS, event.stops), _Folded(others)).count += 1
+
+    def flush(self) -> None:
+        """Write what repeated itself since the last call, and fill the budgets."""
+        self._counts = min(COUNTS, self._counts + COUNTS_HZ)
+        for what, budgets in self._budgets.items():
+            share = LINES_HZ / (len(budgets) + 1)
+            filled = {who: left + share for who, left in budgets.items()}
+            self._budgets[what] = {who: left for who, left in filled.items() if left < BURST}
+            self._strangers[what] = min(BURST, self._strangers[what] + share)
+        waiting, written = dict[_Kind, _Folded](), dict[_Kind, _Folded]()
+        for kind, folded in self._folded.items():
+            if folded.count and self._counts < 1:
+                waiting[kind] = folded
+            elif folded.count:
+                self._counts -= 1
+                self._line(folded.event, folded.count)
+                written[kind] = _Folded(folded.event)
+        self._folded = waiting | written  # who had to wait is first the next time
+
+    def close(self) -> None:
+        """Write all that was counted."""
+        self._counts = float(len(self._folded))
+        self.flush()
+
+    def _affords(self, event: Event) -> bool:
+        """Tell whether the actor may have another line, and take it off its budget."""
+        budgets = self._budgets[event.what]
+        left = budgets.get(event.who, BURST)
+        if event.who not in budgets and len(budgets) >= ACTORS:
+            left = self._strangers[event.what]
+            self._strangers[event.what] -= left >= 1
+        elif left >= 1:
+            budgets[event.who] = left - 1
+        return left >= 1
+
+    def _line(self, event: Event, count: int) -> None:
+        if event.what is not EventKind.REFUSED:
+            log.info("%s: %s%s", self._robot, event, f", {count} times" if count > 1 else "")
+        fields = {
+            "time": datetime.fromtimestamp(self._clock_ns() / 1e9, UTC).isoformat(timespec="milliseconds"),
+            "robot": self._robot,
+            "event": event.what.value,
+            "who": event.who,
+            "priority": event.priority,
+            "command": event.command,
+            "reason": event.reason,
+            "stops": event.stops or None,
+            "count": count if count > 1 else None,
+        }
+        self._write(as_json({name: value for name, value in fields.items() if value is not None}))
+
+
+class AuditFile:
+    """A file that lines are appended to by a thread; see :class:`_Appended` for its rotation.
+
+    ``tell`` is called on that thread with what keeps lines from being written, and with None when they are again.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        metrics: Metrics,
+        *,
+        file_bytes: int,
+        files: int,
+        days: float = 0.0,
+        tell: Callable[[str | None], object] = lambda text: None,
+    ) -> None:
+        self._dropped = metrics.count("audit_dropped")
+        self._failed = metrics.count("audit_failed")
+        self._tell = tell
+        self._path = path
+        self._failing = False
+        self._ending = threading.Event()
+        self._closed = False
+        self._file = _Appended(path, file_bytes=file_bytes, files=files, days=days)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file.open()
+        except OSError as error:
+            if error.errno not in _MAY_PASS:
+                raise ConfigError(f"control.audit = {str(path)!r}: {error.strerror or error}") from error
+            self._fail(error)
+        self._lines: queue.Queue[bytes | None] = queue.Queue(WAITING)
+        self._writer = threading.Thread(target=self._work, name="zbridge-audit", daemon=True)
+        self._writer.start()
+
+    def write(self, line: str) -> None:
+        """Append a line, soon."""
+        try:
+            self._lines.put_nowait(line.encode() + b"\n")
+        except queue.Full:
+            self._dropped.value += 1
+
+    def close(self) -> None:
+        """Write what waits, for :data:`CLOSE_S` at most, and close the file; idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._ending.set()
+        try:
+            self._lines.put(None, timeout=CLOSE_S)
+        except queue.Full:
+            self._lines.get_nowait()
+            self._dropped.value += 1
+            self._lines.put_nowait(None)
+        self._writer.join(CLOSE_S)
+        if self._writer.is_alive():
+            self._dropped.value += self._lines.qsize() - 1
+
+    def _work(self) -> None:
+        if self._failing:
+            self._insist(self._file.open)
+        while (line := self._lines.get()) is not None:
+            self._file.take(line)
+            if not self._insist(self._file.write):
+                self._dropped.value += 1
+        self._file.close()
+
+    def _insist(self, do: Callable[[], None]) -> bool:
+        """Try until it is done; at the end of the gateway only once. Tell whether it was done."""
+        while True:
+            try:
+                do()
+            except OSError as error:
+                self._fail(error)
+            else:
+                self._recover()
+                return True
+            if self._ending.wait(RETRY_S):
+                return False
+
+    def _fail(self, error: OSError) -> None:
+        self._failed.value += 1
+        if not self._failing:
+            self._failing = True
+            why = f"the audit log is not written: {error.strerror or error}"
+            log.error("%s (%s)", why, self._path)
+            self._tell(why)
+
+    def _recover(self) -> None:
+        if self._failing:
+            self._failing = False
+            log.warning("the audit log is written again, %d lines were dropped (%s)", self._dropped.value, self._path)
+            self._tell(None)
+
+
+class _Appended:
+    """The file in use, and older ones besides it, ``.1`` the youngest.
+
+    At ``file_bytes`` it becomes an older one. Of those the oldest is dropped when there are more than ``files`` and it
+    is older than ``days``, or when there are :data:`MOST` times as many.
+
+    ``take`` gives it a line, ``write`` writes it, or the rest of it, and raises OSError where that is not possible now.
+    """
+
+    def __init__(self, path: Path, *, file_bytes: int, files: int, days: float) -> None:
+        self._path = path
+        self._file_bytes = file_bytes
+        self._files = files
+        self._days = days
+        self._descriptor: int | None = None
+        self._rotates = False
+        self._line = self._rest = b""
+
+    def open(self) -> None:
+        """Open the file, if it is not open; never waits, not even for the reader of a pipe."""
+        if self._descriptor is None:
+            descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o666)
+            os.set_blocking(descriptor, True)
+            self._descriptor = descriptor
+            self._rotates = stat.S_ISREG(os.fstat(descriptor).st_mode)
+
+    def take(self, line: bytes) -> None:
+        """Have a line to write."""
+        self._line = self._rest = line
+
+    def write(self) -> None:
+        """Write what there is to write of the line."""
+        try:
+            self.open()
+            if self._rest is self._line:
+                self._rotate_before(len(self._line))
+            while self._rest:
+                assert self._descriptor is not None
+                self._rest = self._rest[os.write(self._descriptor, self._rest) :]
+        except OSError:
+            if not self._rotates:  # whoever reads a pipe next has not seen the beginning
+                self._rest = self._line
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file; idempotent."""
+        descriptor, self._descriptor = self._descriptor, None
+        if descriptor is not None:
+            os.close(descriptor)
+
+    def _rotate_before(self, size: int) -> None:
+        assert self._descriptor is not None
+        used = os.fstat(self._descriptor).st_size
+        if not self._rotates or not used or used + size <= self._file_bytes:
+            return
+        self.close()
+        last = 0
+        while self._older(last + 1).exists():
+            last += 1
+        while last >= self._files and (last >= MOST * self._files or self._age_days(last) > self._days):
+            self._older(last).unlink()
+            last -= 1
+        for number in range(last, -1, -1):
+            self._older(number).rename(self._older(number + 1))
+        self.open()
+
+    def _older(self, number: int) -> Path:
+        return self._path.with_name(f"{self._path.name}.{number}") if number else self._path
+
+    def _age_days(self, number: int) -> float:
+        return (time.time() - self._older(number).stat().st_mtime) / _DAY_S

@@ -1,0 +1,229 @@
+"""Gates: what of the bus reaches the event loop, and by which lane. They run on the bus's threads, one thread each.
+
+Theory of operation. Anybody on the bus may send as much as it takes, so what nobody has to obey must cost little: it is
+dropped here, before the event loop is woken. A command of the holder's is told by its proof, and only then chooses its
+lane and uses its number up: who merely knows the lease's public id fills no lane of the holder's and locks nobody out.
+Of everything else so many a second reach the event loop, which refuses them with reason and sender; the others are
+counted by code, and shown together once a second. A stop is never refused: one that comes right after another, while
+the robot is at rest and nobody holds it, is the same stop.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+
+import msgspec
+
+from zbridge.bus import Lane, Look
+from zbridge.control.authority import Authority
+from zbridge.control.proof import read
+from zbridge.errors import Code, LeaseLost, Malformed, Refused, TooFast
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, Mode, Motor, Raw
+from zbridge.fleet.topics import KeySpace
+from zbridge.protocol.rate_limit import RateLimit
+
+OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
+"""Commands that move a robot, or may: they need the lease."""
+SHOWN_HZ = 20.0
+"""Refused ones a second of each gate that reach the event loop, with reason and sender."""
+OPEN_HZ = 500.0
+"""Commands a second that need no lease, all senders together."""
+NAME_HZ, ALL_NAMES_HZ = 20.0, 100.0
+"""Questions for the lease a second, of one name and of all."""
+NAMES = 256
+"""Names that are kept apart; the one not heard of for longest makes room."""
+SAME_STOP_S = 0.05
+"""Seconds in which one stop is as good as the next, for a robot at rest that nobody holds."""
+_KEPT = 1024
+
+Clock = Callable[[], float]
+_STOP_PATH = f"/{topics.CMD_STOP.path}"
+
+
+def is_stop(key: str) -> bool:
+    """Tell whether a command's key is a stop's, which alone may have wildcards before its end."""
+    return key.endswith(_STOP_PATH)
+
+
+class Sieve:
+    """Lets so many refused ones a second through, and counts the others by code.
+
+    Counting and reading are the business of a thread each: no number is written by both.
+    """
+
+    def __init__(self, rate_hz: float, clock: Clock) -> None:
+        self._allowance = RateLimit(rate_hz)
+        self._clock = clock
+        self._counted = dict.fromkeys(_REFUSALS, 0)
+        self._told = dict.fromkeys(_REFUSALS, 0)
+
+    def __repr__(self) -> str:
+        return f"<Sieve {sum(self._counted.values())} kept back>"
+
+    def lane(self, code: Code) -> Lane | None:
+        """Give the lane by which a refused one goes on, None for one that is only counted."""
+        if self._allowance.take(self._clock()):
+            return Lane.OTHER
+        self._counted[code] += 1
+        return None
+
+    def count(self, code: Code) -> None:
+        """Count one that goes nowhere."""
+        self._counted[code] += 1
+
+    def kept_back(self) -> Iterator[tuple[Refused, int]]:
+        """Give what was counted since the last call; on the event loop's thread."""
+        for code, total in self._counted.items():
+            count, self._told[code] = total - self._told[code], total
+            if count:
+                yield _REFUSALS[code], count
+
+
+class _Kind(msgspec.Struct, frozen=True):
+    """What is known of a key: whether its commands need the lease, and the most bytes they may have."""
+
+    leased: bool
+    most_bytes: int
+    stop: bool = False
+
+
+_STOP = _Kind(leased=False, most_bytes=0, stop=True)
+_UNKNOWN = _Kind(leased=False, most_bytes=topics.LARGE_BYTES)
+
+
+class _Prover:
+    """Tells the holder's newest from everything else."""
+
+    def __init__(self, authority: Authority, clock: Clock) -> None:
+        self.sieve = Sieve(SHOWN_HZ, clock)
+        self._authority = authority
+        self._newest = (b"", -1)
+
+    def prove(self, key: str, shown: bytes | None, look: Look) -> Lane | None:
+        """Choose the lane: COMMAND for what the proof shows to be the holder's and new."""
+        verifier = self._authority.verifier
+        if shown is None or verifier is None or not verifier.plausible(shown):
+            return self.sieve.lane(Code.NO_LEASE)
+        try:
+            said = read(shown)
+        except Malformed:
+            return self.sieve.lane(Code.MALFORMED)
+        if said.lease != verifier.lease:
+            return self.sieve.lane(Code.NO_LEASE)
+        lease, seq = self._newest
+        if said.lease == lease and said.seq <= seq:
+            return self.sieve.lane(Code.OUT_OF_ORDER)
+        if not verifier.proves(said, key, look()):
+            return self.sieve.lane(Code.MALFORMED)
+        self._newest = (said.lease, said.seq)
+        return Lane.COMMAND
+
+
+class CommandGate:
+    """Sorts the commands for one robot. ``clock``: seconds on the event loop's time line, from any thread."""
+
+    def __init__(self, authority: Authority, keys: KeySpace, clock: Clock) -> None:
+        self._authority = authority
+        self._keys = keys
+        self._clock = clock
+        self._prover = _Prover(authority, clock)
+        self.sieve = self._prover.sieve
+        self._open = RateLimit(OPEN_HZ)
+        self._kinds: dict[str, _Kind] = {}
+        self._stopped_at = float("-inf")
+        self.same_stops = 0
+        """Stops that were taken for the one before."""
+
+    def __repr__(self) -> str:
+        return f"<CommandGate {self._keys.robot} {self.sieve!r}>"
+
+    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        kind = self._kinds.get(key) or self._find(key)
+        if kind.stop:
+            return self._stop()
+        if size > kind.most_bytes:
+            return self.sieve.lane(Code.MALFORMED)
+        if kind.leased:
+            return self._prover.prove(key, shown, look)
+        if self._open.take(self._clock()):
+            return Lane.OTHER
+        self.sieve.count(Code.RATE)
+        return None
+
+    def stopped(self) -> None:
+        """Take note that a stop was carried out now; on the event loop's thread."""
+        self._stopped_at = self._clock()
+
+    def _stop(self) -> Lane | None:
+        """Let a stop through, unless it changes nothing: looked at in this order, as a new holder comes first."""
+        fresh = self._clock() - self._stopped_at < SAME_STOP_S
+        if fresh and not self._authority.moving and self._authority.verifier is None:
+            self.same_stops += 1
+            return None
+        return Lane.STOP
+
+    def _find(self, key: str) -> _Kind:
+        kind = self._read(key)
+        if len(self._kinds) < _KEPT:
+            self._kinds[key] = kind
+        return kind
+
+    def _read(self, key: str) -> _Kind:
+        if is_stop(key):
+            return _STOP
+        topic = topics.find(self._keys.path(key)) if topics.is_concrete(key) else None
+        if topic is None or topic.most_bytes is None:
+            return _UNKNOWN
+        return _Kind(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
+
+
+class QuestionGate:
+    """Sorts the holder's questions about the lease; each key has a gate, and numbers of its own."""
+
+    def __init__(self, authority: Authority, clock: Clock) -> None:
+        self._prover = _Prover(authority, clock)
+        self.sieve = self._prover.sieve
+
+    def __repr__(self) -> str:
+        return f"<QuestionGate {self.sieve!r}>"
+
+    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        return self._prover.prove(key, shown, look)
+
+
+class NameGate:
+    """Sorts who asks for the lease: so many a second of one name, the last chunk of the key, and of all names."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.sieve = Sieve(0.0, clock)
+        self._clock = clock
+        self._all = RateLimit(ALL_NAMES_HZ)
+        self._names: OrderedDict[str, RateLimit] = OrderedDict()
+
+    def __repr__(self) -> str:
+        return f"<NameGate {len(self._names)} names, {self.sieve!r}>"
+
+    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        now, name = self._clock(), key.rpartition("/")[2]
+        own = self._names.get(name)
+        if own is None:
+            own = self._names[name] = RateLimit(NAME_HZ)
+            if len(self._names) > NAMES:
+                self._names.popitem(last=False)
+        else:
+            self._names.move_to_end(name)
+        if own.take(now) and self._all.take(now):
+            return Lane.OTHER
+        self.sieve.count(Code.RATE)
+        return None
+
+
+_REFUSALS: dict[Code, Refused] = {
+    Code.NO_LEASE: LeaseLost("no lease: acquire first", Code.NO_LEASE),
+    Code.MALFORMED: Malformed("wrong proof, or too large"),
+    Code.OUT_OF_ORDER: Malformed("repeated or out of order", Code.OUT_OF_ORDER),
+    Code.RATE: TooFast("too many a second"),
+}
+"""What is shown of those that were only counted."""

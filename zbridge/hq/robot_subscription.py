@@ -1,0 +1,111 @@
+"""What the listeners of a process follow of a robot: subscribed once, decoded once. Knows no protocol."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+
+from zbridge.bus import Bus, Handle, Sample
+from zbridge.errors import PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.topics import Delivery, KeySpace, Topic
+from zbridge.fleet.view import RobotView
+from zbridge.metrics import Metrics
+
+log = logging.getLogger("zbridge.hq")
+
+Follow = Callable[[Topic, FleetMessage], None]
+_KNOWN = 1024
+"""Keys whose topics are known at a time."""
+_STATES = (topics.STATUS.path, topics.CONTROL.path)
+
+
+class RobotSubscription:
+    """Keeps the view of one robot, and tells those who follow it."""
+
+    def __init__(self, bus: Bus, keys: KeySpace, metrics: Metrics) -> None:
+        self.view = RobotView()
+        self._bus = bus
+        self._keys = keys
+        self._followers: dict[str, list[Follow]] = {}
+        self._topics: dict[str, Topic] = {}
+        self._gateway: list[Callable[[bool], None]] = []
+        self._handles: dict[str, Handle] = {}
+        self._watch: Handle | None = None
+        self._malformed = metrics.count("telemetry_malformed")
+
+    def __repr__(self) -> str:
+        return f"<RobotSubscription of {self._keys.robot}, {sorted(self._followers)}>"
+
+    def follow(self, paths: Iterable[str], follower: Follow, gateway: Callable[[bool], None]) -> None:
+        """Tell ``follower`` of what is published on these paths, ``gateway`` whether the robot is served."""
+        self._gateway.append(gateway)
+        gateway(self.view.alive)
+        for path in (*_STATES, *paths):
+            self.also_follow(path, follower)
+
+    def unfollow(self, path: str, follower: Follow) -> None:
+        """Tell ``follower`` no more of one path; what nobody follows is not subscribed to."""
+        followers = self._followers.get(path, [])
+        if follower in followers:
+            followers.remove(follower)
+            if not followers:
+                self._handles.pop(path).close()
+                del self._followers[path]
+
+    def also_follow(self, path: str, follower: Follow) -> None:
+        """Tell ``follower`` of one more path."""
+        self._followers.setdefault(path, []).append(follower)
+        if path not in self._handles:
+            self._subscribe(path)
+
+    def open(self) -> None:
+        """Begin to watch the robot's gateway."""
+        self._watch = self._bus.watch_alive(self._keys.alive("gateway"), self._on_gateway)
+
+    def close(self) -> None:
+        """Follow nothing any more."""
+        for handle in (*self._handles.values(), *((self._watch,) if self._watch is not None else ())):
+            handle.close()
+        self._handles.clear()
+
+    def _subscribe(self, path: str) -> None:
+        followers = self._followers[path]
+        topic = topics.find(path)
+        history = topic is not None and topic.delivery is Delivery.STATE
+
+        def take(sample: Sample) -> None:
+            self._take(sample, followers)
+
+        self._handles[path] = self._bus.subscribe(self._keys.key(path), take, history=history)
+
+    def _take(self, sample: Sample, followers: list[Follow]) -> None:
+        topic = self._topics.get(sample.key) or self._topic(sample.key)
+        if topic is None:
+            return
+        try:
+            message = payloads.decode(topic.message, sample.payload)
+        except PayloadError as error:
+            self._malformed.value += 1
+            log.debug("%s: %s", sample.key, error)
+            return
+        self.view.note(topic, message)
+        for follower in tuple(followers):
+            follower(topic, message)
+
+    def _topic(self, key: str) -> Topic | None:
+        topic = topics.find(self._keys.path(key))
+        if topic is not None:
+            if len(self._topics) >= _KNOWN:  # a robot may make up new names for ever
+                self._topics.clear()
+            self._topics[key] = topic
+        return topic
+
+    def _on_gateway(self, key: str, alive: bool) -> None:
+        self.view.alive = alive
+        if not alive:
+            self.view.status = None  # what it said last is nothing its successor says
+        for tell in self._gateway:
+            tell(alive)

@@ -1,0 +1,84 @@
+"""Keeps the sessions of one process: their table, and when to try a lost peer again. Sans-IO."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any
+
+from zbridge.fleet.messages import SessionEntry
+from zbridge.protocol.session import Session
+
+REMEMBERED = 32
+"""Ended sessions that the table still shows."""
+
+
+class Backoff:
+    """Delays between attempts: doubling from ``first_s`` to ``most_s``, each with +-25 % jitter, for ever."""
+
+    def __init__(self, first_s: float = 0.5, most_s: float = 10.0, rng: random.Random | None = None) -> None:
+        self._first_s = first_s
+        self._most_s = most_s
+        self._next_s = first_s
+        self._rng = rng or random.Random()
+
+    def __repr__(self) -> str:
+        return f"<Backoff next {self._next_s:g} s>"
+
+    def delay_s(self) -> float:
+        """Give the next delay in seconds."""
+        delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
+        return delay_s * self._rng.uniform(0.75, 1.25)
+
+    def reset(self) -> None:
+        """Begin anew: the last attempt worked."""
+        self._next_s = self._first_s
+
+
+class ClientIds:
+    """The ids a robot gives its clients: the lowest free one, and none again within ``quiet_s`` of its release."""
+
+    def __init__(self, ids: range, quiet_s: float) -> None:
+        self._quiet_s = quiet_s
+        self._free_at = dict.fromkeys(ids, -math.inf)
+
+    def __repr__(self) -> str:
+        taken = sum(free_at == math.inf for free_at in self._free_at.values())
+        return f"<ClientIds {taken} of {len(self._free_at)} taken>"
+
+    def take(self, now: float) -> int | None:
+        """Give an id that is free now; None where there is none."""
+        for client_id, free_at in self._free_at.items():
+            if free_at <= now:
+                self._free_at[client_id] = math.inf
+                return client_id
+        return None
+
+    def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
+        """Take an id back; one that was never used need not rest."""
+        self._free_at[client_id] = now + self._quiet_s if rests else -math.inf
+
+
+class SessionTable:
+    """The sessions of one process, of every protocol and both roles."""
+
+    def __init__(self) -> None:
+        self._live: dict[Session[Any], None] = {}
+        self._ended: list[SessionEntry] = []
+
+    def __repr__(self) -> str:
+        return f"<SessionTable {len(self._live)} live, {len(self._ended)} ended>"
+
+    def add(self, session: Session[Any]) -> None:
+        """Take a new session into the table."""
+        self._live[session] = None
+
+    def remove(self, session: Session[Any]) -> None:
+        """Move an ended session to the remembered ones."""
+        if session in self._live:
+            del self._live[session]
+            self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]
+
+    def snapshots(self) -> tuple[SessionEntry, ...]:
+        """Show every session, the live ones first."""
+        return (*(session.snapshot() for session in self._live), *self._ended)

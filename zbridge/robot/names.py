@@ -1,0 +1,42 @@
+"""The names under which a robot publishes (its sensors'): bounded, so that one that makes up new ones costs little.
+
+Sans-IO.
+"""
+
+from __future__ import annotations
+
+NAMES = 1024
+"""Different names that a robot may publish within an hour."""
+HOUR_S = 3600.0
+
+
+class NameBudget:
+    """The names of the hour that began with the first of them; a name that was seen in it is free."""
+
+    def __init__(self) -> None:
+        self.over = False
+        """Whether there was one more than there may be."""
+        self._seen: set[str] = set()
+        self._ends_at = 0.0
+
+    def __repr__(self) -> str:
+        return f"<NameBudget {len(self._seen)} of {NAMES}>"
+
+    def admit(self, name: str, now: float) -> bool:
+        """Tell whether a name may be published."""
+        self.expire(now)
+        if name in self._seen:
+            return True
+        if len(self._seen) >= NAMES:
+            self.over = True
+            return False
+        if not self._seen:
+            self._ends_at = now + HOUR_S
+        self._seen.add(name)
+        return True
+
+    def expire(self, now: float) -> None:
+        """Begin a new hour where it is time."""
+        if self._seen and now >= self._ends_at:
+            self._seen.clear()
+            self.over = False

@@ -1,0 +1,26 @@
+"""The settings of the device side, as a configuration has them, and the plan made of them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import msgspec
+
+from zbridge.address import Address
+from zbridge.protocol.plugin import Protocol
+
+
+class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[device]``: the robot itself. ``connect`` has one address for each of its links."""
+
+    protocol: str
+    connect: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    options: dict[str, Any] = {}
+
+
+class DevicePlan(msgspec.Struct, frozen=True):
+    """The device side: its protocol, the protocol's options, an address for each link."""
+
+    protocol: Protocol
+    options: Any
+    addresses: tuple[Address, ...]

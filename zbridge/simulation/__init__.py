@@ -1,0 +1,4 @@
+"""What simulated robots share: the room they drive in, and the accounts of fragile ones.
+
+Knows no bus.
+"""

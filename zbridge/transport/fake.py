@@ -1,0 +1,46 @@
+"""A link without a socket, for tests: keeps what was written, and the test plays the peer."""
+
+from __future__ import annotations
+
+
+class FakeLink:
+    """A link without a socket: keeps what was written, and the test plays the peer."""
+
+    def __init__(self, peer: str = "tcp://robot.test:1") -> None:
+        self.peer = peer
+        self.ready = True
+        self.silent_s = 0.0
+        self.unacknowledged_s = 0.0
+        self.written: list[bytes] = []
+        self.datagrams: list[bytes] = []
+        self.sources_dropped = 0
+        self.paused = False
+        self.closed = False
+
+    def write(self, data: bytes) -> None:
+        """Keep ``data``."""
+        self.written.append(data)
+
+    def write_datagram(self, data: bytes) -> None:
+        """Keep ``data``."""
+        self.datagrams.append(data)
+
+    def drop_source(self) -> None:
+        """Take note."""
+        self.sources_dropped += 1
+
+    def pause(self) -> None:
+        """Take note."""
+        self.paused = True
+
+    def resume(self) -> None:
+        """Take note."""
+        self.paused = False
+
+    def close(self) -> None:
+        """Take note."""
+        self.closed = True
+
+    def abort(self) -> None:
+        """Take note."""
+        self.closed = True

@@ -1,0 +1,175 @@
+"""Datagrams beside a TCP link: our own socket towards one peer, and the shared socket of a listener.
+
+Knows no frame, session or protocol.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+
+from zbridge.metrics import Count
+from zbridge.protocol.rate_limit import RateLimit
+from zbridge.transport.link import Link, Receiver
+
+_DATAGRAM_BYTES = 65_536
+_DATAGRAMS = 64
+"""Most datagrams taken from a socket before the loop serves others."""
+STRAYS_HZ = 20.0
+"""Datagrams a second of one host that nobody claimed and that are shown to its links; the others are counted."""
+STRAY_S = 0.02
+"""Seconds for which a source is not listened to after a datagram that nobody claimed: a flood costs little."""
+STRAY_SOURCES = 1024
+"""Such sources that are kept; of more, all are forgotten."""
+_DRAINED = 1024
+"""Most datagrams taken before a stream is read: more than a socket's buffer holds by default."""
+
+
+class _DatagramReader:
+    """A bound UDP socket on the event loop; asyncio and uvloop alike."""
+
+    def __init__(self) -> None:
+        self._socket: socket.socket | None = None
+        self._loop = asyncio.get_running_loop()
+
+    def _listen(self, host: str, port: int) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        sock = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            sock.setblocking(False)
+            sock.bind((host, port))
+        except OSError:
+            sock.close()
+            raise
+        self._socket = sock
+        self._loop.add_reader(sock.fileno(), self._read)
+
+    def drain(self) -> None:
+        """Take all datagrams that wait."""
+        self._read(_DRAINED)
+
+    def _read(self, most: int = _DATAGRAMS) -> None:
+        for _ in range(most):
+            if self._socket is None:
+                return
+            try:
+                data, source = self._socket.recvfrom(_DATAGRAM_BYTES)
+            except OSError:  # nothing more, or an ICMP error of an earlier send
+                return
+            self._take(data, source[:2])
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        raise NotImplementedError
+
+    def _send(self, data: bytes, destination: tuple[str, int]) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # a full buffer, an unreachable peer: the datagram is lost
+                self._socket.sendto(data, destination)
+
+    def close(self) -> None:
+        """Close the socket; idempotent."""
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            self._loop.remove_reader(sock.fileno())
+            sock.close()
+
+
+class DatagramSocket(_DatagramReader):
+    """Our own UDP socket towards one peer: it hears the peer's address and port, and counts everything else."""
+
+    def __init__(self, transport: asyncio.Transport, receiver: Receiver) -> None:
+        super().__init__()
+        self._receiver = receiver
+        self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
+        self._listen(transport.get_extra_info("sockname")[0], 0)
+
+    def send(self, data: bytes) -> None:
+        """Send to the peer."""
+        self._send(data, self._peer)
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        if source == self._peer:
+            self._receiver.received_datagram(data)
+        else:
+            self._receiver.foreign_datagram()
+
+
+class DatagramHub(_DatagramReader):
+    """The UDP socket of a listener: each source belongs to the link of the same host that claimed it.
+
+    A datagram of a source that is nobody's is shown to every link of its host. The one that claims it gets the source,
+    if it has none; where several claim it, or one that has a source already, somebody speaks in another's name: none
+    of them has a source from then on.
+    """
+
+    def __init__(self, foreign: Count) -> None:
+        super().__init__()
+        self._hosts: dict[str, dict[Link, Receiver]] = {}
+        self._strays: dict[str, RateLimit] = {}
+        self._deaf_until: dict[tuple[str, int], float] = {}
+        self._owners: dict[tuple[str, int], tuple[Link, Receiver]] = {}
+        self._sources: dict[Link, tuple[str, int]] = {}
+        self._foreign = foreign
+
+    def open(self, host: str, port: int) -> None:
+        """Bind the port."""
+        self._listen(host, port)
+
+    def add(self, link: Link, host: str, receiver: Receiver) -> None:
+        """Let a link have the datagrams of its host that it claims."""
+        self._hosts.setdefault(host, {})[link] = receiver
+        self._strays.setdefault(host, RateLimit(STRAYS_HZ))
+
+    def remove(self, link: Link) -> None:
+        """Forget a link and its source; idempotent."""
+        for host, links in tuple(self._hosts.items()):
+            links.pop(link, None)
+            if not links:
+                del self._hosts[host], self._strays[host]
+        self.unbind(link)
+
+    def unbind(self, link: Link) -> None:
+        """Forget the source of a link; idempotent."""
+        source = self._sources.pop(link, None)
+        if source is not None:
+            del self._owners[source]
+
+    def send(self, link: Link, data: bytes) -> None:
+        """Send to the source a link has claimed; nowhere while there is none."""
+        source = self._sources.get(link)
+        if source is not None:
+            self._send(data, source)
+
+    def _take(self, data: bytes, source: tuple[str, int]) -> None:
+        owner = self._owners.get(source)
+        if owner is not None:
+            owner[1].received_datagram(data)
+            return
+        now = self._loop.time()
+        if now < self._deaf_until.get(source, now):
+            self._foreign.value += 1
+            return
+        peers = tuple(self._hosts.get(source[0], {}).items())
+        claiming = [(link, receiver) for link, receiver in peers if receiver.claims(data, source[1])]
+        if len(claiming) == 1 and claiming[0][0] not in self._sources:
+            self._sources[claiming[0][0]] = source
+            self._owners[source] = claiming[0]
+            claiming[0][1].received_datagram(data)
+            return
+        self._foreign.value += 1
+        if claiming:
+            for link, receiver in claiming:
+                self.unbind(link)
+                receiver.rivalled()
+        elif peers:
+            self._note_stray(data, source, now)
+
+    def _note_stray(self, data: bytes, source: tuple[str, int], now: float) -> None:
+        """Show a datagram that nobody claimed to the links of its host; do not listen to its source for a moment."""
+        if len(self._deaf_until) >= STRAY_SOURCES:
+            self._deaf_until.clear()
+        self._deaf_until[source] = now + STRAY_S
+        if self._strays[source[0]].take(now):
+            for receiver in tuple(self._hosts[source[0]].values()):
+                receiver.stray_datagram(data)

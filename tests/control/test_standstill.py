@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from tests.clock import jumping
-from tests.test_device import NEUTRAL, Rig, established, serving
+from tests.robot.test_device import NEUTRAL, Rig, established, serving
 from zbridge.transport.link import STALLED_S
 
 STOP = bytes.fromhex("02000000 02 0d")

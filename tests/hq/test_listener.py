@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from tests.clock import jumping
-from tests.test_helm import Gateway
+from tests.hq.test_operator import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Answer, Question

@@ -12,7 +12,7 @@ import pytest
 from zbridge.address import Address
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
-from zbridge.transport import tcp as links
+from zbridge.transport import tcp, udp
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import STALLED_S, Link, Receiver
 from zbridge.transport.tcp import TcpLink, connect, listen
@@ -273,7 +273,7 @@ async def test_a_peer_that_does_not_answer_is_a_link_error(monkeypatch: pytest.M
     async def forever(*args: object) -> None:
         await asyncio.Event().wait()
 
-    monkeypatch.setattr(links, "CONNECT_S", 0.01)
+    monkeypatch.setattr(tcp, "CONNECT_S", 0.01)
     monkeypatch.setattr(asyncio.get_running_loop(), "create_connection", forever, raising=False)
     with pytest.raises(LinkError, match=r"tcp://robot\.test:1: no answer within 0\.01 s"):
         await connect(Address("robot.test", 1), Recorder())
@@ -663,7 +663,7 @@ async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
 @pytest.fixture
 def all_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look at every datagram, however soon after one that nobody claimed."""
-    monkeypatch.setattr(links, "STRAY_S", 0.0)
+    monkeypatch.setattr(udp, "STRAY_S", 0.0)
 
 
 async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() -> None:
@@ -676,7 +676,7 @@ async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() ->
     assert (recorder.asked, recorder.stray, foreign.value) == ([1], [b"b5"], 1000)
     hub._take(b"a5", ("10.0.0.1", 2))
     assert recorder.datagrams == [b"a5"], "another source is heard"
-    await asyncio.sleep(links.STRAY_S)
+    await asyncio.sleep(udp.STRAY_S)
     hub._take(b"b5", ("10.0.0.1", 1))
     assert recorder.stray == [b"b5", b"b5"]
 
@@ -688,8 +688,8 @@ async def test_what_links_are_shown_of_strays_and_what_is_kept_of_them_is_bounde
     for port in range(5000):
         hub._take(b"b5", ("10.0.0.1", port))
     assert len(recorder.asked) == foreign.value == 5000
-    assert links.STRAYS_HZ <= len(recorder.stray) <= 10 * links.STRAYS_HZ
-    assert len(hub._deaf_until) <= links.STRAY_SOURCES
+    assert udp.STRAYS_HZ <= len(recorder.stray) <= 10 * udp.STRAYS_HZ
+    assert len(hub._deaf_until) <= udp.STRAY_SOURCES
 
 
 async def test_a_hub_counts_what_nobody_claims_and_what_comes_after_its_link(all_heard: None) -> None:
@@ -780,8 +780,8 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(
     def unknown(*_: object) -> bytes:
         raise OSError("Inappropriate ioctl for device")
 
-    monkeypatch.setattr(links.fcntl, "ioctl", unknown)
-    monkeypatch.setattr(links, "_unwatched_said", False)
+    monkeypatch.setattr(tcp.fcntl, "ioctl", unknown)
+    monkeypatch.setattr(tcp, "_unwatched_said", False)
     for _ in range(2):
         async with connected() as pair:
             pair.there.pause()

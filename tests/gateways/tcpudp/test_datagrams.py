@@ -18,7 +18,7 @@ import pytest
 from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp import session as sessions
 from gateways.tcpudp.hq import HqOptions
-from tests.test_helm import Gateway
+from tests.hq.test_operator import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.fleet import payload as payloads
@@ -30,7 +30,7 @@ from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.transport import tcp as link
+from zbridge.transport import udp
 
 KEYS = KeySpace("fleet", "r1")
 SOON_S = 5.0
@@ -63,7 +63,7 @@ def move(sender: int) -> bytes:
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for a 5, and look at every datagram of an attacker, however fast they come."""
     monkeypatch.setattr(sessions, "PROBE_S", PROBE_S)
-    monkeypatch.setattr(link, "STRAY_S", 0.0)
+    monkeypatch.setattr(udp, "STRAY_S", 0.0)
 
 
 class Scene:

@@ -12,7 +12,7 @@ from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import jumping
 from tests.gateways.tcpudp.frames import STOP, Timed, framed, server_settings
-from tests.test_device import serving
+from tests.robot.test_device import serving
 from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map

@@ -21,7 +21,7 @@ from tests.gateways.tcpudp.frames import (
     framed,
     server_settings,
 )
-from tests.test_device import Rig, serving
+from tests.robot.test_device import Rig, serving
 from zbridge.fleet import topics
 
 MALFORMED = framed(1, 51, b"\x01")

@@ -12,7 +12,7 @@ from gateways.tcpudp.session import HqSession
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import jumping
 from tests.gateways.tcpudp.frames import LISTED, SIZE_100_10, START, server_settings
-from tests.test_device import Program, Rig, established, serving
+from tests.robot.test_device import Program, Rig, established, serving
 from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Switch, Text

@@ -30,7 +30,7 @@ from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.transport import udp
+from zbridge.transport import udp as datagrams
 
 KEYS = KeySpace("fleet", "r1")
 SOON_S = 5.0
@@ -63,7 +63,7 @@ def move(sender: int) -> bytes:
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait less for a 5, and look at every datagram of an attacker, however fast they come."""
     monkeypatch.setattr(sessions, "PROBE_S", PROBE_S)
-    monkeypatch.setattr(udp, "STRAY_S", 0.0)
+    monkeypatch.setattr(datagrams, "STRAY_S", 0.0)
 
 
 class Scene:

@@ -22,7 +22,7 @@ from zbridge.control.gate import (
     QuestionGate,
     Sieve,
 )
-from zbridge.errors import Code
+from zbridge.errors import Code, Refused
 from zbridge.fleet.messages import Acquire
 from zbridge.fleet.topics import KeySpace
 
@@ -95,6 +95,18 @@ def test_who_knows_the_leases_id_neither_fills_the_holders_lane_nor_locks_it_out
     assert Lane.COMMAND not in lanes
     assert rig.kept_back() == {Code.MALFORMED: FLOOD - SHOWN_HZ}
     assert rig.drive() is Lane.COMMAND
+
+
+def test_what_the_gate_proved_is_admitted_once_and_only_as_it_was() -> None:
+    rig = Rig()
+    attachment = rig.held.attachment("drive", FORWARD)
+    assert rig.command(attachment) is Lane.COMMAND
+    for key, payload in ((DRIVE, packed({"forward": 1.0})), (MODE, FORWARD)):
+        with pytest.raises(Refused, match="wrong proof"):
+            rig.authority.admit(attachment, key, payload, rig.now)
+    assert rig.authority.admit(attachment, DRIVE, FORWARD, rig.now) == "me"
+    with pytest.raises(Refused, match="repeated"):
+        rig.authority.admit(attachment, DRIVE, FORWARD, rig.now)
 
 
 def test_what_was_overheard_goes_by_the_holders_lane_once() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.proofs import proof, shown
-from zbridge.control.proof import LEAST_BYTES, MOST_BYTES, Signer, Verifier, read
+from zbridge.control.proof import LEAST_BYTES, MOST_BYTES, NOTES, Signer, Verifier, read
 from zbridge.errors import Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
 
@@ -105,3 +105,23 @@ def test_nothing_that_prints_shows_the_token() -> None:
 def test_an_authorization_travels_with_three_fields() -> None:
     said = Authorization(lease=LEASE, seq=7, proof=proof(TOKEN, DRIVE, 7))
     assert read(shown(LEASE, TOKEN, DRIVE, 7)) == said
+
+
+def test_what_was_proven_is_noted_once_and_only_as_it_was() -> None:
+    verifier = Verifier(LEASE, TOKEN)
+    attachment = Signer(GRANTED).command(DRIVE, PAYLOAD)
+    said = read(attachment)
+    for key, payload in (("fleet/r1/@cmd/motor/a", PAYLOAD), (DRIVE, PAYLOAD + b"\0")):
+        verifier.note(attachment, said, DRIVE, PAYLOAD)
+        assert verifier.noted(attachment, key, payload) is None
+    verifier.note(attachment, said, DRIVE, PAYLOAD)
+    assert verifier.noted(attachment, DRIVE, PAYLOAD) == said
+    assert verifier.noted(attachment, DRIVE, PAYLOAD) is None
+
+
+def test_notes_are_bounded() -> None:
+    verifier = Verifier(LEASE, TOKEN)
+    said = read(Signer(GRANTED).command(DRIVE, PAYLOAD))
+    for number in range(3 * NOTES):
+        verifier.note(number.to_bytes(4, "big"), said, DRIVE, PAYLOAD)
+    assert len(verifier._notes) <= NOTES

@@ -206,8 +206,12 @@ class ZenohBus:
 
         Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
         """
-        source = self._inbox.source(handler, _read_sample)
-        store = _store_by(lane, source) if isinstance(lane, Lane) else _store_sorted(lane, source)
+        if isinstance(lane, Lane):
+            source = self._inbox.source(handler, _read_sample)
+            store = _store_by(lane, source)
+        else:
+            source = self._inbox.source(handler, lambda sample: sample)
+            store = _store_sorted(lane, source)
         if not history:
             return self._keep(_Declared(self._session.declare_subscriber(key_expr, store)))
         config = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
@@ -388,11 +392,12 @@ def _store_sorted(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None]:
         attachment, payload = sample.attachment, sample.payload
         shown = attachment.to_bytes() if attachment is not None else None
         size = len(payload) + (len(shown) if shown is not None else 0)
-        lane = sort(str(sample.key_expr), shown, size, payload.to_bytes)
+        key = str(sample.key_expr)
+        lane = sort(key, shown, size, payload.to_bytes)
         if lane is Lane.STOP:
-            source.fold(sample, lane)
+            source.fold(Sample(key, b"", shown), lane)  # its payload says nothing
         elif lane is not None:
-            source.put(sample, lane, size)
+            source.put(Sample(key, payload.to_bytes(), shown), lane, size)
 
     return store
 

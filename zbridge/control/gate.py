@@ -94,9 +94,10 @@ _UNKNOWN = _Kind(leased=False, most_bytes=topics.LARGE_BYTES)
 
 
 class _Prover:
-    """Tells the holder's newest from everything else."""
+    """Tells the holder's newest from everything else. notes: whether the event loop asks what was proven."""
 
-    def __init__(self, authority: Authority, clock: Clock) -> None:
+    def __init__(self, authority: Authority, clock: Clock, *, notes: bool = False) -> None:
+        self._notes = notes
         self.sieve = Sieve(SHOWN_HZ, clock)
         self._authority = authority
         self._newest = (b"", -1)
@@ -115,9 +116,12 @@ class _Prover:
         lease, seq = self._newest
         if said.lease == lease and said.seq <= seq:
             return self.sieve.lane(Code.OUT_OF_ORDER)
-        if not verifier.proves(said, key, look()):
+        payload = look()
+        if not verifier.proves(said, key, payload):
             return self.sieve.lane(Code.MALFORMED)
         self._newest = (said.lease, said.seq)
+        if self._notes:
+            verifier.note(shown, said, key, payload)
         return Lane.COMMAND
 
 
@@ -128,7 +132,7 @@ class CommandGate:
         self._authority = authority
         self._keys = keys
         self._clock = clock
-        self._prover = _Prover(authority, clock)
+        self._prover = _Prover(authority, clock, notes=True)
         self.sieve = self._prover.sieve
         self._open = RateLimit(OPEN_HZ)
         self._kinds: dict[str, _Kind] = {}

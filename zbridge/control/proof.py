@@ -5,8 +5,8 @@ public id, a number that rises, and a proof: the first 16 bytes of HMAC-SHA256(t
 big-endian + payload). Whoever overhears it can neither forge nor alter it, nor use it for another key, and the
 gateway takes each number once. Commands are numbered apart from questions, whose payload is empty in the proof.
 
-:class:`Signer` is the holder's end. :class:`Verifier` is the gateway's: it keeps no number and never changes, so any
-thread may use it.
+:class:`Signer` is the holder's end. :class:`Verifier` is the gateway's. It keeps no numbers. The bus's thread proves a
+command and leaves a note of it; the event loop's takes the note, so that each proof is reckoned once.
 Source: the design's "Who may drive".
 """
 
@@ -23,6 +23,8 @@ from zbridge.fleet.messages import Authorization, Lease
 LEASE_BYTES = 8
 TOKEN_BYTES = 32
 PROOF_BYTES = 16
+NOTES = 1024
+"""Proven commands that may wait for the event loop; where there are more, their proofs are reckoned again."""
 LEAST_BYTES, MOST_BYTES = 46, 128
 """Bytes of an authorization: as short as MessagePack can write it, and with room for those who write it longer."""
 
@@ -64,6 +66,7 @@ class Verifier:
     def __init__(self, lease: bytes, token: bytes) -> None:
         self.lease = lease
         self._prepared = _prepare(token)
+        self._notes: dict[bytes, tuple[Authorization, str, bytes]] = {}
 
     def __repr__(self) -> str:
         return f"<Verifier of {self.lease.hex()}>"
@@ -75,6 +78,17 @@ class Verifier:
     def proves(self, shown: Authorization, key: str, payload: bytes = b"") -> bool:
         """Tell whether the proof is the holder's, for this key and this payload; its number is looked at by others."""
         return hmac.compare_digest(_proof(self._prepared, key, shown.seq, payload), shown.proof)
+
+    def note(self, attachment: bytes, shown: Authorization, key: str, payload: bytes) -> None:
+        """Keep that this command was proven, until :meth:`noted` is asked for it; any one thread may call it."""
+        if len(self._notes) >= NOTES:
+            self._notes.clear()
+        self._notes[attachment] = (shown, key, payload)
+
+    def noted(self, attachment: bytes, key: str, payload: bytes) -> Authorization | None:
+        """Give the authorization of a command that was proven as it is here; None once it was asked for."""
+        note = self._notes.pop(attachment, None)
+        return note[0] if note is not None and note[1:] == (key, payload) else None
 
 
 def read(shown: bytes | None) -> Authorization:

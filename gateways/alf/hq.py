@@ -29,7 +29,7 @@ from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
@@ -143,7 +143,6 @@ class AlfHq(HqSide):
 
     name = NAME
     deadman_s = DEADMAN_S
-    steers = True
 
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
@@ -171,7 +170,7 @@ class AlfHq(HqSide):
         if session.laser and known is not None:
             session.know(self._sweep_of(known).init)
 
-    # The robot, shown
+    # What is shown
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         if isinstance(message, Scan):
@@ -213,7 +212,11 @@ class AlfHq(HqSide):
         value = _finite(value)
         return value if self._dialect is Dialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
 
-    # What clients command
+    # What is understood
+
+    def is_motion(self, command: Drive | Motor) -> bool:
+        """A turn without speed only sets the wheels, and so is neutral."""
+        return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
     def take(self, session: HqClient, message: AlfMessage) -> tuple[Telemetry, ...]:
         if not isinstance(message, DriveCommand):

@@ -45,14 +45,15 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq import listener as listeners
-from zbridge.hq.listener import STALL_S, SWEEP_S, TELL_S, Listener
+from zbridge.hq.client import STALL_S, SWEEP_S, TELL_S
+from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
 from zbridge.protocol.outbox import LIMIT
-from zbridge.protocol.plugin import HqSide, Protocol, Send, Telemetry
+from zbridge.protocol.plugin import ATTEND_S, HqSide, Protocol, RobotUser, Send, Telemetry
 from zbridge.protocol.session import Limits, Role, Session, State
-from zbridge.protocol.session_table import SessionTable
+from zbridge.protocol.session_table import ClientIds, SessionTable
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import Receiver
 
@@ -101,14 +102,24 @@ class ToySession(Session[bytes]):
 class ToySide(HqSide):
     name = "toy"
     deadman_s = 1.25
-    numbers = range(2, 256)
     follows = ("pose", "text", "lidar")
     quiet_s = 0.0
+    hold = False
 
     def __init__(self, options: Any, view: RobotView, metrics: Metrics) -> None:
         self.view = view
         self.encoded = 0
         self.made: list[ToySession] = []
+
+    def numbers(self, clients: int) -> ClientIds:
+        return ClientIds(range(2, 256), self.quiet_s)
+
+    def attend(self, client: RobotUser) -> None:
+        if self.hold:
+            if client.silent_s > self.deadman_s - ATTEND_S:
+                client.let_go("the connection is silent")
+            else:
+                client.repeat()
 
     def session(self, number: int, bounds: Limits) -> ToySession:
         self.made = [session for session in self.made if not session.over]
@@ -229,8 +240,8 @@ class Scene:
             self.come()
         self.metrics = Metrics()
         self.manager = SessionTable()
-        self.audience = RobotSubscription(self.bus, KEYS, self.metrics)
-        self.audience.open()
+        self.robot = RobotSubscription(self.bus, KEYS, self.metrics)
+        self.robot.open()
         protocol = Protocol(
             name="toy",
             summary="",
@@ -248,9 +259,7 @@ class Scene:
             tuple(map(ipaddress.ip_network, allow)),
         )
         self.accept: Callable[[], Receiver]
-        self.listener = Listener(
-            plan, "toy", self.audience, self.bus, KEYS, self.manager, self.metrics, lambda: self.now
-        )
+        self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now)
         self.hosts = 0
 
     def _side(self, options: Any, view: RobotView, metrics: Metrics) -> ToySide:
@@ -495,9 +504,9 @@ async def test_many_clients_come_and_go_and_leave_nothing_behind() -> None:
         assert (len(kept.subscribers), len(kept.queryables)) == (subscribers, queryables)
         assert kept.tokens == [KEYS.alive("gateway")]
         assert repr(scene.manager) == "<SessionTable 0 live, 32 ended>"
-        assert len(scene.listener._bridge._publishers) <= 2
-        assert (scene.listener._active, scene.listener._asked) == (set(), {})
-        assert "0 of 254 taken" in repr(scene.listener._ids)
+        assert len(scene.listener._context.bridge._publishers) <= 2
+        assert (scene.listener._active, len(scene.listener._queries)) == (set(), 0)
+        assert "0 of 254 taken" in repr(scene.listener._numbers)
         assert scene.gateway.report().state == "free"
         scene.side.made.clear()
         del programs, program
@@ -1294,7 +1303,7 @@ async def test_what_waited_while_the_process_stood_still_moves_nothing() -> None
             scene.skipped_s += 5.0
             await asyncio.sleep(0.05)
             assert driven(scene) == []
-            assert program.heard() == [b"! the gateway stood still: let go of the stick first"]
+            assert program.heard() == [b"! the gateway was frozen: let go of the stick first"]
 
 
 # Whether the robot is there
@@ -1372,10 +1381,10 @@ async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so
     errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert sorted(errors) == [
         "toy: a client not sent: KeyError('unheard of'); going on without",
+        "toy: a message of a client not understood: KeyError(b'what is this'); going on without",
         "toy: pose not shown: KeyError('pose'); going on without",
         "toy: status not shown: KeyError('status'); going on without",
         "toy: the robot's presence not shown: KeyError(True); going on without",
-        "toy: what a client said not taken: KeyError(b'what is this'); going on without",
     ]
 
 
@@ -1392,7 +1401,7 @@ async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
             for _ in range(5):
                 assert scene.connect().link.closed
             assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
-            assert repr(scene.listener._ids) == "<ClientIds 0 of 254 taken>"
+            assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
 
 
 @jumping

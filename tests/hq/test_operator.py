@@ -119,6 +119,18 @@ class Gateway:
         return commands
 
 
+class RepeatingOperator(Operator):
+    """The operator of a program that sets motion once."""
+
+    def tick(self) -> None:
+        self.repeat()
+        super().tick()
+
+
+def is_motion_of_wheels(command: Drive | Motor) -> bool:
+    return bool(command.value if isinstance(command, Motor) else command.forward or command.left)
+
+
 class Scene:
     """A robot, its gateway, and any number of programs; nothing is answered before :meth:`settle`."""
 
@@ -150,20 +162,23 @@ class Scene:
         who: str = "hq.toy.1",
         *,
         needs_mode: bool = False,
-        modes: str | None = None,
+        protocol: str = "toy",
         steers: bool = False,
         hold: bool = False,
     ) -> Operator:
-        return Operator(
-            Intent(DEADMAN_S, modes=needs_mode),
+        kind = RepeatingOperator if hold else Operator
+        operator = kind(
+            Intent(DEADMAN_S),
             self.bridge,
             who=who,
-            modes=modes,
-            steers=steers,
-            hold=hold,
+            protocol=protocol,
+            is_motion=is_motion_of_wheels if steers else lambda command: command.moving,
             tell=self.told.append,
             clock=lambda: self.now,
         )
+        if needs_mode:
+            operator.command(topics.CMD_MODE, Mode("none"))
+        return operator
 
     def look(self, *helms: Operator) -> None:
         """Let the gateway say how things stand."""
@@ -568,7 +583,7 @@ async def test_turning_is_motion_to_a_program_that_does_not_steer() -> None:
 
 async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     await scene.settle()
@@ -580,7 +595,7 @@ async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> N
 
 async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -593,7 +608,7 @@ async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
 
 async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -610,7 +625,7 @@ async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
 
 async def test_mode_none_is_told_although_another_command_is_still_on_its_way() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
@@ -629,7 +644,7 @@ async def test_mode_none_is_told_although_another_command_is_still_on_its_way() 
 
 async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -643,7 +658,7 @@ async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted
 
 async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds_one_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -661,7 +676,7 @@ async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds
 
 async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
@@ -683,7 +698,7 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
 
 async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     with pytest.raises(Refused, match="connected: let go of the stick first"):
         helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     helm.command(topics.CMD_DRIVE, STAND)
@@ -776,7 +791,7 @@ async def test_news_older_than_the_lease_does_not_end_it() -> None:
 
 async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -918,7 +933,7 @@ async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> Non
 
 async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     with pytest.raises(Refused, match="does not move by itself"):
         helm.command(topics.CMD_MODE, Mode("autonomous"))

@@ -74,14 +74,14 @@ class Gateway:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
-            audience = RobotSubscription(bus, self._keys, self.metrics)
+            robot = RobotSubscription(bus, self._keys, self.metrics)
             work: list[Coroutine[Any, Any, None]] = [
-                Listener(listener, name, audience, bus, self._keys, self.sessions, self.metrics, time.monotonic).run()
+                Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
                 for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
             ]
             if work:
-                audience.open()
-                stack.callback(audience.close)
+                robot.open()
+                stack.callback(robot.close)
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:

@@ -95,8 +95,8 @@ class Bridge:
 class Operator:
     """What one client commands. ``tell`` says something to its people; who: its name on the bus, and its token's.
 
-    modes: the protocol whose robots are told the control mode. steers, hold: see
-    :class:`zbridge.protocol.plugin.HqSide`.
+    protocol: of the client; only robots of the same one are told a control mode, and only where the client chose one.
+    is_motion: whether a command is motion, see :meth:`zbridge.protocol.plugin.HqSide.is_motion`.
     """
 
     def __init__(
@@ -105,18 +105,17 @@ class Operator:
         bridge: Bridge,
         *,
         who: str,
-        modes: str | None,
-        steers: bool,
-        hold: bool,
+        protocol: str,
+        is_motion: Callable[[Drive | Motor], bool],
         tell: Callable[[str], None],
         clock: Callable[[], float],
     ) -> None:
         self.intent = intent
         self.who = who
         self._bridge = bridge
-        self._modes = modes
-        self._steers = steers
-        self._hold = hold
+        self._protocol = protocol
+        self._is_motion = is_motion
+        self._chose_mode = False
         self._tell = tell
         self._clock = clock
         self._signer: Signer | None = None
@@ -171,22 +170,27 @@ class Operator:
             self._bridge.put(topic, message)
 
     def tick(self) -> None:
-        """Repeat what is held, keep the lease or give it back; to be called every :data:`REPEAT_S` while active."""
+        """Keep the lease or give it back; to be called every :data:`REPEAT_S` while active."""
         now, intent = self._clock(), self.intent
         intent.expire(now)
         if not intent.held:
             return
         if intent.held_back is not None:
             self._set.clear()
-        elif self._hold:
-            for topic, message in tuple(self._set.values()):
-                intent.motion(now)
-                self._send(topic, message)
         if intent.wants_release(now):
             self._release("unused")
         elif intent.mode == "autonomous" and now >= self._due:
             self._due = now + intent.lease_s / 3
             self._doubt()
+
+    def repeat(self) -> None:
+        """Send again what is in motion, unless neutral is owed."""
+        now, intent = self._clock(), self.intent
+        intent.expire(now)
+        if intent.held and intent.held_back is None:
+            for topic, message in tuple(self._set.values()):
+                intent.motion(now)
+                self._send(topic, message)
 
     def let_go(self, why: str) -> None:
         """Give the robot back: whether the client still means what it said, nobody can tell."""
@@ -247,12 +251,9 @@ class Operator:
         intent.expire(now)
         if intent.held_back is not None:
             self._set.clear()
-        moves = message.moving
-        if moves and self._steers and isinstance(message, Drive) and not (message.forward or message.left):
-            if not intent.may_steer:
+        if not self._is_motion(message):
+            if isinstance(message, Drive) and message.moving and not intent.may_steer:
                 message = Drive(light=message.light)
-            moves = False
-        if not moves:
             self._set.pop(topic.path, None)
             self._pushed.pop(topic.path, None)
             whole = all(now - said_at >= intent.deadman_s for said_at in self._pushed.values())
@@ -274,9 +275,10 @@ class Operator:
         return message
 
     def _choose(self, message: Mode, now: float) -> None:
+        self._chose_mode = True
         if message.mode == "autonomous":
             self._require_robot()
-            if self._bridge.view.protocol != self._modes:
+            if self._bridge.view.protocol != self._protocol:
                 self._choose(Mode("manual"), now)
                 raise Unsupported("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
@@ -306,7 +308,7 @@ class Operator:
 
     def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
         """Tell the robot its control mode, if it is of a protocol that has any."""
-        if self.intent.held and self._modes is not None and self._bridge.view.protocol == self._modes:
+        if self.intent.held and self._chose_mode and self._bridge.view.protocol == self._protocol:
             send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
 
     # The lease

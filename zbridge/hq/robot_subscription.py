@@ -27,8 +27,8 @@ class RobotSubscription:
 
     def __init__(self, bus: Bus, keys: KeySpace, metrics: Metrics) -> None:
         self.view = RobotView()
-        self._bus = bus
-        self._keys = keys
+        self.bus = bus
+        self.keys = keys
         self._followers: dict[str, list[Follow]] = {}
         self._topics: dict[str, Topic] = {}
         self._gateway: list[Callable[[bool], None]] = []
@@ -37,7 +37,7 @@ class RobotSubscription:
         self._malformed = metrics.count("telemetry_malformed")
 
     def __repr__(self) -> str:
-        return f"<RobotSubscription of {self._keys.robot}, {sorted(self._followers)}>"
+        return f"<RobotSubscription of {self.keys.robot}, {sorted(self._followers)}>"
 
     def follow(self, paths: Iterable[str], follower: Follow, gateway: Callable[[bool], None]) -> None:
         """Tell ``follower`` of what is published on these paths, ``gateway`` whether the robot is served."""
@@ -63,7 +63,7 @@ class RobotSubscription:
 
     def open(self) -> None:
         """Begin to watch the robot's gateway."""
-        self._watch = self._bus.watch_alive(self._keys.alive("gateway"), self._on_gateway)
+        self._watch = self.bus.watch_alive(self.keys.alive("gateway"), self._on_gateway)
 
     def close(self) -> None:
         """Follow nothing any more."""
@@ -79,7 +79,7 @@ class RobotSubscription:
         def take(sample: Sample) -> None:
             self._take(sample, followers)
 
-        self._handles[path] = self._bus.subscribe(self._keys.key(path), take, history=history)
+        self._handles[path] = self.bus.subscribe(self.keys.key(path), take, history=history)
 
     def _take(self, sample: Sample, followers: list[Follow]) -> None:
         topic = self._topics.get(sample.key) or self._topic(sample.key)
@@ -96,7 +96,7 @@ class RobotSubscription:
             follower(topic, message)
 
     def _topic(self, key: str) -> Topic | None:
-        topic = topics.find(self._keys.path(key))
+        topic = topics.find(self.keys.path(key))
         if topic is not None:
             if len(self._topics) >= _KNOWN:  # a robot may make up new names for ever
                 self._topics.clear()

@@ -6,6 +6,7 @@ A package adds one by an entry point in the group ``zbridge.protocols`` that nam
 from __future__ import annotations
 
 import math
+import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
 from importlib.metadata import entry_points
@@ -15,11 +16,12 @@ import msgspec
 
 from zbridge.address import Address
 from zbridge.errors import ConfigError, Unsupported
-from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
 from zbridge.protocol.session import Limits, Session, State
+from zbridge.protocol.session_table import ClientIds
 
 GROUP = "zbridge.protocols"
 
@@ -102,6 +104,24 @@ Send = Callable[[Any, float], object]
 """``send(session, now)``: puts what was encoded into the outbox of one client's session; raises Refused."""
 
 
+ATTEND_S = 0.1
+"""Seconds between two calls of :meth:`HqSide.attend`."""
+
+
+class RobotUser(typing.Protocol):
+    """A client that holds the robot, as :meth:`HqSide.attend` sees it."""
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the client's machine has owed an acknowledgement."""
+
+    def repeat(self) -> None:
+        """Send the robot again what the client has in motion, unless neutral is owed."""
+
+    def let_go(self, why: str) -> None:
+        """Give the robot back; the client must send neutral before it drives again."""
+
+
 class HqSide(ABC):
     """What one listener shows its HQ programs of a robot, and how it understands them. Sans-IO.
 
@@ -113,18 +133,8 @@ class HqSide(ABC):
     """The protocol's name: a robot of the same one is passed on whole."""
     deadman_s: ClassVar[float]
     """Seconds after which motion of a silent client ends."""
-    modes: ClassVar[bool] = False
-    """Whether a client says first that it wants to drive (:class:`Mode`), and motion before that is refused."""
-    steers: ClassVar[bool] = False
-    """Whether a turn without motion only sets wheels, and so is neutral."""
-    hold: bool = False
-    """Whether what a client set once is repeated while its link lives."""
     datagrams: bool = False
-    """Whether clients are heard by datagrams too."""
-    numbers: range = range(1, 1_000_000)
-    """The numbers that clients are given."""
-    quiet_s: float = 0.0
-    """Seconds before a number is given again."""
+    """Whether clients may send datagrams too, to the listener's port."""
     follows: tuple[str, ...]
     """The paths (``pose``, ``sensor/*``) whose messages :meth:`show` is given."""
 
@@ -167,6 +177,28 @@ class HqSide(ABC):
     def wanted(self) -> tuple[Topic, ...]:
         """List what clients want besides ``follows``, only now and then."""
         return ()
+
+    def numbers(self, clients: int) -> ClientIds:
+        """Make the numbers that clients are given, at most ``clients`` at a time; 1 and up unless overridden."""
+        return ClientIds(range(1, clients + 1), quiet_s=0.0)
+
+    def initial_commands(self) -> tuple[Telemetry, ...]:
+        """List the commands that a client counts as having sent when it connects."""
+        return ()
+
+    def is_motion(self, command: Drive | Motor) -> bool:
+        """Return whether a command of this protocol's programs is motion, False for neutral.
+
+        What a side calls neutral although it sets something (wheels) is carried out only for who drives the robot.
+        """
+        return command.moving
+
+    def attend(self, client: RobotUser) -> None:
+        """Look after a client that holds the robot; called every :data:`ATTEND_S`.
+
+        Deployed programs repeat their motion, or the deadman ends it. For those that set it once, override this.
+        """
+        return
 
 
 class HqSimulation(msgspec.Struct, frozen=True):

@@ -14,7 +14,7 @@ from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.protocol import ProtocolError
 from zbridge.wire import (
     F32,
     I32,

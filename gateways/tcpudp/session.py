@@ -37,11 +37,24 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
-from zbridge.errors import EncodeError, Malformed, NotReady, ProtocolError, Unsupported
-from zbridge.protocol.negotiation import agree, newest, parse_versions
-from zbridge.protocol.outbox import LIMIT
-from zbridge.protocol.session import Datagram, Limits, Role, Session, State
-from zbridge.protocol.udp_probe import Probe, Verdict
+from zbridge.protocol import (
+    LIMIT,
+    Datagram,
+    EncodeError,
+    Limits,
+    Malformed,
+    NotReady,
+    Probe,
+    ProtocolError,
+    Role,
+    Session,
+    State,
+    Unsupported,
+    Verdict,
+    agree,
+    newest,
+    parse_versions,
+)
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""

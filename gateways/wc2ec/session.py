@@ -19,8 +19,7 @@ from gateways.wc2ec.messages import (
     read,
     write,
 )
-from zbridge.errors import EncodeError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import EncodeError, Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
 SETTLE_S = 0.1

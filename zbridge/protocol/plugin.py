@@ -9,7 +9,6 @@ import math
 import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from importlib.metadata import entry_points
 from typing import Any, ClassVar
 
 import msgspec
@@ -45,11 +44,11 @@ class Robot(ABC):
 
     dialect: ClassVar[str | None] = None
     link_names: tuple[str, ...]
-    """One name for each configured address; the first link is the one that drives."""
+    """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 
     @abstractmethod
-    def session(self, link: int, peer: str) -> Session[Any]:
-        """Make the session for a new connection of one link."""
+    def session(self, link: str, peer: str) -> Session[Any]:
+        """Make the session for a new connection of the link of this name; ``peer``: its address, for logs."""
 
     @property
     @abstractmethod
@@ -257,11 +256,15 @@ class Protocol(msgspec.Struct, frozen=True):
 
 def protocol_names() -> tuple[str, ...]:
     """List the installed protocols."""
+    from importlib.metadata import entry_points  # here: it loads sockets and threads
+
     return tuple(sorted(point.name for point in entry_points(group=GROUP)))
 
 
 def find_protocol(name: str) -> Protocol:
     """Find an installed protocol; raise ConfigError naming the ones there are."""
+    from importlib.metadata import entry_points
+
     for point in entry_points(group=GROUP, name=name):
         protocol = point.load()
         if isinstance(protocol, Protocol):

@@ -10,9 +10,7 @@ from gateways.tcpudp.maps import TCP_BYTES, Geometry
 from gateways.tcpudp.messages import PACKETS, Packet, ServerPosition, ServerSLAMMap, encode_packet
 from gateways.tcpudp.session import RobotSession
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
-from zbridge.errors import EncodeError
-from zbridge.protocol.plugin import Send
-from zbridge.protocol.session import Datagram, Limits
+from zbridge.protocol import Datagram, EncodeError, Limits, Send
 
 _ASKING = ("1.1",)
 """Versions whose first programs have no handlers for packets that they did not ask for ("The gateway as robot")."""

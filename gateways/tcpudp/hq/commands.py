@@ -29,10 +29,9 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
 )
 from gateways.tcpudp.translate import NAME, OFF, ON
-from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Query, Raw, Scan, Switch, Text
-from zbridge.protocol.plugin import Telemetry
+from zbridge.protocol import ProtocolError, Telemetry
 
 Commands = tuple[Telemetry, ...]
 

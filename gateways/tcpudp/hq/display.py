@@ -40,13 +40,11 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.translate import NAME, OFF, ON
-from zbridge.errors import EncodeError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Map, Pose, Raw, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol.plugin import Send
-from zbridge.protocol.session import Datagram
+from zbridge.protocol import Datagram, EncodeError, Send
 
 TEXT_CHARACTERS = 1000
 MOST_SIDE = most_side(UDP_BYTES)

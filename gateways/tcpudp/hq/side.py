@@ -17,16 +17,11 @@ from gateways.tcpudp.maps import Geometry
 from gateways.tcpudp.messages import DebugMessage, Packet
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME
-from zbridge.errors import EncodeError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, Mode
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.negotiation import newest
-from zbridge.protocol.plugin import HqSide, Send, Telemetry
-from zbridge.protocol.session import Limits
-from zbridge.protocol.session_table import ClientIds
+from zbridge.protocol import ClientIds, EncodeError, HqSide, Limits, Metrics, Send, Telemetry, newest
 
 DEADMAN_S = 1.3
 """Deployed HQ programs repeat the position of their stick every 0.5 s."""

@@ -6,7 +6,7 @@ import math
 
 from gateways.wc2ec.messages import Dialect, SetValue, Wc2EcMessage
 from gateways.wc2ec.session import ControllerSession
-from zbridge.protocol.session import Limits
+from zbridge.protocol import Limits
 
 LEFT, RIGHT = "left", "right"
 """The motors of a robot that has none of its own."""

@@ -15,11 +15,10 @@ from gateways.wc2ec.hq.client import HqClient
 from gateways.wc2ec.hq.device_table import DeviceTable, ShownDevice
 from gateways.wc2ec.hq.options import HqOptions
 from gateways.wc2ec.messages import ChangeSensor, DisableSensor, EnableSensor, SetSensor, SetValue, Wc2EcMessage
-from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motor, SensorSetting
 from zbridge.fleet.view import RobotView
-from zbridge.protocol.plugin import Telemetry
+from zbridge.protocol import ProtocolError, Telemetry
 
 _MOST = 1e9
 
@@ -76,10 +75,7 @@ class Commands:
     def _drive(self, left: float, right: float) -> Drive:
         """Convert the velocities of two sides, rad/s, to a drive; both parts are scaled down if one exceeds 1."""
         wheels = self._options.wheels
-        forward = wheels.wheel_radius_m * (left + right) / 2 / wheels.speed_full_m_s
-        turn = wheels.wheel_radius_m * (right - left) / wheels.track_m / wheels.turn_full_rad_s
-        scale = max(1.0, abs(forward), abs(turn))
-        return Drive(forward=forward / scale, turn=turn / scale)
+        return wheels.drive(wheels.wheel_radius_m * left, wheels.wheel_radius_m * right)
 
     def _enable(self, session: HqClient, device: ShownDevice, message: EnableSensor) -> tuple[Telemetry, ...]:
         session.enabled.add(device.number)

@@ -15,12 +15,12 @@ import msgspec
 from gateways.wc2ec.devices import DISTANCE, LINEAR, ROTATIONAL
 from gateways.wc2ec.hq.client import LEFT, RIGHT
 from gateways.wc2ec.hq.options import HqOptions
-from gateways.wc2ec.hq.sectors import Sectors
+from gateways.wc2ec.hq.sectors import SectorSensors
 from gateways.wc2ec.messages import Dialect, RegisterSensor, write
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet.messages import Device
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Count
+from zbridge.protocol import Count
 
 NUMBERS = 255
 """Device numbers there are: 0 to 254."""
@@ -52,7 +52,7 @@ class DeviceTable:
         self,
         options: HqOptions,
         view: RobotView,
-        sectors: Sectors,
+        sectors: SectorSensors,
         registered: Callable[[], set[int]],
         unregistered: Count,
     ) -> None:
@@ -99,7 +99,7 @@ class DeviceTable:
             names = self._sectors.covered(geometry) if geometry is not None else []
             if names:
                 return names
-        return [] if self._view.readings else self._sectors.all
+        return [] if self._view.readings else self._sectors.names
 
     def _forget_gone(self, devices: Iterable[Device]) -> None:
         """Give up the numbers of devices that the robot has no longer and that no controller knows."""

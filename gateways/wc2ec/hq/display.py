@@ -11,14 +11,14 @@ from collections.abc import Iterable
 from gateways.wc2ec.devices import DISTANCE
 from gateways.wc2ec.hq.client import HqClient
 from gateways.wc2ec.hq.device_table import DeviceTable, ShownDevice
-from gateways.wc2ec.hq.sectors import Sectors
+from gateways.wc2ec.hq.sectors import SectorSensors
 from gateways.wc2ec.messages import Dialect, SensorData, write
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices, FleetMessage, Reading, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol.plugin import Send
+from zbridge.protocol import Send
 
 FAULT = -1.0
 """What a distance sensor shows when nothing is known: deployed controllers take it as a fault, while anything from
@@ -28,7 +28,7 @@ FAULT = -1.0
 class Display:
     """Shows one robot to the controllers of one listener."""
 
-    def __init__(self, dialect: Dialect, view: RobotView, table: DeviceTable, sectors: Sectors) -> None:
+    def __init__(self, dialect: Dialect, view: RobotView, table: DeviceTable, sectors: SectorSensors) -> None:
         self._dialect = dialect
         self._draft = dialect is Dialect.DRAFT
         self._view = view
@@ -89,7 +89,7 @@ class Display:
             return _shown(device, reading.value, fault=reading.fault)
         if scan is None or scan is self._scan_gone or self._view.protocol in (None, NAME):
             return None
-        nearest = self._sectors.nearest(scan).get(device.name)
+        nearest = self._sectors.values(scan).get(device.name)
         return None if nearest is None else _shown(device, nearest)
 
     def _reading(self, name: str, message: Reading) -> Send | None:
@@ -108,7 +108,7 @@ class Display:
         self._table.learn()
         if self._view.missing is not None:
             return None
-        shown = [(self._table.by_name.get(name), value) for name, value in self._sectors.nearest(scan).items()]
+        shown = [(self._table.by_name.get(name), value) for name, value in self._sectors.values(scan).items()]
         return self._data((device, _shown(device, value)) for device, value in shown if device is not None)
 
     def _data(self, values: Iterable[tuple[ShownDevice, float | None]]) -> Send | None:

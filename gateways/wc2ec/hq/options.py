@@ -7,16 +7,14 @@ from typing import Annotated, Literal
 import msgspec
 
 from gateways.wc2ec.translate import Byte, DeviceOption, Positive
-from zbridge.errors import ConfigError
+from zbridge.protocol import ConfigError, Differential
 
 
-class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The two sides of wheels that are shown of a robot without motors; the full scales are those of a drive of 1."""
+class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The two sides of wheels that are shown of a robot without motors."""
 
     wheel_radius_m: Positive = 0.05
     track_m: Positive = 0.3
-    speed_full_m_s: Positive = 0.5
-    turn_full_rad_s: Positive = 1.0
 
 
 class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

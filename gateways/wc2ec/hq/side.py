@@ -12,16 +12,14 @@ from gateways.wc2ec.hq.commands import Commands
 from gateways.wc2ec.hq.device_table import DeviceTable
 from gateways.wc2ec.hq.display import Display
 from gateways.wc2ec.hq.options import HqOptions
-from gateways.wc2ec.hq.sectors import Sectors
+from gateways.wc2ec.hq.sectors import SectorSensors
 from gateways.wc2ec.messages import MAX_FRAME, Dialect, Wc2EcMessage
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import ATTEND_S, HqSide, RobotUser, Send, Telemetry
-from zbridge.protocol.session import Limits
+from zbridge.protocol import ATTEND_S, HqSide, Limits, Metrics, RobotUser, Send, Telemetry
 
 DEADMAN_S = 0.5
 
@@ -39,7 +37,7 @@ class Wc2EcHq(HqSide):
         self._draft = self._dialect is Dialect.DRAFT
         self.follows = ("scan",) if self._draft else ("scan", "scanner", "devices", "sensor/*")
         self._sessions: list[HqClient] = []
-        sectors = Sectors(options.sectors, options.sector_unit_m)
+        sectors = SectorSensors(options.sectors, options.sector_unit_m)
         left_out = (metrics or Metrics()).count("hq_devices_left_out")
         self._table = DeviceTable(options, view, sectors, self._registered, left_out)
         self._display = Display(self._dialect, view, self._table, sectors)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).parents[1] / "docs"
-NOTHING = "–"
+NOTHING = "\u2013"
 
 Cells = dict[tuple[str, str], str]
 """What a table says of each state and input: ``action → next state``, or the action alone if the state stays."""
@@ -27,7 +27,7 @@ def documented(page: str, first: str) -> Cells:
         said, *entries = _cells(line)
         for together, entry in zip(states, entries, strict=True):
             if entry != NOTHING:
-                cells |= {(state, said): entry for state in together}
+                cells |= {(state, said): entry.removesuffix(f" → {state}") for state in together}
     return cells
 
 

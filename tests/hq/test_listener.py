@@ -783,7 +783,7 @@ async def test_what_a_client_may_not_is_told_to_the_gateway() -> None:
         told, program = Told(scene), scene.connect().greeted()
         program.say(b"go", b"go", b"go")
         await asyncio.sleep(2.0)
-        reason = "connected: let go of the stick first"
+        reason = "connected: release the stick first"
         assert told.shown() == [
             ("hq.toy.2", "drive", "neutral_first", reason, 1),
             ("hq.toy.2", "drive", "neutral_first", reason, 2),
@@ -819,7 +819,7 @@ async def test_what_the_gateway_refuses_by_itself_is_not_told_a_second_time() ->
         program.say(b"go")
         await soon()
         assert told.shown() == [
-            ("hq.toy.2", "drive", "neutral_first", "held by operator (priority 0): let go of the stick first", 1)
+            ("hq.toy.2", "drive", "neutral_first", "held by operator (priority 0): release the stick first", 1)
         ]
 
 
@@ -900,12 +900,12 @@ async def test_a_refused_client_is_told_why_and_not_all_the_time() -> None:
         for _ in range(10):
             program.say(b"go")
             await asyncio.sleep(0.02)
-        assert program.heard() == [b"! connected: let go of the stick first"]
+        assert program.heard() == [b"! connected: release the stick first"]
         assert (scene.count("hq_refused"), scene.manager.snapshots()[0].counters["refused"]) == (10, 10)
         await asyncio.sleep(TELL_S)
         program.say(b"go")
         await soon()
-        assert program.heard() == [b"! connected: let go of the stick first"]
+        assert program.heard() == [b"! connected: release the stick first"]
 
 
 @jumping
@@ -981,7 +981,7 @@ async def test_motion_that_is_not_repeated_ends_with_the_deadman_and_the_lease_f
         await asyncio.sleep(1.3)
         program.say(b"go")
         await soon()
-        assert program.heard() == [b"! deadman: let go of the stick first"]
+        assert program.heard() == [b"! deadman: release the stick first"]
         await asyncio.sleep(2.0)
         assert scene.gateway.report().holder is None
         assert scene.listener._active == set()
@@ -1303,7 +1303,7 @@ async def test_what_waited_while_the_process_stood_still_moves_nothing() -> None
             scene.skipped_s += 5.0
             await asyncio.sleep(0.05)
             assert driven(scene) == []
-            assert program.heard() == [b"! the gateway was frozen: let go of the stick first"]
+            assert program.heard() == [b"! the gateway was frozen: release the stick first"]
 
 
 # Whether the robot is there

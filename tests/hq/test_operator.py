@@ -217,7 +217,7 @@ async def test_nothing_moves_and_nothing_is_asked_before_neutral() -> None:
     scene = Scene()
     helm = scene.helm()
     for _ in range(3):
-        with pytest.raises(Refused, match="connected: let go of the stick first"):
+        with pytest.raises(Refused, match="connected: release the stick first"):
             helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert (scene.gateway.asked, scene.bus.values("fleet/r1/@cmd/**")) == ([], [])
@@ -279,7 +279,7 @@ async def test_a_robot_that_somebody_else_drives_is_refused_and_neutral_must_com
     assert scene.told == ["not driving: held by operator (priority 0)"]
     assert scene.gateway.taken() == []
     assert not helm.active
-    with pytest.raises(Refused, match=r"held by operator \(priority 0\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"held by operator \(priority 0\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert len(scene.told) == 1, "the refusal of the question itself is not told again"
@@ -350,7 +350,7 @@ async def test_a_robot_that_is_not_there_is_not_asked_for(status: Status, alive:
         helm.command(topics.CMD_DRIVE, GO)
     scene.view.note(topics.STATUS, Status(state="established", protocol="toy"))
     scene.view.alive = True
-    with pytest.raises(Refused, match=f"{reason}: let go of the stick first"):
+    with pytest.raises(Refused, match=f"{reason}: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.asked == []
 
@@ -699,7 +699,7 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
 async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -> None:
     scene = Scene()
     helm = scene.helm(needs_mode=True)
-    with pytest.raises(Refused, match="connected: let go of the stick first"):
+    with pytest.raises(Refused, match="connected: release the stick first"):
         helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     helm.command(topics.CMD_DRIVE, STAND)
     scene.view.alive = False
@@ -719,7 +719,7 @@ async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     scene.look(helm)
     await scene.settle()
     assert scene.told == ["not driving: the lease has ended (stop)"]
-    with pytest.raises(Refused, match=r"the lease has ended \(stop\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"the lease has ended \(stop\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "renew"]
@@ -827,7 +827,7 @@ async def test_the_gateway_going_away_ends_the_drive() -> None:
     helm.gateway_lost()
     helm.gateway_lost()
     assert scene.told == ["not driving: the robot's gateway is gone"]
-    with pytest.raises(Refused, match="the robot's gateway is gone: let go of the stick first"):
+    with pytest.raises(Refused, match="the robot's gateway is gone: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
 
 
@@ -958,7 +958,7 @@ async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -
     helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert scene.told == ["drive: busy: map: send a neutral drive first"]
-    with pytest.raises(Refused, match="motion was refused: let go of the stick first"):
+    with pytest.raises(Refused, match="motion was refused: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_DRIVE, GO)
@@ -1030,7 +1030,7 @@ async def test_one_motor_at_rest_is_no_neutral_while_another_is_still_set() -> N
     scene.gateway.taken()
     for _ in range(10):
         scene.now += REPEAT_S
-        with pytest.raises(Refused, match="let go of the stick first"):
+        with pytest.raises(Refused, match="release the stick first"):
             helm.command(LEFT, Motor(value=5.0))
         helm.command(RIGHT, Motor(value=0.0))
         helm.tick()

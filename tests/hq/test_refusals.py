@@ -49,7 +49,7 @@ class Scene:
 async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reason() -> None:
     scene = Scene()
     scene.serve()
-    scene.reports.note("hq.desk.3", "drive", NeutralFirst("connected: let go of the stick first"))
+    scene.reports.note("hq.desk.3", "drive", NeutralFirst("connected: release the stick first"))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     ((_, told),) = scene.told
@@ -58,7 +58,7 @@ async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reaso
             "who": "hq.desk.3",
             "command": "drive",
             "code": "neutral_first",
-            "reason": "connected: let go of the stick first",
+            "reason": "connected: release the stick first",
             "count": 1,
             "by": None,
         }

@@ -1258,7 +1258,7 @@ def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> 
     listener, client = captured(name)
     assert listener.deadman_s == 1.3
     intent = intent_of(listener)
-    owed = "connected: let go of the stick first"
+    owed = "connected: release the stick first"
     assert carry_out(intent, replay(listener, client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
     again = replay(listener, client, name, late=10.0)
     assert carry_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]

@@ -24,7 +24,8 @@ from zbridge.bus import BusSettings
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
-from zbridge.hq.settings import HqSettings, ListenerPlan, Network
+from zbridge.hq import HqSettings, ListenerPlan
+from zbridge.hq.settings import Network
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 

@@ -30,8 +30,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
-from zbridge.hq.listener import Listener
-from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device

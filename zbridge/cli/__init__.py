@@ -16,8 +16,7 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, NoReturn
 
-from zbridge.app.config import load
-from zbridge.app.gateway import Gateway, until_signal
+from zbridge.app import Gateway, load, until_signal
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.text import shown
 

@@ -9,9 +9,7 @@ from typing import Annotated
 import typer
 
 from zbridge.address import Address, parse_device_address
-from zbridge.app.config import load
-from zbridge.app.gateway import until_signal
-from zbridge.app.templates import listener_template, robot_template
+from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
 from zbridge.fleet.topics import is_name

@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from zbridge.app.gateway import until_signal
+from zbridge.app import until_signal
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot

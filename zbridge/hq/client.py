@@ -207,7 +207,7 @@ class Client:
     # The session
 
     def _on_session(self) -> None:
-        """Begin with a client whose handshake is done; let go of the robot for one whose session is over."""
+        """Begin with a client whose handshake is done; give the robot back for a client whose session is over."""
         context = self._context
         if self.session.state is State.ESTABLISHED and not self.begun:
             self.begun = True

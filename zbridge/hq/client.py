@@ -100,7 +100,7 @@ class Client:
             self.send(lambda session, now: self._context.side.tell(session, text, now))
 
     def tick(self) -> None:
-        """Let the side and the operator repeat and renew; called every ``REPEAT_S`` while the operator is active."""
+        """Let the side and the operator repeat and renew; called every ``ATTEND_S`` while the operator is active."""
         if self.operator.intent.held:
             self._context.side.attend(self)
         self.operator.tick()

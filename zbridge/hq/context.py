@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import msgspec
 
+from zbridge.hq.bridge import Bridge
 from zbridge.hq.freeze import FreezeWatch
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
-from zbridge.hq.operator import Bridge
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings
 from zbridge.hq.tasks import Tasks

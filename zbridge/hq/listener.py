@@ -13,18 +13,19 @@ import logging
 from collections.abc import Callable
 
 from zbridge.hq.admission import FULL, Admission
+from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
 from zbridge.hq.client import SWEEP_S, Client
 from zbridge.hq.context import ListenerContext, listener_counts
 from zbridge.hq.freeze import FROZEN, FreezeWatch
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
-from zbridge.hq.operator import REPEAT_S, Bridge
 from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
 from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Metrics
+from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits
 from zbridge.protocol.session_table import SessionTable
 from zbridge.transport.conversation import Accepted, Conversation
@@ -117,7 +118,7 @@ class Listener:
         freeze, sweep_at = self._context.freeze, self._clock() + SWEEP_S
         freeze.begin(self._clock())
         while True:
-            await asyncio.sleep(REPEAT_S)
+            await asyncio.sleep(ATTEND_S)
             freeze.beat(self._clock())
             for client in tuple(self._active):
                 client.tick()

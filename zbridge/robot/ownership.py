@@ -96,7 +96,7 @@ class Input(StrEnum):
 
 
 class Ownership:
-    """The right to be a robot's gateway: from the end of :meth:`take` to :meth:`release` or the end of :meth:`watch`."""
+    """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`."""
 
     def __init__(self, bus: Bus, keys: KeySpace, clock: Callable[[], float] = time.monotonic) -> None:
         self._bus = bus

@@ -321,7 +321,7 @@ class HqSession(_TcpUdpSession):
         features = self._announce if udp else self._announce - {Feature.UDP}
         self.send_first(ClientSettings(answer, announced(answer, features)))
         if udp:
-            self._limit_at = math.inf
+            self.lift_limit()
             self._start.begin(now)
         else:
             self._finish(now)
@@ -581,7 +581,7 @@ class RobotSession(_TcpUdpSession):
         row = newest((agreed,), known=VERSIONS)
         self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
         if self.settings.udp and self.client.udp:
-            self._limit_at = math.inf
+            self.lift_limit()
             self.send_first(ServerStartUDP())
             self._probe.begin(now)
             self._heard_until = now + PROBE_S

@@ -73,7 +73,7 @@ class ExternalSession(Wc2EcSession):
     def accept(self, message: Wc2EcMessage, now: float) -> bool:
         if self.state is State.HANDSHAKING:
             if isinstance(message, RegisterSensor):
-                self._limit_at = math.inf
+                self.lift_limit()
                 self._settled_at = now + SETTLE_S
             elif isinstance(message, SensorData):
                 self._settle()

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.bus import Bus, Handle, Publisher, Question
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
@@ -34,7 +34,7 @@ from zbridge.robot.commands import LINK_BLOCKED, Commands
 from zbridge.robot.connection import Connect, Connection, Hooks
 from zbridge.robot.names import NAMES, NameBudget
 from zbridge.robot.pending_queries import PendingQueries
-from zbridge.transport.tcp import connect
+from zbridge.transport.connect import connect
 
 log = logging.getLogger("zbridge.robot.device")
 
@@ -56,7 +56,7 @@ class Device:
     def __init__(
         self,
         robot: Robot,
-        addresses: tuple[Address, ...],
+        addresses: tuple[DeviceAddress, ...],
         *,
         protocol: str,
         keys: KeySpace,

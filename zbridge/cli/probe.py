@@ -62,7 +62,7 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
     """Shake hands with the device, say what was agreed, and leave."""
     loop = asyncio.get_running_loop()
     robot = protocol.robot(protocol.options(), 1, Metrics())
-    session = robot.session(0, str(address))
+    session = robot.session(robot.link_names[0], str(address))
     settled = asyncio.Event()
 
     def changed() -> None:

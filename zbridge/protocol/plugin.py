@@ -19,6 +19,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
 
 GROUP = "zbridge.protocols"
@@ -219,6 +220,8 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """The commented ``[device]`` table of a configuration, ``[device.options]`` with it."""
+    codecs: Callable[[], tuple[Codec, ...]] | None = None
+    """``codecs()``: the messages, for the conformance kit."""
     hq_template: str = ""
     """What a commented ``[[hq]]`` table says of this protocol: ``protocol``, ``listen`` and ``[hq.options]``."""
 

@@ -1,90 +1,68 @@
-"""The lines of the protocol: a letter and integers, separated by commas. Sans-IO.
-
-An answer begins with the letter of its request in lower case.
-"""
+"""The lines of the protocol: a letter and integers. An answer has the letter of its request in lower case."""
 
 from __future__ import annotations
 
-import re
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-import msgspec
-
-from zbridge.errors import EncodeError, ProtocolError
 from zbridge.protocol.codec import Codec
+from zbridge.wire import I32, U8, Line, Lines, Scalar, Whole
 
-LINE_BYTES = 128
-"""Bytes of the longest line that is taken."""
-
-Wheel = Annotated[int, msgspec.Meta(ge=-127, le=127)]
+Wheel = Annotated[int, Scalar("h"), Whole(-127, 127)]
 """The speed of a wheel: 1 is 8 mm/s."""
-Pulses = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
-"""What a wheel has turned: 1 is 0.08 mm on the ground."""
-Light = Annotated[int, msgspec.Meta(ge=0, le=1023)]
+Light = Annotated[int, Scalar("H"), Whole(0, 1023)]
 """Reflected light: the nearer an obstacle, the more."""
-Count = Annotated[int, msgspec.Meta(ge=0, le=255)]
-
-
-class Line(msgspec.Struct, frozen=True):
-    """One message: the letter is the class's, the integers are the fields in their order."""
-
-    letter: ClassVar[bytes]
-
-
-class SetSpeeds(Line, frozen=True):
-    letter = b"D"
-    left: Wheel
-    right: Wheel
-
-
-class ReadSpeeds(Line, frozen=True):
-    letter = b"E"
-
-
-class ReadPositions(Line, frozen=True):
-    letter = b"H"
-
-
-class SetLed(Line, frozen=True):
-    """action: 0 off, 1 on, 2 change."""
-
-    letter = b"L"
-    number: Count
-    action: Annotated[int, msgspec.Meta(ge=0, le=2)]
-
-
-class ReadProximity(Line, frozen=True):
-    letter = b"N"
 
 
 class ReadVersion(Line, frozen=True):
-    letter = b"B"
+    word = b"B"
 
 
-class SpeedsSet(Line, frozen=True):
-    letter = b"d"
+class Version(Line, frozen=True):
+    word = b"b"
+    major: U8
+    minor: U8
 
 
-class Speeds(Line, frozen=True):
-    letter = b"e"
+class SetSpeeds(Line, frozen=True):
+    word = b"D"
     left: Wheel
     right: Wheel
 
 
+class SpeedsSet(Line, frozen=True):
+    word = b"d"
+
+
+class ReadSpeeds(Line, frozen=True):
+    word = b"E"
+
+
+class Speeds(Line, frozen=True):
+    word = b"e"
+    left: Wheel
+    right: Wheel
+
+
+class ReadPositions(Line, frozen=True):
+    word = b"H"
+
+
 class Positions(Line, frozen=True):
-    letter = b"h"
-    left: Pulses
-    right: Pulses
+    """What the wheels have turned: 1 is 0.08 mm on the ground."""
+
+    word = b"h"
+    left: I32
+    right: I32
 
 
-class LedSet(Line, frozen=True):
-    letter = b"l"
+class ReadProximity(Line, frozen=True):
+    word = b"N"
 
 
 class Proximity(Line, frozen=True):
     """The eight sensors, counter-clockwise from the right of the back."""
 
-    letter = b"n"
+    word = b"n"
     back_right: Light
     right: Light
     front_right: Light
@@ -95,48 +73,23 @@ class Proximity(Line, frozen=True):
     back_left: Light
 
 
-class Version(Line, frozen=True):
-    letter = b"b"
-    major: Count
-    minor: Count
+class SetLed(Line, frozen=True):
+    """action: 0 off, 1 on, 2 change."""
+
+    word = b"L"
+    number: U8
+    action: U8
 
 
-REQUESTS: tuple[type[Line], ...] = (SetSpeeds, ReadSpeeds, ReadPositions, SetLed, ReadProximity, ReadVersion)
-ANSWERS: tuple[type[Line], ...] = (SpeedsSet, Speeds, Positions, LedSet, Proximity, Version)
-_CLASSES = {declared.letter: declared for declared in (*REQUESTS, *ANSWERS)}
-_INTEGER = re.compile(rb"-?[0-9]{1,10}")
+class LedSet(Line, frozen=True):
+    word = b"l"
 
 
-def line_end(data: bytes, start: int) -> int:
-    """Find where the line that begins at ``start`` ends; behind the data where its end has not come yet."""
-    found = data.find(b"\n", start)
-    return found + 1 if found >= 0 else len(data) + 1
-
-
-def read(line: bytes) -> Line:
-    """Read one line; raise ProtocolError where it is none of the messages above."""
-    letter, *numbers = line.rstrip(b"\r\n").split(b",")
-    declared = _CLASSES.get(letter)
-    if declared is None:
-        raise ProtocolError(f"{line[:LINE_BYTES]!r} begins no message")
-    names = declared.__struct_fields__
-    if len(numbers) != len(names) or not all(map(_INTEGER.fullmatch, numbers)):
-        raise ProtocolError(f"{line[:LINE_BYTES]!r}: expected {len(names)} integers")
-    try:
-        return msgspec.convert(dict(zip(names, map(int, numbers), strict=True)), declared)
-    except msgspec.ValidationError as error:
-        raise ProtocolError(f"{line[:LINE_BYTES]!r}: {error}") from error
-
-
-def write(message: Line) -> bytes:
-    """Write one line; raise EncodeError where a number is out of its range."""
-    try:
-        msgspec.convert(msgspec.structs.asdict(message), type(message))
-    except msgspec.ValidationError as error:
-        raise EncodeError(f"{message}: {error}") from error
-    return b",".join((message.letter, *(b"%d" % number for number in msgspec.structs.astuple(message)))) + b"\n"
+REQUESTS = (ReadVersion, SetSpeeds, ReadSpeeds, ReadPositions, ReadProximity, SetLed)
+ANSWERS = (Version, SpeedsSet, Speeds, Positions, Proximity, LedSet)
+LINES: Lines[Line] = Lines((*REQUESTS, *ANSWERS))
 
 
 def codecs() -> tuple[Codec, ...]:
     """List the messages for the conformance kit."""
-    return (Codec("lines", write, read, line_end, (*REQUESTS, *ANSWERS)),)
+    return (Codec("lines", LINES.write, LINES.read, LINES.end, (*REQUESTS, *ANSWERS)),)

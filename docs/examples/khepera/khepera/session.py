@@ -1,25 +1,13 @@
-"""The conversation with a Khepera: one request at a time, the version first, then polls at 20 Hz. Sans-IO."""
+"""The conversation: one request at a time, the version first, then polls at 20 Hz. Sans-IO."""
 
 from __future__ import annotations
 
-from khepera.messages import (
-    LINE_BYTES,
-    Line,
-    ReadPositions,
-    ReadProximity,
-    ReadSpeeds,
-    ReadVersion,
-    Version,
-    line_end,
-    read,
-    write,
-)
+from khepera.messages import LINES, Line, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
 from zbridge.protocol.exchange import ExchangeSession
 from zbridge.protocol.session import Limits, Role
 
 POLL_S = 0.05
 VERSION_S = 0.5
-"""Seconds after which a robot that does not answer is asked for its version again."""
 _POLLS = {"positions": ReadPositions(), "speeds": ReadSpeeds(), "proximity": ReadProximity()}
 
 
@@ -27,20 +15,20 @@ class KheperaSession(ExchangeSession[Line]):
     """We ask, the robot answers."""
 
     role = Role.HQ
-    frame_end = staticmethod(line_end)
+    frame_end = staticmethod(LINES.end)
     answer_s = 0.1
 
     def __init__(self) -> None:
-        super().__init__(Limits(frame_bytes=LINE_BYTES, handshake_s=5.0))
+        super().__init__(Limits(frame_bytes=128, handshake_s=5.0))
 
     def encode(self, message: Line) -> bytes:
-        return write(message)
+        return LINES.write(message)
 
     def read(self, frame: bytes) -> Line:
-        return read(frame)
+        return LINES.read(frame)
 
     def answers(self, request: bytes, message: Line) -> bool:
-        return message.letter == request[:1].lower()
+        return message.word == request[:1].lower()
 
     def opened(self, now: float) -> None:
         self.poll("version", ReadVersion(), now, VERSION_S)

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from khepera.messages import Line, Positions, Proximity, SetLed, SetSpeeds, Speeds
+from khepera.messages import Positions, Proximity, SetLed, SetSpeeds, Speeds
 from khepera.session import KheperaSession
 from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import topics
@@ -61,7 +61,7 @@ class KheperaRobot(Robot):
     def driving(self) -> KheperaSession | None:
         return self._session
 
-    def session(self, link: int, peer: str) -> KheperaSession:
+    def session(self, link: str, peer: str) -> KheperaSession:
         self._session = KheperaSession()
         self._pulses = None
         return self._session

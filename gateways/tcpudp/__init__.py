@@ -105,6 +105,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
-    codecs=codecs,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

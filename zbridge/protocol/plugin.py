@@ -220,8 +220,8 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """The commented ``[device]`` table of a configuration, ``[device.options]`` with it."""
-    codecs: Callable[[], tuple[Codec, ...]] | None = None
-    """``codecs()``: the messages, for the conformance kit."""
+    codecs: tuple[Codec, ...] = ()
+    """The messages, for the conformance kit."""
     hq_template: str = ""
     """What a commented ``[[hq]]`` table says of this protocol: ``protocol``, ``listen`` and ``[hq.options]``."""
 

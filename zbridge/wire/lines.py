@@ -31,7 +31,8 @@ class Lines(Generic[L]):
     """Reads and writes the lines of a protocol, given its messages."""
 
     def __init__(self, messages: Iterable[type[L]], separator: bytes = b",") -> None:
-        self._codecs = {message.word: TextCodec(message) for message in messages}
+        self.messages = tuple(messages)
+        self._codecs = {message.word: TextCodec(message) for message in self.messages}
         self._separator = separator
 
     @staticmethod

@@ -1,10 +1,7 @@
 """The lines of the protocol: a letter and integers. An answer has the letter of its request in lower case."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
-from zbridge.protocol.codec import Codec
 from zbridge.wire import I32, U8, Line, Lines, Scalar, Whole
 
 Wheel = Annotated[int, Scalar("h"), Whole(-127, 127)]
@@ -88,8 +85,3 @@ class LedSet(Line, frozen=True):
 REQUESTS = (ReadVersion, SetSpeeds, ReadSpeeds, ReadPositions, ReadProximity, SetLed)
 ANSWERS = (Version, SpeedsSet, Speeds, Positions, Proximity, LedSet)
 LINES: Lines[Line] = Lines((*REQUESTS, *ANSWERS))
-
-
-def codecs() -> tuple[Codec, ...]:
-    """List the messages for the conformance kit."""
-    return (Codec("lines", LINES.write, LINES.read, LINES.end, (*REQUESTS, *ANSWERS)),)

@@ -1,10 +1,8 @@
 """The conversation: one request at a time, the version first, then polls at 20 Hz. Sans-IO."""
 
-from __future__ import annotations
-
 from khepera.messages import LINES, Line, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
 from zbridge.protocol.exchange import ExchangeSession
-from zbridge.protocol.session import Limits, Role
+from zbridge.protocol.session import Role
 
 POLL_S = 0.05
 VERSION_S = 0.5
@@ -17,9 +15,6 @@ class KheperaSession(ExchangeSession[Line]):
     role = Role.HQ
     frame_end = staticmethod(LINES.end)
     answer_s = 0.1
-
-    def __init__(self) -> None:
-        super().__init__(Limits(frame_bytes=128, handshake_s=5.0))
 
     def encode(self, message: Line) -> bytes:
         return LINES.write(message)

@@ -1,11 +1,6 @@
 """Between Khepera lines and fleet messages, and one Khepera as a robot. Sans-IO."""
 
-from __future__ import annotations
-
-import math
-from collections.abc import Callable
-from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,35 +9,28 @@ from khepera.messages import Positions, Proximity, SetLed, SetSpeeds, Speeds
 from khepera.session import KheperaSession
 from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Pose, Reading, Scan, Switch
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Switch
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.bearings import BearingScan
+from zbridge.protocol.kinematics import Differential, Positive
+from zbridge.protocol.odometry import Odometry
 from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol.session import Limits
 
-UNIT_M_S = 0.008
-"""One unit of a wheel's speed."""
+UNIT_M_S, MOST_UNITS = 0.008, 127
 PULSE_M = 0.00008
-"""One pulse of a wheel's counter."""
-MOST_UNITS = 127
-DRIVE_AGAIN_S = 0.5
-STOP_AGAIN_S = 0.1
-BEARINGS_DEG = np.array([-150, -85, -45, -15, 15, 45, 85, 150])
-"""Where the sensors look, counter-clockwise from straight ahead; in the order of :class:`Proximity`."""
-STEP_DEG = 5
+AGAIN_S, STOP_AGAIN_S = 0.5, 0.1
+LINE_BYTES = 128
+BEARINGS_DEG = dict(zip(Proximity.__struct_fields__, (-150, -85, -45, -15, 15, 45, 85, 150), strict=True))
 RANGE_M = (0.005, 0.06)
-"""What the sensors see: nothing farther than 6 cm."""
-LIGHT = np.array([20.0, 60.0, 150.0, 350.0, 700.0, 1023.0])
-DISTANCE_M = np.array([0.06, 0.05, 0.035, 0.02, 0.01, 0.005])
-"""The distance of an obstacle at each value of LIGHT."""
-
-Positive = Annotated[float, msgspec.Meta(gt=0, le=100)]
+LIGHT, DISTANCE_M = [20, 60, 150, 350, 700, 1023], [0.06, 0.05, 0.035, 0.02, 0.01, 0.005]
+"""How far an obstacle is at each value of a sensor."""
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Options(Differential, frozen=True, kw_only=True):
     """``[device.options]``; the template of ``zbridge init`` explains each."""
 
-    speed_full_m_s: Positive = 0.5
-    turn_full_rad_s: Positive = 3.0
     track_m: Positive = 0.053
 
 
@@ -54,81 +42,62 @@ class KheperaRobot(Robot):
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options
         self._session: KheperaSession | None = None
-        self._x = self._y = self._heading = 0.0
-        self._pulses: tuple[int, int] | None = None
+        self._scan = BearingScan(BEARINGS_DEG, RANGE_M)
+        self._odometry = Odometry(options.track_m)
+
+    def session(self, link: str, peer: str) -> KheperaSession:
+        self._session = KheperaSession(Limits(frame_bytes=LINE_BYTES, handshake_s=5.0))
+        self._odometry.restart()
+        return self._session
 
     @property
     def driving(self) -> KheperaSession | None:
         return self._session
 
-    def session(self, link: str, peer: str) -> KheperaSession:
-        self._session = KheperaSession()
-        self._pulses = None
-        return self._session
-
-    # Messages to telemetry
+    # What the robot sends
 
     def translator(self, kind: type) -> Translate:
-        return partial(_TELEMETRY.get(kind, _nothing), self)
+        found: dict[type, Translate] = {Positions: self._pose, Speeds: self._motion, Proximity: self._ring}
+        return found.get(kind, lambda message, stamp_ns: ())
 
     def _pose(self, message: Positions, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Add what the wheels have turned since the last answer to the pose."""
-        before, self._pulses = self._pulses or (message.left, message.right), (message.left, message.right)
-        left_m, right_m = ((new - old) * PULSE_M for new, old in zip(self._pulses, before, strict=True))
-        way_m, turned = (left_m + right_m) / 2, (right_m - left_m) / self.options.track_m
-        self._x += way_m * math.cos(self._heading + turned / 2)
-        self._y += way_m * math.sin(self._heading + turned / 2)
-        self._heading = math.remainder(self._heading + turned, 2 * math.pi)
-        return ((topics.POSE, Pose(self._x, self._y, self._heading, stamp_ns=stamp_ns)),)
+        pose = self._odometry.sides(message.left * PULSE_M, message.right * PULSE_M, stamp_ns)
+        return ((topics.POSE, pose),)
 
     def _motion(self, message: Speeds, stamp_ns: int) -> tuple[Telemetry, ...]:
-        speed = (message.left + message.right) / 2 * UNIT_M_S / self.options.speed_full_m_s
-        turn_rad_s = (message.right - message.left) * UNIT_M_S / self.options.track_m
-        motion = Motion(speed=max(-1.0, min(1.0, speed)), gyro=(0.0, 0.0, turn_rad_s), stamp_ns=stamp_ns)
-        return ((topics.MOTION, motion),)
+        speed = self.options.drive(message.left * UNIT_M_S, message.right * UNIT_M_S).forward
+        return ((topics.MOTION, Motion(speed=speed, stamp_ns=stamp_ns)),)
 
-    def _scan(self, message: Proximity, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Show the sensors one by one and, as metres at their bearings, as a scan."""
-        values = msgspec.structs.asdict(message)
-        metres = np.interp(list(values.values()), LIGHT, DISTANCE_M, left=np.nan)
-        ranges = np.full((BEARINGS_DEG[-1] - BEARINGS_DEG[0]) // STEP_DEG + 1, np.nan, np.float32)
-        ranges[(BEARINGS_DEG - BEARINGS_DEG[0]) // STEP_DEG] = metres
-        scan = Scan(math.radians(BEARINGS_DEG[0]), math.radians(STEP_DEG), *RANGE_M, ranges, stamp_ns=stamp_ns)
-        readings = (
-            (topics.SENSOR(name), Reading(float(value), kind="proximity", stamp_ns=stamp_ns))
-            for name, value in values.items()
-        )
-        return ((topics.SCAN, scan), *readings)
+    def _ring(self, message: Proximity, stamp_ns: int) -> tuple[Telemetry, ...]:
+        scan = None
+        for name, light in msgspec.structs.asdict(message).items():
+            scan = self._scan.take(name, float(np.interp(light, LIGHT, DISTANCE_M, left=np.nan)), stamp_ns)
+        return ((topics.SCAN, scan),) if scan is not None else ()
 
-    # Commands to messages
+    # What the robot is told
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         if isinstance(command, Drive):
-            return self._drive(command, now)
-        if topic is topics.CMD_LIGHT and isinstance(command, Switch):
-            self._connected().send(SetLed(0, int(command.on)))
-            return Outcome()
-        raise Unsupported("a Khepera has no such command")
-
-    def _drive(self, command: Drive, now: float) -> Outcome:
-        if command.left and not (command.forward or command.turn):
-            raise Unsupported("left: a robot with two wheels does not move sideways")
-        session, options = self._connected(), self.options
-        along = command.forward * options.speed_full_m_s
-        across = command.turn * options.turn_full_rad_s * options.track_m / 2
-        speeds = SetSpeeds(_units(along - across), _units(along + across))
-        session.outbox.stand("drive", (session.encode(speeds),), now, period_s=DRIVE_AGAIN_S)
-        if command.light is not None:
-            session.send(SetLed(0, int(command.light)))
-        return Outcome(left_out="left: a robot with two wheels does not move sideways" if command.left else None)
+            left_m_s, right_m_s = self.options.sides_m_s(command)
+            self._drive(SetSpeeds(_units(left_m_s), _units(right_m_s)), now, period_s=AGAIN_S)
+            light, left_out = command.light, "left: it does not move sideways" if command.left else None
+        elif topic is topics.CMD_LIGHT and isinstance(command, Switch):
+            light, left_out = command.on, None
+        else:
+            raise Unsupported(f"a Khepera has no {topic.path}")
+        if light is not None:
+            self._connected().send(SetLed(0, int(light)))
+        return Outcome(left_out=left_out)
 
     def stop(self, now: float, until: float) -> None:
-        session = self._connected()
-        frames = (session.encode(SetSpeeds(0, 0)),)
-        session.outbox.stand("drive", frames, now, period_s=STOP_AGAIN_S, until=until, urgent=True)
+        self._drive(SetSpeeds(0, 0), now, period_s=STOP_AGAIN_S, until=until, urgent=True)
 
     def ask(self, topic: Topic) -> None:
-        raise Unsupported(f"a Khepera cannot be asked for its {topic.path}: it shows what it has")
+        raise Unsupported(f"a Khepera cannot be asked for its {topic.path}")
+
+    def _drive(self, speeds: SetSpeeds, now: float, **how: Any) -> None:
+        session = self._connected()
+        session.outbox.stand("drive", (session.encode(speeds),), now, **how)
 
     def _connected(self) -> KheperaSession:
         if self._session is None or self._session.over:
@@ -138,14 +107,3 @@ class KheperaRobot(Robot):
 
 def _units(speed_m_s: float) -> int:
     return max(-MOST_UNITS, min(MOST_UNITS, round(speed_m_s / UNIT_M_S)))
-
-
-def _nothing(robot: KheperaRobot, message: Line, stamp_ns: int) -> tuple[Telemetry, ...]:
-    return ()
-
-
-_TELEMETRY: dict[type, Callable[[KheperaRobot, Any, int], tuple[Telemetry, ...]]] = {
-    Positions: KheperaRobot._pose,
-    Speeds: KheperaRobot._motion,
-    Proximity: KheperaRobot._scan,
-}

@@ -27,7 +27,7 @@ from gateways.wc2ec.messages import (
     write,
 )
 from gateways.wc2ec.session import ControllerSession
-from gateways.wc2ec.translate import NAME, Byte, DeviceOption, Positive
+from gateways.wc2ec.translate import NAME, Byte, DeviceOption
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Device,
@@ -43,7 +43,18 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import ConfigError, Differential, HqSide, Limits, Metrics, ProtocolError, Sectors, Send, Telemetry
+from zbridge.protocol import (
+    ConfigError,
+    Differential,
+    HqSide,
+    Limits,
+    Metrics,
+    Positive,
+    ProtocolError,
+    Sectors,
+    Send,
+    Telemetry,
+)
 
 DEADMAN_S = 0.5
 NUMBERS = 255

@@ -49,6 +49,7 @@ from zbridge.protocol import (
     Metrics,
     NotReady,
     Outcome,
+    Positive,
     ProtocolError,
     Robot,
     Telemetry,
@@ -60,7 +61,6 @@ NAME = "wc2ec"
 STOP_REPEAT_S = 0.1
 
 Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
-Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Bearing = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 

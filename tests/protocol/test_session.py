@@ -305,6 +305,7 @@ def test_the_snapshot_does_not_change_with_the_session(established: Toy) -> None
         "foreign": 0,
         "dropped": 0,
         "refused": 0,
+        "unanswered": 0,
     }
     assert shown.left_out == {"wings (7)": 2}
 

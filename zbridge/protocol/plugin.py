@@ -18,6 +18,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
 
 GROUP = "zbridge.protocols"
@@ -218,6 +219,8 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """The commented ``[device]`` table of a configuration, ``[device.options]`` with it."""
+    codecs: tuple[Codec, ...] = ()
+    """The messages, for the conformance kit."""
     hq_template: str = ""
     """What a commented ``[[hq]]`` table says of this protocol: ``protocol``, ``listen`` and ``[hq.options]``."""
 

@@ -37,3 +37,5 @@ class Traffic(msgspec.Struct):
     """Frames that found no place in the queue."""
     refused: int = 0
     """Commands of the peer that were not carried out."""
+    unanswered: int = 0
+    """Requests that the peer did not answer in time."""

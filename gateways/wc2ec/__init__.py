@@ -1,8 +1,8 @@
 """WC2EC: Webots robots, by the controller program of the simulation, in the field's dialect or the document's.
 
 ``messages`` declares the messages of both dialects; ``devices`` is the table of a robot's devices; ``session`` holds
-the conversation in both roles; ``settings`` and ``translate`` are the device side, ``hq`` the HQ side. ``simulator`` is a
-simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
+the conversation in both roles; ``settings`` and ``translate`` are the device side, ``hq`` the HQ side. ``simulator`` is
+a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
 """
 
 from __future__ import annotations

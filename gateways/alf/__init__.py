@@ -10,9 +10,7 @@ from __future__ import annotations
 from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import Dialect, codecs
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
 

@@ -27,14 +27,11 @@ from gateways.alf.messages import (
 )
 from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
-from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import HqSide, Send, Telemetry
-from zbridge.protocol.session import Limits
+from zbridge.protocol import EncodeError, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
 """Deployed HQ programs repeat their command every 20 ms."""

@@ -15,8 +15,7 @@ from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
-from zbridge.protocol.codec import Codec
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import (
     F32,
     I32,

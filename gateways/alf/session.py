@@ -28,8 +28,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from zbridge.errors import Code, NotReady, ProtocolError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import Code, Limits, NotReady, ProtocolError, Role, Session, State
 
 REPEAT_S = 0.02
 """Seconds between repetitions of the drive command."""

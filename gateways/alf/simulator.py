@@ -18,9 +18,7 @@ import numpy as np
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleSession
 from gateways.alf.translate import DRIVE, LASER
-from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import State
+from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Accepted, Conversation
 from zbridge.transport.link import Link, Receiver

@@ -12,9 +12,7 @@ from gateways.tcpudp.messages import codecs
 from gateways.tcpudp.settings import HQ_BLOCKS
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]

@@ -15,8 +15,7 @@ from typing import ClassVar, TypeVar
 import msgspec
 
 from gateways.tcpudp.settings import Feature
-from zbridge.errors import EncodeError, ProtocolError
-from zbridge.protocol.codec import Codec
+from zbridge.protocol import Codec, EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64

@@ -38,12 +38,21 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.errors import Malformed, NotReady, ProtocolError, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    Malformed,
+    Metrics,
+    NotReady,
+    Outcome,
+    ProtocolError,
+    Refused,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "tcpudp"
 ON, OFF = 1, 2

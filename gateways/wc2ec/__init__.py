@@ -11,9 +11,7 @@ from __future__ import annotations
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect, codecs
 from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]

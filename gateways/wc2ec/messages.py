@@ -15,8 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from zbridge.errors import ProtocolError
-from zbridge.protocol.codec import Codec
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import F64, U8, BinaryCodec, Message
 from zbridge.wire.fields import CountedBytes, Filling
 from zbridge.wire.frames import FrameEnd

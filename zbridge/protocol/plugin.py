@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from importlib.metadata import entry_points
 from typing import Any, ClassVar
 
 import msgspec
@@ -228,11 +227,15 @@ class Protocol(msgspec.Struct, frozen=True):
 
 def protocol_names() -> tuple[str, ...]:
     """List the installed protocols."""
+    from importlib.metadata import entry_points  # here: it loads sockets and threads
+
     return tuple(sorted(point.name for point in entry_points(group=GROUP)))
 
 
 def find_protocol(name: str) -> Protocol:
     """Find an installed protocol; raise ConfigError naming the ones there are."""
+    from importlib.metadata import entry_points
+
     for point in entry_points(group=GROUP, name=name):
         protocol = point.load()
         if isinstance(protocol, Protocol):

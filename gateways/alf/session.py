@@ -135,7 +135,7 @@ class HqSession(AlfSession):
         """Send a command at once, and again every 20 ms until the next one."""
         if self.over:
             raise NotReady("closing", Code.CLOSING)
-        self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
+        self.outbox.set(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
 class VehicleSession(AlfSession):

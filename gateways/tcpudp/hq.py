@@ -131,7 +131,7 @@ class HqClient(RobotSession):
     def show(self, slot: str, packet_id: int, frame: bytes, now: float) -> None:
         """Let a frame stand until it is written, the newest of its slot, if the client knows the packet."""
         if packet_id in self.known:
-            self.outbox.stand(slot, (frame,), now)
+            self.outbox.set(slot, (frame,), now)
         else:
             self.leave_out(packet_id)
 

@@ -351,7 +351,7 @@ class Wc2EcHq(HqSide):
         if device.number not in session.registered:
             self._register(session, now)
         if not self._draft or device.number in session.enabled:
-            session.outbox.stand(f"sensor {device.number}", (frame,), now)
+            session.outbox.set(f"sensor {device.number}", (frame,), now)
 
     # What controllers command
 

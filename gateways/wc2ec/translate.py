@@ -185,7 +185,7 @@ class Wc2EcRobot(Robot):
             devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
             frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
             if frames:
-                session.outbox.stand("enable", frames, -math.inf)
+                session.outbox.set("enable", frames, -math.inf)
             return ((topics.DEVICES, self._table.message(stamp_ns)),)
         return ()
 
@@ -308,7 +308,7 @@ class Wc2EcRobot(Robot):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
         frame = session.encode(SetValue(device.type, device.number, value))
-        session.outbox.stand(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
+        session.outbox.set(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
 
     def _motor(self, name: str, value: float, now: float) -> None:
         device = self._table.named(name)

@@ -195,8 +195,8 @@ def test_a_stop_goes_before_all_that_waits_and_replaces_the_motion(asker: Asker)
     for number in range(60):
         asker.send(Line(f"L,{number}"))
     asker.poll("position", Line("H"), 1.0, 0.05)
-    asker.outbox.stand("drive", (b"D,9,9\n",), 1.0)
-    asker.outbox.stand("drive", (b"D,0,0\n",), 1.0, until=1.0, urgent=True)
+    asker.outbox.set("drive", (b"D,9,9\n",), 1.0)
+    asker.outbox.set("drive", (b"D,0,0\n",), 1.0, until=1.0, urgent=True)
     taken = [frame for _, frame in run(asker, 1.0, 3.0, b"")]
     assert taken[0] == b"D,0,0\n"
     assert b"D,9,9\n" not in taken
@@ -207,7 +207,7 @@ def test_a_stop_waits_for_one_answer_at_most(asker: Asker) -> None:
     asker.send(Line("H"))
     asker.send(Line("N"))
     asker.outgoing(1.0)
-    asker.outbox.stand("drive", (b"D,0,0\n",), 1.05, until=1.05, urgent=True)
+    asker.outbox.set("drive", (b"D,0,0\n",), 1.05, until=1.05, urgent=True)
     assert asker.outgoing(1.05) is None
     asker.expire(1.2)
     assert asker.outgoing(1.2) == b"D,0,0\n"
@@ -217,7 +217,7 @@ def test_only_the_newest_motion_is_sent(asker: Asker) -> None:
     asker.send(Line("H"))
     asker.outgoing(1.0)
     for speed in range(5):
-        asker.outbox.stand("drive", (b"D,%d\n" % speed,), 1.0)
+        asker.outbox.set("drive", (b"D,%d\n" % speed,), 1.0)
     asker.receive(b"h\n", 1.1)
     assert run(asker, 1.1, 2.0, b"") == [(1.1, b"D,4\n")]
 
@@ -247,7 +247,7 @@ def test_one_request_too_many_is_refused_and_a_stop_never() -> None:
     exchange.put(b"b")
     with pytest.raises(Refused, match="2 packets"):
         exchange.put(b"c")
-    exchange.stand("drive", (b"stop",), 0.0, until=0.0, urgent=True)
+    exchange.set("drive", (b"stop",), 0.0, until=0.0, urgent=True)
     assert exchange.take(0.0) == b"stop"
 
 
@@ -266,7 +266,7 @@ def test_last_words_are_written_without_waiting_for_answers(asker: Asker) -> Non
     asker.send(Line("H"))
     asker.outgoing(1.0)
     asker.send(Line("N"))
-    asker.outbox.stand("drive", (b"D,0,0\n",), 1.0, until=1.0, urgent=True)
+    asker.outbox.set("drive", (b"D,0,0\n",), 1.0, until=1.0, urgent=True)
     asker.close("gateway stopped", 1.0)
     assert [asker.outgoing(1.0), asker.outgoing(1.0), asker.outgoing(1.0)] == [b"D,0,0\n", b"N\n", None]
     assert asker.state is State.CLOSED
@@ -281,7 +281,7 @@ def test_a_link_that_takes_nothing_leaves_the_time_limit_in_force(asker: Asker) 
 def test_an_exchange_tells_what_it_awaits(asker: Asker) -> None:
     asker.send(Line("H"))
     asker.outgoing(1.0)
-    assert repr(asker.exchange) == "<Exchange awaits b'H\\n', 0 failed in a row, <Outbox 0 waiting, standing []>>"
+    assert repr(asker.exchange) == "<Exchange awaits b'H\\n', 0 failed in a row, <Outbox 0 waiting, slots []>>"
     assert (asker.exchange.deadline(), asker.exchange.answer_at) == (None, pytest.approx(1.2))
     asker.receive(b"h\n", 1.0)
     assert asker.exchange.answer_at == math.inf
@@ -303,10 +303,10 @@ def test_at_no_time_are_two_requests_on_the_wire_and_a_stop_is_next(steps: list[
         if what == "send":
             session.send(Line(f"L,{value}"))
         elif what == "drive":
-            session.outbox.stand("drive", (b"D,%d\n" % (value + 1),), now)
+            session.outbox.set("drive", (b"D,%d\n" % (value + 1),), now)
         elif what == "stop":
             stops = 1
-            session.outbox.stand("drive", (b"D,0,0\n",), now, until=now, urgent=True)
+            session.outbox.set("drive", (b"D,0,0\n",), now, until=now, urgent=True)
         elif what == "poll":
             session.poll(f"poll {value % 3}", Line("H"), now, 0.05)
         elif what == "answer" and on_wire is not None:

@@ -11,7 +11,7 @@ An :class:`Exchange` is an outbox that waits. A session writes what ``take`` giv
     OPEN     the session is closing. ``take`` gives what is left and awaits nothing.
 
 Order of requests: urgent ones (the stop), then slots and the queue in turns. The rules of :class:`Outbox` hold:
-``stand`` keeps the newest motion of a slot; an urgent group replaces the motion of its slot and is never
+``set`` keeps the newest motion of a slot; an urgent group replaces the motion of its slot and is never
 dropped; ``put`` refuses a request when too many wait. So a stop waits for one answer at most: ``answer_s`` seconds.
 
 A poll is a slot that repeats: ``poll`` sends a request every ``period_s``. A poll that is late is sent once, and the
@@ -156,7 +156,7 @@ class ExchangeSession(Session[M]):
 
     def poll(self, slot: str, request: M, now: float, period_s: float) -> None:
         """Send a request now and then every ``period_s`` seconds; a newer one of the same slot replaces it."""
-        self.outbox.stand(slot, (self.encode(request),), now, period_s=period_s)
+        self.outbox.set(slot, (self.encode(request),), now, period_s=period_s)
 
     def unpoll(self, slot: str) -> None:
         """End a poll."""

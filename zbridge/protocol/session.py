@@ -252,7 +252,7 @@ class Session(ABC, Generic[M]):
         self._on(SessionEvent.CLOSE, reason, now)
 
     def lost(self, reason: str) -> None:
-        """End the conversation: the transport is gone. The first reason stands."""
+        """End the conversation: the transport is gone. The first reason is kept."""
         self.fail(reason)
 
     def fail(self, reason: str) -> None:

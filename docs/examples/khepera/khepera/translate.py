@@ -89,7 +89,7 @@ class KheperaRobot(protocol.Robot):
 
     def _drive(self, speeds: SetSpeeds, now: float, **how: Any) -> None:
         session = self._connected()
-        session.outbox.stand("drive", (session.encode(speeds),), now, **how)
+        session.outbox.set("drive", (session.encode(speeds),), now, **how)
 
     def _connected(self) -> KheperaSession:
         if self._session is None or self._session.over:

@@ -224,7 +224,7 @@ def stop_nothing(self: Any, now: float, until: float) -> None:
 
 
 def stop_beside(self: Any, now: float, until: float) -> None:
-    self._session.outbox.stand("stop", (b"go 0.000000 0.000000\n",), now, period_s=0.1, until=until, urgent=True)
+    self._session.outbox.set("stop", (b"go 0.000000 0.000000\n",), now, period_s=0.1, until=until, urgent=True)
 
 
 @pytest.mark.parametrize(

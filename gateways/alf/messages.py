@@ -272,9 +272,9 @@ _SKIPPED = 4096
 def codecs() -> tuple[Codec, ...]:
     """List the messages of both dialects and both sides for the conformance kit; one measurement has two points."""
     found = []
-    for sender in (Sender.VEHICLE, Sender.HQ):
+    for sender, whole in ((Sender.VEHICLE, (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),)), (Sender.HQ, ())):
         ids = sent_by(sender)
-        messages = tuple(MESSAGES[number].message for number in sorted(ids))
+        messages = (*(MESSAGES[number].message for number in sorted(ids - {DriveInfo.spec.id})), *whole)
         end = binary_frame_end(ids, lambda: 2)
         found += [
             Codec(f"text, {sender.value}", write_text, partial(read_text, ids=ids), text_frame_end(4096), messages),

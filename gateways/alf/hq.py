@@ -195,7 +195,7 @@ class AlfHq(HqSide):
         def send(session: HqClient, now: float) -> None:
             if session.laser:
                 session.know(sweep.init)
-                session.outbox.stand("scan", (frame,), now)
+                session.outbox.set("scan", (frame,), now)
 
         return send
 
@@ -207,7 +207,7 @@ class AlfHq(HqSide):
         speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
         message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
-        return lambda session, now: session.outbox.stand("info", (frame,), now) if session.drive else None
+        return lambda session, now: session.outbox.set("info", (frame,), now) if session.drive else None
 
     def _measured(self, value: float) -> float:
         value = _finite(value)

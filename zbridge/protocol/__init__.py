@@ -14,7 +14,10 @@ negotiation     :func:`agree`, :func:`newest`, :func:`parse_versions`: which ver
 udp_probe       :class:`Probe`, :class:`Verdict`: whether datagrams get through.
 device_clock    :class:`DeviceClock`: when a device measured, by its own millisecond counter.
 rate_limit      :class:`RateLimit`: how often something may happen.
-kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back.
+exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
+codec           :class:`Codec`: the messages, for the conformance kit.
+kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
+odometry        :class:`Odometry`: from what the wheels have turned to a pose.
 bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
 errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message
                 can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
@@ -37,9 +40,12 @@ from zbridge.errors import (
 )
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.bearings import BearingScan, Sectors
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock
-from zbridge.protocol.kinematics import Differential, Factors
+from zbridge.protocol.exchange import Exchange, ExchangeSession
+from zbridge.protocol.kinematics import Differential, Factors, Positive
 from zbridge.protocol.negotiation import agree, newest, parse_versions
+from zbridge.protocol.odometry import Odometry
 from zbridge.protocol.outbox import LIMIT, Outbox
 from zbridge.protocol.plugin import (
     ATTEND_S,
@@ -66,12 +72,15 @@ __all__ = [
     "BearingScan",
     "ClientIds",
     "Code",
+    "Codec",
     "ConfigError",
     "Count",
     "Datagram",
     "DeviceClock",
     "Differential",
     "EncodeError",
+    "Exchange",
+    "ExchangeSession",
     "Factors",
     "HqSide",
     "HqSimulation",
@@ -79,8 +88,10 @@ __all__ = [
     "Malformed",
     "Metrics",
     "NotReady",
+    "Odometry",
     "Outbox",
     "Outcome",
+    "Positive",
     "Probe",
     "Protocol",
     "ProtocolError",

@@ -52,7 +52,7 @@ class HqClient(RobotSession):
     def show(self, slot: str, packet_id: int, frame: bytes, now: float) -> None:
         """Queue a frame as the newest of its slot, if the client knows the packet; count it otherwise."""
         if packet_id in self.known:
-            self.outbox.stand(slot, (frame,), now)
+            self.outbox.set(slot, (frame,), now)
         else:
             self.leave_out(packet_id)
 

@@ -135,7 +135,7 @@ class Display:
         if device.number not in session.registered:
             self.register(session, now)
         if not self._draft or device.number in session.enabled:
-            session.outbox.stand(f"sensor {device.number}", (frame,), now)
+            session.outbox.set(f"sensor {device.number}", (frame,), now)
 
 
 def _shown(device: ShownDevice, value: float, *, fault: bool = False) -> float | None:

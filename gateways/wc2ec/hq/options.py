@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from gateways.wc2ec.translate import Byte, DeviceOption, Positive
-from zbridge.protocol import ConfigError, Differential
+from gateways.wc2ec.settings import Byte, DeviceOption
+from zbridge.protocol import ConfigError, Differential, Positive
 
 
 class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -12,8 +12,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol import plugin as protocol
 from zbridge.protocol.plugin import Outcome, Protocol, Robot, find_protocol, protocol_names
-from zbridge.protocol.plugin import plugin as protocol
 
 
 class ToyRobot(Robot):

@@ -77,7 +77,7 @@ def test_every_protocol_says_what_it_is_and_makes_robots_with_its_default_option
     found = find_protocol(name)
     assert found.name == name
     assert found.summary
-    assert "{name}" in found.template
+    assert f'protocol = "{name}"' in found.template
     robot = found.robot(found.options(), found.links, Metrics())
     assert len(robot.link_names) == found.links
     assert robot.driving is None

@@ -22,8 +22,6 @@ from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Teleme
 from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\
-[robot]
-name = "{name}"
 [device]
 protocol = "toy"
 connect = ["tcp://127.0.0.1:4000"]

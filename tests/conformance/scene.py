@@ -115,6 +115,7 @@ class Scene:
 
     def __init__(self, judge: Any, peer: Any, task: asyncio.Task[None]) -> None:
         self.judge, self.peer, self.task = judge, peer, task
+        self._former: list[Peer] = []
 
     async def play(self, steps: list[str]) -> None:
         for step in steps:
@@ -184,8 +185,18 @@ class Scene:
     async def connect(self, _: str) -> None:
         await self.peer.connect()
 
+    async def again(self, _: str) -> None:
+        """Go on with a second connection; the first one stays as it is."""
+        self._former.append(self.peer)
+        self.peer = Peer(self.peer.port)
+        await self.peer.connect()
+
     async def close(self, _: str) -> None:
         self.peer.close()
+
+    def close_all(self) -> None:
+        for peer in (*self._former, self.peer):
+            peer.close()
 
     async def reset(self, _: str) -> None:
         self.peer.reset()
@@ -228,7 +239,7 @@ async def _ending(scene: Any) -> AsyncIterator[Any]:
     try:
         yield scene
     finally:
-        scene.peer.close()
+        scene.close_all()
         scene.task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await scene.task

@@ -509,8 +509,7 @@ async def test_after_a_disconnect_it_accepts_and_says_nothing() -> None:
     robot = quick()
     async with facing(robot) as hq:
         await hq.play(["greet", "close", "wait 0.015"])
-        hq.peer = Peer(hq.peer.port)
-        await hq.play(["connect", "silent", "by_udp FORWARD", "!! a datagram after the TCP connection ended"])
+        await hq.play(["again", "silent", "by_udp FORWARD", "!! a datagram after the TCP connection ended"])
         assert [event.split(",")[0] for event in robot.events] == ["the HQ closed the connection", "second connection"]
 
 
@@ -520,8 +519,7 @@ async def test_a_second_connection_may_work_and_lose_half_and_get_no_telemetry()
         await hq.play(["meet", f"> {hello('1.1', udp=False).replace('07', '02', 1)}"])
         assert (await hq.packet())[5] in (1, 31, 40, 51, 53, 55)
         await hq.play(["close", "wait 0.015"])
-        hq.peer = Peer(hq.peer.port)
-        await hq.connect("")
+        await hq.again("")
         assert (await hq.packet())[4:7] == bytes([1, 2, 3]), "client id 3"
         await hq.send(hello("1.1", udp=False).replace("07", "03", 1))
         for _ in range(60):

@@ -1,9 +1,13 @@
 """Marks by folder, and how hypothesis runs here: a machine that is busy with other tests is no failure."""
 
+import asyncio
+from collections.abc import Callable
 from fnmatch import fnmatch
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.clock import JumpingLoop
 
 REAL = ("tests/e2e/*", "tests/gateways/*/conformance/*")
 """Where tests take real sockets and real time: scenes on Zenoh, and the judges against plain sockets."""
@@ -24,3 +28,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         path = item.path.relative_to(item.config.rootpath).as_posix()
         if any(fnmatch(path, pattern) for pattern in REAL):
             item.add_marker("e2e")
+
+
+def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    if item.get_closest_marker("jumping"):
+        return {"jumping": JumpingLoop}
+    return {"real": asyncio.new_event_loop}

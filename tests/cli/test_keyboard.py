@@ -139,10 +139,7 @@ def test_holding_plus_moves_nothing() -> None:
 
 # Any keys at any times
 
-presses = st.lists(
-    st.tuples(st.floats(0.0, 2.0), st.sampled_from([*DIRECTIONS, "+", "-", *OTHERS])),
-    max_size=40,
-)
+presses = st.lists(st.tuples(st.floats(0.0, 2.0), st.sampled_from([*DIRECTIONS, "+", "-", *OTHERS])), max_size=40)
 
 
 def meant(history: list[tuple[float, str]], now: float) -> str | None:

@@ -308,11 +308,7 @@ async def test_commands_reach_the_robot_with_proofs_and_rising_numbers() -> None
         ]
         held = lease(1)
         assert [msgpack.unpackb(sample.attachment or b"") for sample in sent] == [
-            {
-                "lease": held.lease,
-                "seq": number,
-                "proof": proof(held.token, sample.key, number, sample.payload),
-            }
+            {"lease": held.lease, "seq": number, "proof": proof(held.token, sample.key, number, sample.payload)}
             for number, sample in enumerate(sent, 1)
         ]
         assert not any(held.token in (sample.attachment or b"") + sample.payload for sample in sent)
@@ -407,11 +403,7 @@ async def test_no_command_overtakes_another_however_they_are_given() -> None:
         await drive.mode("manual")
         await drive(forward=0.5)
         await asyncio.gather(
-            drive.motor("arm", 1.0),
-            drive(forward=0.25),
-            drive.raw("tcpudp", 7),
-            drive.mode("none"),
-            drive(),
+            drive.motor("arm", 1.0), drive(forward=0.25), drive.raw("tcpudp", 7), drive.mode("none"), drive()
         )
         assert [name for name, _ in world.machine.commands] == [
             "mode",
@@ -851,9 +843,7 @@ async def test_a_refusal_is_raised_as_the_class_of_its_code(refusal: Refused, ki
         (Lease(ok=False), Unsupported, "r1: no reason given"),
     ],
 )
-async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words(
-    answer: Lease, kind: type[Refused], text: str
-) -> None:
+async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words(answer, kind, text) -> None:
     world = World(served=False)
     world.bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: question.answer(payloads.encode(answer)))
     with pytest.raises(kind, match=re.escape(text)) as raised:

@@ -46,13 +46,7 @@ SCAN = Scan(
 )
 MAP = Map(rows=2, columns=3, cell=0.1, origin=(-1.0, 2.0), cells=np.array([[0, 1, 2], [2, 1, 0]], np.uint8))
 SCANNER = Scanner(
-    angle_min=0.0,
-    angle_max=1.0,
-    angle_increment=0.1,
-    time_increment_s=0.0,
-    range_min=0.1,
-    range_max=4.0,
-    points=11,
+    angle_min=0.0, angle_max=1.0, angle_increment=0.1, time_increment_s=0.0, range_min=0.1, range_max=4.0, points=11
 )
 STREAMS: list[tuple[Topic, FleetMessage]] = [
     (topics.SCAN, SCAN),
@@ -293,9 +287,7 @@ async def test_nothing_is_subscribed_before_somebody_iterates() -> None:
 
 
 @pytest.mark.parametrize(("topic", "message"), STATES, ids=NAMES[len(STREAMS) :])
-async def test_last_is_none_before_a_state_was_published_and_then_its_value(
-    topic: Topic, message: FleetMessage
-) -> None:
+async def test_last_is_none_before_a_state_was_published_and_then_its_value(topic, message) -> None:
     world = World()
     assert await world.feed(topic).last() is None
     world.gateway.publish(topic, message)

@@ -113,9 +113,7 @@ async def test_fleet_and_robots_print_what_they_are() -> None:
     [(topics.RPC_POSE, POSE, lambda robot: robot.ask_pose()), (topics.RPC_MAP, MAP, lambda robot: robot.ask_map())],
     ids=["pose", "map"],
 )
-async def test_questions_are_answered_refused_or_not_answered(
-    topic: Topic, message: FleetMessage, ask: Callable[[Robot], Any]
-) -> None:
+async def test_questions_are_answered_refused_or_not_answered(topic, message, ask) -> None:
     world = World()
     with pytest.raises(BusError, match=r"^r1: no gateway answered"):
         await ask(world.robot)

@@ -110,9 +110,7 @@ def test_the_cut_of_a_random_stream_changes_none_of_its_messages(side: Side, dat
 
 @each_side
 @given(data=st.data())
-def test_random_bytes_give_a_message_that_survives_the_wire_or_a_protocol_error(
-    side: Side, data: st.DataObject
-) -> None:
+def test_random_bytes_give_a_message_that_survives_the_wire_or_a_protocol_error(side, data) -> None:
     frame = data.draw(st.sampled_from([frame for _, frame in side.golden]))
     kept = data.draw(st.integers(0, len(frame)))
     bent = frame[:kept] + data.draw(st.binary(min_size=len(frame) - kept, max_size=len(frame) - kept))

@@ -409,9 +409,7 @@ async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise(scen
 
 
 @pytest.mark.parametrize("accept_hz", [20.0, 1000.0])
-async def test_a_flood_of_connections_costs_a_few_lines_a_second(
-    accept_hz: float, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         async with serving(accept_hz=accept_hz, clients=10_000) as scene:
             caplog.clear()
@@ -790,9 +788,7 @@ async def test_a_client_drives_and_its_name_is_shown(scene: Scene) -> None:
     assert KEYS.alive("hq.toy.2") in scene.bus._shared.tokens
 
 
-async def test_what_was_said_while_the_process_stood_still_moves_nothing_and_neutral_must_come_anew(
-    scene: Scene,
-) -> None:
+async def test_what_was_said_while_the_process_stood_still_moves_nothing_and_neutral_must_come_anew(scene) -> None:
     driver, idle = scene.connect().greeted(), scene.connect().greeted()
     driver.say(b"stand", b"go")
     idle.say(b"stand")
@@ -1017,9 +1013,7 @@ async def test_a_question_of_many_is_asked_once_and_answered_to_each(scene: Scen
         lambda question: question.answer(payloads.pack({"rows": 7})),
     ],
 )
-async def test_a_question_without_an_answer_is_answered_with_what_is_known(
-    scene: Scene, answer: Callable[[Question], None]
-) -> None:
+async def test_a_question_without_an_answer_is_answered_with_what_is_known(scene: Scene, answer) -> None:
     answering(scene, topics.RPC_POSE, answer)
     program = scene.connect().greeted()
     for _ in range(2):
@@ -1028,9 +1022,7 @@ async def test_a_question_without_an_answer_is_answered_with_what_is_known(
         assert program.heard() == [b"@rpc/pose: NoneType"]
 
 
-async def test_a_bus_that_cannot_be_asked_leaves_no_question_open(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_bus_that_cannot_be_asked_leaves_no_question_open(scene, monkeypatch) -> None:
 
     async def fails(*args: Any, **kwargs: Any) -> list[Answer]:
         raise BusError("the bus is closed")
@@ -1260,9 +1252,7 @@ class LostSide(ToySide):
         raise KeyError(there)
 
 
-async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(caplog) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(Scene, "side_class", LostSide)
         async with serving() as scene:

@@ -60,15 +60,7 @@ NEUTRAL: dict[str, Any] = {}
 FOREVER_S = 1e6
 """A lease that no test outlives."""
 NEED_A_LEASE = {"drive", "motor", "mode", "raw"}
-DENIED = {
-    "ok": False,
-    "lease": None,
-    "token": None,
-    "expires_in_s": None,
-    "holder": None,
-    "reason": None,
-    "code": None,
-}
+DENIED = {"ok": False, "lease": None, "token": None, "expires_in_s": None, "holder": None, "reason": None, "code": None}
 STRANGE = lease(99)
 """A lease that was never given."""
 
@@ -100,12 +92,7 @@ class OpenBus(FakeBus):
         return super().answer(key, handler, lane=lane)
 
     def subscribe(
-        self,
-        key_expr: str,
-        handler: Callable[[Sample], None],
-        *,
-        lane: Lane | Sort = Lane.OTHER,
-        history: bool = False,
+        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane | Sort = Lane.OTHER, history: bool = False
     ) -> Handle:
         self.lanes[key_expr] = lane
         return super().subscribe(key_expr, handler, lane=lane, history=history)
@@ -296,11 +283,7 @@ def handlers(rig: Rig, key: str) -> list[Callable[[Sample], None]]:
 
 @contextlib.asynccontextmanager
 async def serving(
-    options: Options | None = None,
-    *,
-    unreachable: str | None = None,
-    hold: bool = True,
-    **more: Any,
+    options: Options | None = None, *, unreachable: str | None = None, hold: bool = True, **more: Any
 ) -> AsyncIterator[Rig]:
     """Run a device; unless told otherwise, a program holds the lease."""
     rig = Rig(options, **more)
@@ -460,9 +443,7 @@ async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_o
         ("02000000 01 3c", "text", {"text": "simulated lidar data", "kind": "request", "sender": None}),
     ],
 )
-async def test_a_packet_is_published_on_its_key(
-    rig: Rig, packet: str | bytes, path: str, fields: dict[str, Any]
-) -> None:
+async def test_a_packet_is_published_on_its_key(rig: Rig, packet, path, fields) -> None:
     rig.sends(bytes.fromhex(packet) if isinstance(packet, str) else packet)
     assert rig.last(path) == {**fields, "stamp_ns": 1234}
 
@@ -841,9 +822,7 @@ async def test_control_counts_the_time_that_is_left_down_and_never_shows_the_tok
 
 @pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
 @pytest.mark.scene(hold=False)
-async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(
-    rig: Rig, name: str, fields: dict[str, Any]
-) -> None:
+async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(rig: Rig, name, fields) -> None:
     rig.command(name, fields)
     assert rig.written() == []
     assert rig.metrics.total("refused") == 1
@@ -852,9 +831,7 @@ async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(
 
 
 @pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
-async def test_of_two_programs_only_the_holders_commands_are_carried_out(
-    rig: Rig, name: str, fields: dict[str, Any]
-) -> None:
+async def test_of_two_programs_only_the_holders_commands_are_carried_out(rig: Rig, name, fields) -> None:
     other = Program(rig, "other")
     assert other.acquire("takeover")["ok"]
     assert rig.hold("takeover")["ok"]
@@ -877,10 +854,7 @@ async def test_a_guessed_lease_is_nobodys_and_a_guessed_token_of_the_right_one_n
         held.seq = 1_000
         forger.put("drive", DRIVE_LEFT, held.attachment("drive", packed(DRIVE_LEFT)))
     assert rig.written() == []
-    assert await rig.refused() == [
-        (None, "drive", "held by driver (priority 0)", 1),
-        (None, "drive", "wrong proof", 2),
-    ]
+    assert await rig.refused() == [(None, "drive", "held by driver (priority 0)", 1), (None, "drive", "wrong proof", 2)]
     assert [entry["code"] for entry in rig.last("control")["refusals"]] == ["held", "malformed"]
     rig.command("drive", DRIVE_LEFT)
     assert rig.written() == [MOVE_LEFT], "their numbers are not the holder's"
@@ -1014,10 +988,7 @@ async def test_neutral_of_anybody_else_does_not_make_motion_possible(rig: Rig) -
     [
         ("text", {"text": "hi"}),
         ("lidar", {"on": True}),
-        (
-            "scan",
-            {"angle_min": 0.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": bytes(8)},
-        ),
+        ("scan", {"angle_min": 0.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": bytes(8)}),
         ("stop", {}),
     ],
 )
@@ -1190,9 +1161,7 @@ async def test_a_question_about_the_lease_whose_key_has_wildcards_is_refused(rig
 @pytest.mark.parametrize("name", ["acquire/ann", "takeover/ann", "renew", "release"])
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x90", b"\x81", packed({"who": 5, "lease": 5})])
 @pytest.mark.scene(hold=False)
-async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(
-    rig: Rig, name: str, payload: bytes
-) -> None:
+async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(rig: Rig, name, payload) -> None:
     (reply,) = rig.ask(f"control/{name}", payload).replies
     assert isinstance(reply.error, Malformed)
     reason = str(reply.error)
@@ -1214,9 +1183,7 @@ async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_exp
     ],
 )
 @pytest.mark.parametrize("how", ["acquire", "takeover"])
-async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_holder(
-    rig: Rig, how: str, wishes: dict[str, Any], reason: str
-) -> None:
+async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_holder(rig, how, wishes, reason) -> None:
     wish = {"who": "other", "priority": 9, **wishes}
     denied = rig.driver.ask(f"{how}/{topics.escape(wish['who'])}", packed(wish))
     assert (denied["ok"], denied["token"], denied["code"]) == (False, None, "malformed")
@@ -1254,9 +1221,7 @@ async def test_wishes_are_capped_by_the_robots_own(rig: Rig) -> None:
     ],
 )
 @pytest.mark.scene(lease_s=1.0, deadman_s=5.0, hold=False)
-async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(
-    rig: Rig, name: str, fields: dict[str, Any], sent: bytes, stop: list[bytes]
-) -> None:
+async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(rig: Rig, name, fields, sent, stop) -> None:
     rig.hold()
     await asyncio.sleep(0.5)
     start = rig.loop.time()
@@ -1508,9 +1473,7 @@ async def test_a_gateway_that_wakes_from_being_frozen_sends_the_stop_before_any_
 
 @pytest.mark.parametrize(("name", "fields"), [("drive", {"left": 9.0}), ("motor/x", {"value": 1.0})])
 @pytest.mark.scene(deadman_s=0.6)
-async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(
-    rig: Rig, name: str, fields: dict[str, Any]
-) -> None:
+async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(rig: Rig, name, fields) -> None:
     rig.command("drive", DRIVE_LEFT)
     for _ in range(4):
         await asyncio.sleep(0.2)
@@ -1545,9 +1508,7 @@ async def test_commands_are_served_in_the_midst_of_a_large_read(rig: Rig) -> Non
 
 @pytest.mark.parametrize("first", ["mode", "raw/tcpudp"])
 @pytest.mark.parametrize("mode", ["manual", "none"])
-async def test_a_release_stops_a_robot_that_was_let_move_by_itself_whatever_its_mode_is_now(
-    rig: Rig, first: str, mode: str
-) -> None:
+async def test_a_release_stops_a_robot_that_was_let_move_by_itself_whatever_its_mode_is_now(rig, first, mode) -> None:
     rig.command(first, {"mode": "autonomous", "id": 40, "body": b"x"})
     rig.command("mode", {"mode": mode})
     await asyncio.sleep(0.1)
@@ -1649,10 +1610,7 @@ async def test_a_flood_of_refusals_is_one_line_and_then_one_a_second(rig: Rig) -
 async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too(rig: Rig) -> None:
     rig.command("stop")
     rig.goes()
-    assert [(line["event"], line["reason"]) for line in rig.audited] == [
-        ("stopped", "stop"),
-        ("stopped", "robot lost"),
-    ]
+    assert [(line["event"], line["reason"]) for line in rig.audited] == [("stopped", "stop"), ("stopped", "robot lost")]
 
 
 async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing(rig: Rig) -> None:
@@ -1864,9 +1822,7 @@ async def test_an_unknown_command_is_refused(rig: Rig, name: str) -> None:
         ("text", {"text": "Grüße"}, "text"),
     ],
 )
-async def test_what_the_robot_cannot_do_is_refused_with_the_reason(
-    rig: Rig, name: str, fields: dict[str, Any], reason: str
-) -> None:
+async def test_what_the_robot_cannot_do_is_refused_with_the_reason(rig: Rig, name, fields, reason) -> None:
     rig.command(name, fields)
     await asyncio.sleep(0.1)
     assert rig.written() == []
@@ -2086,9 +2042,7 @@ async def test_raw_frames_are_shown_only_to_those_who_listen() -> None:
 @pytest.mark.parametrize(
     ("name", "asked", "answer"), [("map", "02000000 02 34", MAP), ("pose", "02000000 02 36", POSITION)]
 )
-async def test_a_query_asks_the_robot_and_is_answered_with_what_it_sends(
-    rig: Rig, name: str, asked: str, answer: bytes
-) -> None:
+async def test_a_query_asks_the_robot_and_is_answered_with_what_it_sends(rig: Rig, name, asked, answer) -> None:
     question = rig.ask(name)
     assert rig.written() == [bytes.fromhex(asked)]
     assert question.replies == []

@@ -312,9 +312,7 @@ HEALED = [
 
 
 @pytest.mark.parametrize(("first_has", "second_has", "left"), HEALED)
-async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it(
-    first_has: bool, second_has: bool, left: tuple[bool, bool]
-) -> None:
+async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it(first_has, second_has, left) -> None:
     bus, other = FakeBus("9"), FakeBus("1")
     clock = asyncio.get_running_loop().time
     first, second = Ownership(bus, KEYS, clock), Ownership(other, KEYS, clock)

@@ -78,9 +78,7 @@ def told(robot: AlfRobot, link: int, name: str, port: int) -> list[tuple[Topic, 
 
 
 @pytest.mark.parametrize(("name", "port", "count"), [(DRIVE, DRIVE_PORT, 6), (LASER, LASER_PORT, 7)])
-def test_what_a_vehicle_sent_is_read_as_hq_and_written_as_vehicle_to_the_same_bytes(
-    name: str, port: int, count: int
-) -> None:
+def test_what_a_vehicle_sent_is_read_as_hq_and_written_as_vehicle_to_the_same_bytes(name, port, count) -> None:
     recorded = stream(name, source=port)
     reader = session_of(HqSession(Dialect.TEXT))
     messages = delivered(reader, recorded)

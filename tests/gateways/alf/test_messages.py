@@ -71,9 +71,7 @@ def test_the_message_table_is_that_of_the_page() -> None:
     ("message_id", "points", "size"),
     [(1, 769, 6169), (1, 726, 5825), (1, 0, 17), (2, 769, 25), (3, 769, 5), (4, 769, 18), (255, 769, 2)],
 )
-def test_the_id_and_the_number_of_points_give_the_length_of_a_binary_message(
-    message_id: int, points: int, size: int
-) -> None:
+def test_the_id_and_the_number_of_points_give_the_length_of_a_binary_message(message_id, points, size) -> None:
     assert binary_size(message_id, points) == size
 
 
@@ -275,9 +273,7 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
 
 @pytest.mark.parametrize("length", [text_limit(769) + 100, 3 * text_limit(769), 500_000])
 @pytest.mark.parametrize("read_bytes", [1 << 20, 4096, 1000])
-def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(
-    length: int, read_bytes: int
-) -> None:
+def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(length, read_bytes) -> None:
     """The end of a message that is too long may look like one: cut anywhere, it must not drive a vehicle."""
     long = b"1" + b"|3|80|0|30|1" * (length // 12) + b";"
     by = session(VehicleSession, TEXT, 769)
@@ -386,9 +382,7 @@ PIECES = st.one_of(
 
 
 @given(st.sampled_from(list(Dialect)), st.sampled_from([HqSession, VehicleSession]), st.lists(PIECES, max_size=12))
-def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(
-    dialect: Dialect, kind: type[AlfSession], reads: list[bytes]
-) -> None:
+def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(dialect, kind, reads) -> None:
     by = session(kind, dialect)
     ids = OF_VEHICLE if kind is HqSession else OF_HQ
     for read in reads:

@@ -318,9 +318,7 @@ BINARY_726 = bytes.fromhex("01 07000000 88130000" + "e803000000000000" * 726 + "
 
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("cut", [0, 1, 25, 26, 100, 25 + 5824, 25 + 5825])
-def test_the_number_of_points_counts_from_the_first_measurement_on_however_the_stream_is_cut(
-    cut: int, count: int
-) -> None:
+def test_the_number_of_points_counts_from_the_first_measurement_on_however_the_stream_is_cut(cut, count) -> None:
     """Binary framing depends on it: a measurement in the same read as its scanner init must not be cut wrong."""
     wire = Wire(Options(dialect="binary", points_from_scanner=True))
     stream = INIT_BINARY + BINARY_726 * count
@@ -510,9 +508,7 @@ def test_no_motion_is_infinite(wire: Wire, number: str) -> None:
         (0.0, -0.5, b"3|0|0|45|0;"),
     ],
 )
-def test_a_drive_in_text_steers_from_minus_90_left_to_90_right(
-    wire: Wire, forward: float, turn: float, text: bytes
-) -> None:
+def test_a_drive_in_text_steers_from_minus_90_left_to_90_right(wire: Wire, forward, turn, text) -> None:
     assert wire.driven(forward, turn) == text
 
 
@@ -719,9 +715,7 @@ def test_moving_sideways_too_is_left_out_and_said(wire: Wire, forward: float, tu
         (topics.CMD_STOP, Stop()),
     ],
 )
-def test_what_no_message_of_the_protocol_says_is_refused_and_nothing_is_sent(
-    wire: Wire, topic: Topic, command: FleetMessage
-) -> None:
+def test_what_no_message_of_the_protocol_says_is_refused_and_nothing_is_sent(wire: Wire, topic, command) -> None:
     wire.driven(0.5)
     with pytest.raises(Refused, match="ALF"):
         wire.robot.command(topic, command, wire.now)

@@ -40,13 +40,7 @@ from gateways.tcpudp.messages import (
     frame_end,
 )
 from tests import captures
-from tests.gateways.tcpudp.golden import (
-    GOLDEN,
-    TABLE,
-    TCP_SESSION_MESSAGES,
-    UDP_SESSION_MESSAGES,
-    server_settings,
-)
+from tests.gateways.tcpudp.golden import GOLDEN, TABLE, TCP_SESSION_MESSAGES, UDP_SESSION_MESSAGES, server_settings
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.wire import FrameBuffer
 
@@ -301,10 +295,7 @@ def test_map_of_eight_cells_is_no_position() -> None:
 
 @pytest.mark.parametrize(
     "frame",
-    [
-        "0f000000 01 01 09000000 01 01 03000000 627965",
-        "15000000 01 01 0f000000 01 01 09000000 01 01 03000000 627965",
-    ],
+    ["0f000000 01 01 09000000 01 01 03000000 627965", "15000000 01 01 0f000000 01 01 09000000 01 01 03000000 627965"],
     ids=["doubled", "tripled"],
 )
 def test_more_headers_before_a_broadcast_text_do_not_confuse_the_parser(frame: str) -> None:

@@ -108,9 +108,7 @@ def test_nothing_is_refused_for_its_type_alone(kind: int) -> None:
 
 
 @pytest.mark.parametrize(("dialect", "sender"), HALVES)
-def test_every_command_that_is_not_of_this_side_breaks_the_stream_and_is_quoted(
-    dialect: Dialect, sender: Sender
-) -> None:
+def test_every_command_that_is_not_of_this_side_breaks_the_stream_and_is_quoted(dialect, sender) -> None:
     for command in sorted(set(range(256)) - HALVES[dialect, sender]):
         data = bytes((command, 0x25, 0x0B, 0xAB, 0xCD))
         with pytest.raises(ProtocolError) as caught:

@@ -258,10 +258,7 @@ async def test_an_end_of_the_connection_without_end_is_a_violation(dialect: Dial
 
 async def test_an_end_of_the_connection_within_a_message_is_a_violation_more() -> None:
     hq = await after(INIT["text"] + b"4|10", viewer())
-    assert hq.violations == [
-        "the connection ended within a message: '4|10'",
-        "the vehicle closed without END: EOF",
-    ]
+    assert hq.violations == ["the connection ended within a message: '4|10'", "the vehicle closed without END: EOF"]
 
 
 async def test_a_reset_without_end_is_a_violation() -> None:
@@ -356,8 +353,7 @@ async def test_it_stands_at_first_and_repeats_its_command_for_ever(dialect: Dial
 
 
 @pytest.mark.parametrize(
-    ("dialect", "told"),
-    [("text", b"3|255|1|-90|1;"), ("binary", bytes.fromhex("03 64 01 00 01"))],
+    ("dialect", "told"), [("text", b"3|255|1|-90|1;"), ("binary", bytes.fromhex("03 64 01 00 01"))]
 )
 async def test_drive_and_idle_change_what_is_repeated(dialect: Dialect, told: bytes) -> None:
     hq = FragileHq(dialect=dialect, repeat_s=0.002)
@@ -467,9 +463,7 @@ async def test_nobody_listening_is_an_error() -> None:
         await viewer().run("127.0.0.1", vehicle.port)
 
 
-async def test_the_program_logs_and_prints_what_it_died_of(
-    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     vehicle = Vehicle()
     task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", vehicle.port, dialect="text", points=POINTS))
     async with asyncio.timeout(LONG_S):

@@ -180,10 +180,7 @@ NOTED: dict[str, Script] = {
             {"dialect": dialect},
             ["> END GOOD", f"! a message after END: {good}", "> END", f"! a message after END: {end}", "noted 2"],
         )
-        for dialect, good, end in (
-            ("text", "'3|0|0|0|0;'", "'255|1;'"),
-            ("binary", "03 00 00 5a 00", "ff 01"),
-        )
+        for dialect, good, end in (("text", "'3|0|0|0|0;'", "'255|1;'"), ("binary", "03 00 00 5a 00", "ff 01"))
     },
     "no close after END": ({}, ["> END", "! the HQ did not close within 0.15 s of its END"]),
     "no answer to the vehicle's END": (
@@ -265,12 +262,7 @@ async def test_what_is_noted_and_survived(options: dict[str, Any], steps: list[s
         ),
         "many connections are bounded": ({}, ["crowd 20"]),
         "an HQ that reads nothing is an event": (
-            {
-                **BINARY,
-                **LASER,
-                "times": Times(cycle_s=0.005, scan_s=0.0, first_s=50, send_s=0.1),
-                "points": 100_000,
-            },
+            {**BINARY, **LASER, "times": Times(cycle_s=0.005, scan_s=0.0, first_s=50, send_s=0.1), "points": 100_000},
             ["? the HQ read nothing for 0.1 s", "ok"],
         ),
         "a laser expects no commands": (
@@ -299,10 +291,7 @@ async def test_what_an_hq_may_do(options: dict[str, Any], steps: list[str]) -> N
             )
         },
         **{
-            f"{data}, laser {laser}": (
-                {**BINARY, "laser": laser, "drive": not laser},
-                [f"> {data}", f"died {words}"],
-            )
+            f"{data}, laser {laser}": ({**BINARY, "laser": laser, "drive": not laser}, [f"> {data}", f"died {words}"])
             for laser, data, words in (
                 (False, "00", "id 0, of which this server knows nothing: the framing is lost: 00"),
                 (False, "01", "id 1,"),
@@ -699,9 +688,7 @@ async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.Log
         await hq.task
 
 
-async def test_the_simulator_logs_violations_and_says_what_it_died_of(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     hq, _ = await simulating(None, "binary")
     with contextlib.closing(hq.peer):
         await hq.play(["> 48", "over"])

@@ -191,10 +191,7 @@ PARTS: dict[str, Any] = {"version": "1.4", "parts": 4}
             {},
             ["connect", f"> 18000000 00 {HELLO['1.3'][12:]} 00 {FLAGS['1.3']}", "> STOP", "ok"],
         ),
-        "a second connection hears nothing and does no harm": (
-            {},
-            ["greet", "crowd 20", "> STOP", "ok", "took 3 13"],
-        ),
+        "a second connection hears nothing and does no harm": ({}, ["greet", "crowd 20", "> STOP", "ok", "took 3 13"]),
         "a 7 that denies the answer is an event, and all goes by TCP": (
             UDP,
             ["probing", "by_udp PROBE", "> NOT_CONNECTED", "wait 0.1", "> FORWARD", "ok"]
@@ -548,9 +545,7 @@ async def test_what_is_kept_is_bounded() -> None:
         assert len(hq.judge.violations) == 2
 
 
-async def test_the_simulator_logs_violations_and_says_what_it_died_of(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     task = asyncio.create_task(
         simulate_fragile("127.0.0.1", 0, version="1.3", udp=False, seed=3, ready=port.set_result)

@@ -338,9 +338,7 @@ async def test_nobody_listening_is_an_error() -> None:
         await FragileController().run("127.0.0.1", webots.port)
 
 
-async def test_the_program_logs_and_prints_what_it_died_of(
-    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     webots = Webots()
     task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", webots.port, dialect="deployed", split=True))
     async with asyncio.timeout(LONG_S):

@@ -451,9 +451,7 @@ LOST = [
 
 
 @pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(
-    dialect: Dialect, data: str, words: str
-) -> None:
+async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(dialect, data, words) -> None:
     controller = quick(dialect)
     async with connected(controller) as external:
         await external.send(bytes.fromhex(data))
@@ -471,9 +469,7 @@ async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(
 
 
 @pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_after_a_valid_one_in_the_same_read_kills(
-    dialect: Dialect, data: str, words: str
-) -> None:
+async def test_an_unknown_command_after_a_valid_one_in_the_same_read_kills(dialect, data, words) -> None:
     controller = quick(dialect)
     async with facing(controller) as (external, task):
         await external.connect()
@@ -668,9 +664,7 @@ async def test_the_simulator_ends_with_its_external_controller(capsys: pytest.Ca
     assert capsys.readouterr().out == "the external controller left the robot at rest: closed\n"
 
 
-async def test_the_simulator_logs_violations_and_says_what_it_died_of(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     task, port = await simulating("draft")
     with contextlib.closing(External(port)) as external:
         await external.connect()

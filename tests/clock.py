@@ -1,7 +1,5 @@
 """An event loop whose clock jumps: what waits for a time is next, and nobody really waits."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import selectors

@@ -1,7 +1,5 @@
 """The keyboard: motion only while a key repeats, whatever is typed and however the terminal delivers it."""
 
-from __future__ import annotations
-
 import string
 
 import pytest

@@ -4,8 +4,6 @@ A script is a list of steps, a verb and what it is done with: ``"> 02000000 07 0
 bytes (``Scene.names``). The verbs that all judges share are methods here; those of a protocol are in a subclass.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket

@@ -1,7 +1,5 @@
 """What one side of a protocol sends in one dialect: its golden table, and the code that reads and writes it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Every message of every protocol: golden bytes both ways, in any cut, joined, truncated, prolonged, random."""
 
-from __future__ import annotations
-
 import warnings
 from itertools import pairwise
 from typing import Any

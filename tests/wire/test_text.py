@@ -2,8 +2,6 @@
 binary message, which the same declaration makes. Texts and bytes are written by hand.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re

@@ -3,8 +3,6 @@
 The robot says ``at X Y HEADING`` ten times a second, and takes ``go FORWARD TURN``.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The five messages in both dialects, by hand from the protocol page, sections "Text" and "Binary"."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

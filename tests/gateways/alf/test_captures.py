@@ -1,7 +1,5 @@
 """Both recorded sessions through the sessions of both roles, each segment at its recorded time, and on to the fleet."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What HQ programs of ALF are shown and what they command: texts and bytes of the protocol page, written by hand."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """The five messages and their framing in both dialects. Texts and bytes are written by hand from the protocol page."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sessions of ALF in both roles and dialects: texts and bytes from the protocol page, by hand; time is an argument."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 from itertools import pairwise

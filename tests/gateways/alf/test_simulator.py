@@ -1,7 +1,5 @@
 """The simulated vehicle itself: what commands make it do, what it sees, and what it says of itself."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

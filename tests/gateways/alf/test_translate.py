@@ -1,7 +1,5 @@
 """Units, axes, signs and refusals of ALF, worked out by hand from "Translation" and "The gateway as HQ" of the page."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tomllib

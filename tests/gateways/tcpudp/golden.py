@@ -3,8 +3,6 @@
 Every expected byte is written out by hand from the page or read off a capture, never computed by the code under test.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

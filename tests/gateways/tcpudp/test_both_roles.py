@@ -1,7 +1,5 @@
 """Both roles back to back over a network that cuts, delays, loses, reorders and doubles, on a simulated clock."""
 
-from __future__ import annotations
-
 import heapq
 import random
 from collections.abc import Callable, Iterable

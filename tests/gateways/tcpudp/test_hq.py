@@ -1,7 +1,5 @@
 """What HQ programs of each version are shown, and what they command. Bytes come from the protocol page, by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from itertools import pairwise

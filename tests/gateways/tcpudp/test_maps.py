@@ -3,8 +3,6 @@
 The protocol page: index = x * side + y, 0 unknown, 1 free, 2 obstacle.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

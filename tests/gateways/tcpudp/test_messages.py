@@ -4,8 +4,6 @@ Every expected byte is written out by hand from the protocol page or read off a 
 under test.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import random

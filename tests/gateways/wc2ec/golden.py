@@ -1,7 +1,5 @@
 """The messages of both dialects, by hand from the tables of the protocol page."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from __future__ import annotations
-
 from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
 from gateways.wc2ec.session import ControllerSession, ExternalSession
 from gateways.wc2ec.translate import Options, Wc2EcRobot

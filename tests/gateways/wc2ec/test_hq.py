@@ -1,7 +1,5 @@
 """What external controllers are shown and what they command: bytes of the protocol page, written by hand."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The messages and their framing in both dialects. Bytes are written by hand from the protocol page."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """Sessions of WC2EC in both roles and dialects: bytes from the protocol page, by hand; time is an argument."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names, units, kinematics and refusals of WC2EC, worked out by hand from the page and the design."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tomllib

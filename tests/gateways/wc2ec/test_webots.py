@@ -1,7 +1,5 @@
 """The controller script for Webots, with a stand-in for Webots' own ``controller`` module and a real socket."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import socket

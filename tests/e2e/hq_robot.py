@@ -4,8 +4,6 @@
 what was violated as one JSON object. It says more often than deployed robots where it is: tests are short.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from tests.hq.scene import SCENES, Scene
+from tests.clock import scene_of
+from tests.hq.scene import SCENES, Scene, serving
 from zbridge.address import Address
 from zbridge.hq import listener as listeners
 from zbridge.transport.link import Receiver
@@ -27,3 +28,6 @@ def by_hand(monkeypatch: pytest.MonkeyPatch) -> list[Scene]:
     monkeypatch.setattr(listeners, "listen", listen)
     SCENES.append(scenes)
     return scenes
+
+
+scene = scene_of(serving)

@@ -1,7 +1,5 @@
 """Which connections a listener accepts."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -8,7 +8,6 @@ import logging
 import numpy as np
 import pytest
 
-from tests.clock import jumping
 from tests.hq.scene import COMMANDS, STATUS, Scene, ToySession, ToySide, serving, soon
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -23,83 +22,79 @@ from zbridge.fleet.topics import Topic
 from zbridge.hq.client import TELL_S
 from zbridge.protocol.plugin import Send, Telemetry
 
+pytestmark = pytest.mark.jumping
+
+
 # The robot comes and goes
 
 
-@jumping
-async def test_clients_are_told_when_the_robot_goes_and_comes() -> None:
-    async with serving() as scene:
-        program, early = scene.connect().greeted(), scene.connect()
-        early.heard()
-        scene.go()
-        scene.go()
-        assert program.heard() == [b"! no gateway serves the robot"]
-        assert early.heard() == [], "not before the handshake"
-        await asyncio.sleep(TELL_S)
-        scene.come()
-        scene.say(topics.STATUS, STATUS)
-        assert program.heard() == [b"! the robot is there"]
-        scene.say(topics.STATUS, Status(state="offline", reason="no route", protocol="toy"))
-        assert program.heard() == [b"! robot offline: no route"]
+async def test_clients_are_told_when_the_robot_goes_and_comes(scene: Scene) -> None:
+    program, early = scene.connect().greeted(), scene.connect()
+    early.heard()
+    scene.go()
+    scene.go()
+    assert program.heard() == [b"! no gateway serves the robot"]
+    assert early.heard() == [], "not before the handshake"
+    await asyncio.sleep(TELL_S)
+    scene.come()
+    scene.say(topics.STATUS, STATUS)
+    assert program.heard() == [b"! the robot is there"]
+    scene.say(topics.STATUS, Status(state="offline", reason="no route", protocol="toy"))
+    assert program.heard() == [b"! robot offline: no route"]
 
 
-@jumping
-async def test_a_client_that_comes_while_the_robot_is_away_is_told_so() -> None:
-    async with serving(robot=False) as scene:
-        program = scene.connect()
-        program.say(b"hi")
-        assert program.heard() == [b"who are you", b"welcome", b"! no gateway serves the robot"]
-        program.say(b"stand", b"go")
-        await soon()
-        assert scene.gateway.asked == []
-        scene.come()
-        assert program.heard() == [b"! the robot is there"]
-        program.say(b"stand", b"go")
-        await soon()
-        assert scene.gateway.report().holder == "hq.toy.2"
+@pytest.mark.scene(robot=False)
+async def test_a_client_that_comes_while_the_robot_is_away_is_told_so(scene: Scene) -> None:
+    program = scene.connect()
+    program.say(b"hi")
+    assert program.heard() == [b"who are you", b"welcome", b"! no gateway serves the robot"]
+    program.say(b"stand", b"go")
+    await soon()
+    assert scene.gateway.asked == []
+    scene.come()
+    assert program.heard() == [b"! the robot is there"]
+    program.say(b"stand", b"go")
+    await soon()
+    assert scene.gateway.report().holder == "hq.toy.2"
 
 
-@jumping
-async def test_a_driver_whose_gateway_went_must_let_go_first() -> None:
-    async with serving() as scene:
-        program = scene.connect().greeted()
-        program.say(b"stand", b"go")
-        await soon()
-        scene.go()
-        assert b"! not driving: the robot's gateway is gone" in program.heard()
-        scene.come()
-        scene.gateway.authority.stop("a new gateway knows of no lease")
-        scene.gateway.taken()
-        program.say(b"go")
-        await soon()
-        assert scene.gateway.taken() == []
-        program.say(b"stand", b"go")
-        await soon()
-        assert scene.gateway.report().holder == "hq.toy.2"
+async def test_a_driver_whose_gateway_went_must_let_go_first(scene: Scene) -> None:
+    program = scene.connect().greeted()
+    program.say(b"stand", b"go")
+    await soon()
+    scene.go()
+    assert b"! not driving: the robot's gateway is gone" in program.heard()
+    scene.come()
+    scene.gateway.authority.stop("a new gateway knows of no lease")
+    scene.gateway.taken()
+    program.say(b"go")
+    await soon()
+    assert scene.gateway.taken() == []
+    program.say(b"stand", b"go")
+    await soon()
+    assert scene.gateway.report().holder == "hq.toy.2"
 
 
 # What is followed only now and then
 
 
-@jumping
-async def test_what_a_client_wants_is_followed_while_one_wants_it() -> None:
-    async with serving() as scene:
-        first, second = scene.connect().greeted(), scene.connect().greeted()
-        scan = Scan(0.0, 0.1, 0.1, 10.0, np.ones(3, np.float32))
-        scene.say(topics.SCAN, scan)
-        assert scene.side.encoded == 0
-        first.say(b"scans on")
-        second.say(b"scans on")
-        scene.say(topics.SCAN, scan)
-        assert scene.side.encoded == 1
-        assert (first.heard(), second.heard()) == ([b"scan"], [b"scan"])
-        first.say(b"scans off")
-        scene.say(topics.SCAN, scan)
-        assert (first.heard(), second.heard()) == ([], [b"scan"])
-        second.leave()
-        await soon()
-        scene.say(topics.SCAN, scan)
-        assert scene.side.encoded == 2, "nobody wants it"
+async def test_what_a_client_wants_is_followed_while_one_wants_it(scene: Scene) -> None:
+    first, second = scene.connect().greeted(), scene.connect().greeted()
+    scan = Scan(0.0, 0.1, 0.1, 10.0, np.ones(3, np.float32))
+    scene.say(topics.SCAN, scan)
+    assert scene.side.encoded == 0
+    first.say(b"scans on")
+    second.say(b"scans on")
+    scene.say(topics.SCAN, scan)
+    assert scene.side.encoded == 1
+    assert (first.heard(), second.heard()) == ([b"scan"], [b"scan"])
+    first.say(b"scans off")
+    scene.say(topics.SCAN, scan)
+    assert (first.heard(), second.heard()) == ([], [b"scan"])
+    second.leave()
+    await soon()
+    scene.say(topics.SCAN, scan)
+    assert scene.side.encoded == 2, "nobody wants it"
 
 
 # Whether the robot is there
@@ -111,7 +106,6 @@ class ToldSide(ToySide):
         return lambda session, now: session.send(b"there" if there else b"lost")
 
 
-@jumping
 async def test_every_client_is_shown_once_that_the_robot_is_lost_and_that_it_is_there_again() -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(Scene, "side_class", ToldSide)
@@ -150,10 +144,7 @@ class LostSide(ToySide):
         raise KeyError(there)
 
 
-@jumping
-async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(caplog) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(Scene, "side_class", LostSide)
         async with serving() as scene:

@@ -10,7 +10,6 @@ import weakref
 
 import pytest
 
-from tests.clock import jumping
 from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, serving, soon
 from zbridge.address import Address
 from zbridge.fleet import topics
@@ -20,96 +19,87 @@ from zbridge.fleet.messages import (
 )
 from zbridge.protocol.session import Limits
 
+pytestmark = pytest.mark.jumping
+
+
 # Coming and going
 
 
-@jumping
-async def test_a_client_shakes_hands_and_is_shown_the_robot() -> None:
-    async with serving() as scene:
-        assert scene.listener.address == Address("127.0.0.1", 11002)
-        program = scene.connect()
-        assert program.heard() == [b"who are you"]
-        scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
-        assert program.heard() == [], "nothing before the handshake"
-        program.say(b"hi")
-        assert program.heard() == [b"welcome"]
-        scene.say(topics.POSE, Pose(x=2.0, y=0.0, heading=0.0))
-        assert program.heard() == [b"at 2"]
-        (entry,) = scene.manager.snapshots()
-        assert (entry.name, entry.role, entry.state, entry.version) == ("toy.2", "robot", "established", "2.0")
-        assert entry.peer == program.link.peer
+async def test_a_client_shakes_hands_and_is_shown_the_robot(scene: Scene) -> None:
+    assert scene.listener.address == Address("127.0.0.1", 11002)
+    program = scene.connect()
+    assert program.heard() == [b"who are you"]
+    scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+    assert program.heard() == [], "nothing before the handshake"
+    program.say(b"hi")
+    assert program.heard() == [b"welcome"]
+    scene.say(topics.POSE, Pose(x=2.0, y=0.0, heading=0.0))
+    assert program.heard() == [b"at 2"]
+    (entry,) = scene.manager.snapshots()
+    assert (entry.name, entry.role, entry.state, entry.version) == ("toy.2", "robot", "established", "2.0")
+    assert entry.peer == program.link.peer
 
 
-@jumping
-async def test_clients_get_the_lowest_numbers_that_are_free() -> None:
-    async with serving() as scene:
-        programs = [scene.connect() for _ in range(4)]
-        assert sorted(scene.listener.clients) == [2, 3, 4, 5]
-        programs[1].leave()
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2, 3, 4, 5]
-        assert scene.reason("toy.3") is None
-        assert scene.count("hq_accepted") == 5
+async def test_clients_get_the_lowest_numbers_that_are_free(scene: Scene) -> None:
+    programs = [scene.connect() for _ in range(4)]
+    assert sorted(scene.listener.clients) == [2, 3, 4, 5]
+    programs[1].leave()
+    await soon()
+    scene.connect()
+    assert sorted(scene.listener.clients) == [2, 3, 4, 5]
+    assert scene.reason("toy.3") is None
+    assert scene.count("hq_accepted") == 5
 
 
-@jumping
-async def test_254_clients_are_served_and_the_255th_is_turned_away() -> None:
-    async with serving(accept_hz=1000) as scene:
-        programs = [scene.connect().greeted() for _ in range(254)]
-        assert sorted(scene.listener.clients) == list(range(2, 256))
-        late = scene.connect()
-        assert late.link.closed
-        assert late.heard() == []
-        late.say(b"hi", b"go")
-        assert late.heard() == []
-        assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (254, 1)
-        await soon()
-        scene.say(topics.POSE, Pose(x=3.0, y=0.0, heading=0.0))
-        assert all(program.heard() == [b"at 3"] for program in programs)
-        assert scene.side.encoded == 1
-        programs[76].leave()
-        await soon()
-        assert scene.connect().heard() == [b"who are you"]
+@pytest.mark.scene(accept_hz=1000)
+async def test_254_clients_are_served_and_the_255th_is_turned_away(scene: Scene) -> None:
+    programs = [scene.connect().greeted() for _ in range(254)]
+    assert sorted(scene.listener.clients) == list(range(2, 256))
+    late = scene.connect()
+    assert late.link.closed
+    assert late.heard() == []
+    late.say(b"hi", b"go")
+    assert late.heard() == []
+    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (254, 1)
+    await soon()
+    scene.say(topics.POSE, Pose(x=3.0, y=0.0, heading=0.0))
+    assert all(program.heard() == [b"at 3"] for program in programs)
+    assert scene.side.encoded == 1
+    programs[76].leave()
+    await soon()
+    assert scene.connect().heard() == [b"who are you"]
 
 
-@jumping
-async def test_a_listener_may_be_told_to_serve_fewer() -> None:
-    async with serving(clients=2) as scene:
-        programs = [scene.connect() for _ in range(3)]
-        assert [program.link.closed for program in programs] == [False, False, True]
-        programs[0].leave()
-        await soon()
-        assert not scene.connect().link.closed
+@pytest.mark.scene(clients=2)
+async def test_a_listener_may_be_told_to_serve_fewer(scene: Scene) -> None:
+    programs = [scene.connect() for _ in range(3)]
+    assert [program.link.closed for program in programs] == [False, False, True]
+    programs[0].leave()
+    await soon()
+    assert not scene.connect().link.closed
 
 
-@jumping
-async def test_more_than_so_many_connections_a_second_of_one_address_are_closed_at_once() -> None:
-    async with serving(accept_hz=3.0) as scene:
-        programs = [scene.connect() for _ in range(5)]
-        assert [program.link.closed for program in programs] == [False, False, False, True, True]
-        assert programs[4].heard() == []
-        assert not scene.connect("10.0.0.2").link.closed, "another address"
-        assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (4, 2)
-        for program in programs[:3]:
-            program.leave()
-        await soon()
-        assert scene.connect().link.closed, "that they have left makes no room"
-        await asyncio.sleep(1.0)
-        assert not scene.connect().link.closed
+@pytest.mark.scene(accept_hz=3.0)
+async def test_more_than_so_many_connections_a_second_of_one_address_are_closed_at_once(scene: Scene) -> None:
+    programs = [scene.connect() for _ in range(5)]
+    assert [program.link.closed for program in programs] == [False, False, False, True, True]
+    assert programs[4].heard() == []
+    assert not scene.connect("10.0.0.2").link.closed, "another address"
+    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (4, 2)
+    for program in programs[:3]:
+        program.leave()
+    await soon()
+    assert scene.connect().link.closed, "that they have left makes no room"
+    await asyncio.sleep(1.0)
+    assert not scene.connect().link.closed
 
 
-@jumping
-async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise() -> None:
-    async with serving() as scene:
-        assert [scene.connect().link.closed for _ in range(25)] == [False] * 20 + [True] * 5
+async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise(scene: Scene) -> None:
+    assert [scene.connect().link.closed for _ in range(25)] == [False] * 20 + [True] * 5
 
 
 @pytest.mark.parametrize("accept_hz", [20.0, 1000.0])
-@jumping
-async def test_a_flood_of_connections_costs_a_few_lines_a_second(
-    accept_hz: float, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         async with serving(accept_hz=accept_hz, clients=10_000) as scene:
             caplog.clear()
@@ -129,7 +119,6 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(
     assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
-@jumping
 async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ToySide, "quiet_s", 2.0)
     async with serving() as scene:
@@ -142,7 +131,6 @@ async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPa
         assert sorted(scene.listener.clients) == [2, 3]
 
 
-@jumping
 async def test_a_number_that_was_never_used_need_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ToySide, "quiet_s", 2.0)
     async with serving() as scene:
@@ -152,7 +140,6 @@ async def test_a_number_that_was_never_used_need_not_rest(monkeypatch: pytest.Mo
         assert sorted(scene.listener.clients) == [2]
 
 
-@jumping
 async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """``clients`` is the most at a time: a program that is restarted at once finds its place free."""
     monkeypatch.setattr(ToySide, "quiet_s", 2.0)
@@ -163,47 +150,44 @@ async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.Monke
         assert scene.connect().link.closed
 
 
-@jumping
-async def test_many_clients_come_and_go_and_leave_nothing_behind() -> None:
-    async with serving(accept_hz=1000) as scene:
-        await soon()
-        tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
-        subscribers, queryables = len(kept.subscribers), len(kept.queryables)
-        sessions: list[weakref.ref[ToySession]] = []
-        for cycle in range(500):
-            programs = [scene.connect() for _ in range(4)]
-            for program in programs[:3]:
-                program.say(b"hi")
-            sessions += [weakref.ref(session) for session in scene.side.made[-4:]]
-            programs[0].say(b"stand", b"go", b"scans on")
-            programs[1].say(b"map?", b"?")
-            if cycle % 2:
-                await soon()
-            for program in programs:
-                program.leave()
+@pytest.mark.scene(accept_hz=1000)
+async def test_many_clients_come_and_go_and_leave_nothing_behind(scene: Scene) -> None:
+    await soon()
+    tasks, kept = len(asyncio.all_tasks()), scene.bus._shared
+    subscribers, queryables = len(kept.subscribers), len(kept.queryables)
+    sessions: list[weakref.ref[ToySession]] = []
+    for cycle in range(500):
+        programs = [scene.connect() for _ in range(4)]
+        for program in programs[:3]:
+            program.say(b"hi")
+        sessions += [weakref.ref(session) for session in scene.side.made[-4:]]
+        programs[0].say(b"stand", b"go", b"scans on")
+        programs[1].say(b"map?", b"?")
+        if cycle % 2:
             await soon()
-        await asyncio.sleep(5.0)
-        assert scene.listener.clients == {}
-        assert len(asyncio.all_tasks()) == tasks
-        assert (len(kept.subscribers), len(kept.queryables)) == (subscribers, queryables)
-        assert kept.tokens == [KEYS.alive("gateway")]
-        assert repr(scene.manager) == "<SessionTable 0 live, 32 ended>"
-        assert len(scene.listener._context.bridge._publishers) <= 2
-        assert (scene.listener._active, len(scene.listener._queries)) == (set(), 0)
-        assert "0 of 254 taken" in repr(scene.listener._numbers)
-        assert scene.gateway.report().state == "free"
-        scene.side.made.clear()
-        del programs, program
-        gc.collect()
-        assert sum(session() is not None for session in sessions) <= 1, "the last one is a variable of a loop"
-
-
-@jumping
-async def test_the_table_says_why_a_client_went() -> None:
-    async with serving() as scene:
-        scene.connect().leave()
+        for program in programs:
+            program.leave()
         await soon()
-        assert scene.reason("toy.2") == "closed by peer"
+    await asyncio.sleep(5.0)
+    assert scene.listener.clients == {}
+    assert len(asyncio.all_tasks()) == tasks
+    assert (len(kept.subscribers), len(kept.queryables)) == (subscribers, queryables)
+    assert kept.tokens == [KEYS.alive("gateway")]
+    assert repr(scene.manager) == "<SessionTable 0 live, 32 ended>"
+    assert len(scene.listener._context.bridge._publishers) <= 2
+    assert (scene.listener._active, len(scene.listener._queries)) == (set(), 0)
+    assert "0 of 254 taken" in repr(scene.listener._numbers)
+    assert scene.gateway.report().state == "free"
+    scene.side.made.clear()
+    del programs, program
+    gc.collect()
+    assert sum(session() is not None for session in sessions) <= 1, "the last one is a variable of a loop"
+
+
+async def test_the_table_says_why_a_client_went(scene: Scene) -> None:
+    scene.connect().leave()
+    await soon()
+    assert scene.reason("toy.2") == "closed by peer"
 
 
 # Who may come
@@ -223,29 +207,25 @@ async def test_the_table_says_why_a_client_went() -> None:
         ("[::ffff:11.1.2.3]", False),
     ],
 )
-@jumping
-async def test_only_allowed_networks_are_let_in(host: str, welcome: bool) -> None:
-    async with serving(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8")) as scene:
-        program = scene.connect(host)
-        assert program.link.closed is not welcome
-        assert scene.count("hq_turned_away") == (not welcome)
-        assert len(scene.listener.clients) == welcome
+@pytest.mark.scene(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8"))
+async def test_only_allowed_networks_are_let_in(scene: Scene, host: str, welcome: bool) -> None:
+    program = scene.connect(host)
+    assert program.link.closed is not welcome
+    assert scene.count("hq_turned_away") == (not welcome)
+    assert len(scene.listener.clients) == welcome
 
 
-@jumping
-async def test_without_a_list_everybody_is_let_in() -> None:
-    async with serving() as scene:
-        assert not any(scene.connect(host).link.closed for host in ("10.1.2.3", "127.0.0.1", "[fe80::1%eth0]"))
+async def test_without_a_list_everybody_is_let_in(scene: Scene) -> None:
+    assert not any(scene.connect(host).link.closed for host in ("10.1.2.3", "127.0.0.1", "[fe80::1%eth0]"))
 
 
-@jumping
-async def test_a_client_that_is_turned_away_uses_up_no_number() -> None:
-    async with serving(allow=("10.0.0.0/8",)) as scene:
-        for _ in range(300):
-            scene.connect("11.0.0.1")
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2]
+@pytest.mark.scene(allow=("10.0.0.0/8",))
+async def test_a_client_that_is_turned_away_uses_up_no_number(scene: Scene) -> None:
+    for _ in range(300):
+        scene.connect("11.0.0.1")
+    await soon()
+    scene.connect()
+    assert sorted(scene.listener.clients) == [2]
 
 
 class SessionlessSide(ToySide):
@@ -253,7 +233,6 @@ class SessionlessSide(ToySide):
         raise KeyError(self.view.protocol)
 
 
-@jumping
 async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(Scene, "side_class", SessionlessSide)
@@ -267,7 +246,6 @@ async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
 # The end
 
 
-@jumping
 async def test_an_ending_listener_takes_leave_of_all_and_gives_the_robot_back() -> None:
     async with serving() as scene:
         driver, idle, early = scene.connect().greeted(), scene.connect().greeted(), scene.connect()
@@ -286,7 +264,6 @@ async def test_an_ending_listener_takes_leave_of_all_and_gives_the_robot_back() 
     assert late.link.closed
 
 
-@jumping
 async def test_an_ending_listener_does_not_wait_long_for_a_client_that_takes_nothing() -> None:
     async with serving() as scene:
         program = scene.connect().greeted()
@@ -297,9 +274,7 @@ async def test_an_ending_listener_does_not_wait_long_for_a_client_that_takes_not
     assert program.link.closed
 
 
-@jumping
-async def test_a_listener_and_its_clients_print_themselves() -> None:
-    async with serving() as scene:
-        scene.connect()
-        assert repr(scene.listener) == "<Listener toy tcp://127.0.0.1:11002, 1 clients>"
-        assert repr(scene.listener.clients[2]) == "<Client 2 <ToySession toy.2 handshaking>>"
+async def test_a_listener_and_its_clients_print_themselves(scene: Scene) -> None:
+    scene.connect()
+    assert repr(scene.listener) == "<Listener toy tcp://127.0.0.1:11002, 1 clients>"
+    assert repr(scene.listener.clients[2]) == "<Client 2 <ToySession toy.2 handshaking>>"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import socket
 import sys
 import threading
@@ -220,7 +221,7 @@ def show(title: str, ways: Counter[Way], *, calls: bool) -> None:
         return
     way, times = ways.most_common(1)[0]
     files = list(dict.fromkeys(path for path, _ in way))
-    changes = sum(one[0] != other[0] for one, other in zip(way, way[1:], strict=False))
+    changes = sum(one[0] != other[0] for one, other in itertools.pairwise(way))
     print(f"{title}: {len(files)} files, {len(way)} calls, {changes} changes of file ({times} of {ways.total()} alike)")
     for path in files:
         print(f"    {path}")

@@ -19,8 +19,8 @@ import pytest
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
 from tests.proofs import lease, proof
-from zbridge.bus import Answer, Handle, Publisher, Question, Sample
-from zbridge.bus.fake import FakeBus, FakeQuestion
+from zbridge.bus import Answer, Handle, IncomingQuery, Publisher, Sample
+from zbridge.bus.fake import FakeBus, FakeQuery
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import RETRY_S, default_who
 from zbridge.errors import (
@@ -639,10 +639,10 @@ async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -
     async with driving() as (world, drive):
         heard: list[bytes] = []
 
-        def repeat(question: Question) -> None:
+        def repeat(question: IncomingQuery) -> None:
             if question.payload not in heard:
                 heard.append(question.payload)
-                world.gateway.answer_first(FakeQuestion(question.key, question.payload))
+                world.gateway.answer_first(FakeQuery(question.key, question.payload))
 
         world.bus.answer("fleet/r1/@rpc/control/renew", repeat)
         queryables = world.bus._shared.queryables
@@ -924,9 +924,9 @@ async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words
 @jumping
 async def test_a_lease_that_cannot_be_given_for_now_is_asked_for_again(code: Code) -> None:
     world = World(served=False)
-    asked: list[Question] = []
+    asked: list[IncomingQuery] = []
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         asked.append(question)
         question.answer(payloads.encode(Lease(ok=False, reason="later", code=code)))
 

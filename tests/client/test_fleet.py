@@ -12,7 +12,7 @@ import pytest
 
 from tests.client import Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
-from zbridge.bus import Answer, Question, Sample
+from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.fleet import CONFIRM_S
@@ -124,9 +124,9 @@ async def test_questions_are_answered_refused_or_not_answered(
     world = World()
     with pytest.raises(BusError, match=r"^r1: no gateway answered"):
         await ask(world.robot)
-    asked: list[Question] = []
+    asked: list[IncomingQuery] = []
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         asked.append(question)
         if len(asked) == 1:
             question.answer(payloads.encode(message))

@@ -15,7 +15,7 @@ from typing import Any
 
 from zbridge.app.config import Plan
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, Handle, Question, open_bus
+from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
@@ -116,7 +116,7 @@ class Gateway:
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer who asks for the session table of this process."""
 
-        def answer(question: Question) -> None:
+        def answer(question: IncomingQuery) -> None:
             question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)

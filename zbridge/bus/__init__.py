@@ -1,6 +1,6 @@
 """The bus: what gateways and commands use of Zenoh, its implementation, and a fake for tests.
 
-Nothing here knows a robot. Only :mod:`zbridge.bus.zenohbus` imports zenoh; it is imported where a bus is
+Nothing here knows a robot. Only :mod:`zbridge.bus.zenoh` imports zenoh; it is imported where a bus is
 opened, so that whatever needs no bus starts without it.
 """
 
@@ -12,10 +12,10 @@ from zbridge.bus.interface import (
     Bus,
     BusSettings,
     Handle,
+    IncomingQuery,
     Lane,
     Look,
     Publisher,
-    Question,
     Sample,
     Sort,
     Tls,
@@ -29,10 +29,10 @@ __all__ = [
     "Bus",
     "BusSettings",
     "Handle",
+    "IncomingQuery",
     "Lane",
     "Look",
     "Publisher",
-    "Question",
     "Sample",
     "Sort",
     "Tls",
@@ -48,6 +48,6 @@ async def open_bus(
     ``wait_for_peers`` returns only when the peers that scouting finds at once are connected. bounds: what comes in on
     these keys and is larger is dropped by Zenoh, before anybody can count it.
     """
-    from zbridge.bus.zenohbus import open_zenoh
+    from zbridge.bus.zenoh import open_zenoh
 
     return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds)

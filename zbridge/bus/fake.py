@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.bus.interface import Answer, Batch, Handle, Lane, Publisher, Question, Sample, Sort
+from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete
 
@@ -123,7 +123,7 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         entry = (key, handler, self._zid)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
@@ -133,7 +133,7 @@ class FakeBus:
         for key, handler, zid in tuple(self._shared.queryables):
             if meet(key_expr, key):
                 concrete = key if is_concrete(key) else key_expr
-                questions.append((question := FakeQuestion(concrete, payload, asked=key_expr), zid))
+                questions.append((question := FakeQuery(concrete, payload, asked=key_expr), zid))
                 handler(question)
         kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
         replies = [(reply, zid) for question, zid in questions for reply in question.replies]
@@ -196,7 +196,7 @@ class _Shared:
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
-        self.queryables: list[tuple[str, Callable[[Question], None], str]] = []
+        self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self.last: dict[str, bytes] = {}
@@ -240,7 +240,7 @@ class _FakePublisher(_FakeHandle):
         self._shared.last.pop(self.key, None)
 
 
-class FakeQuestion:
+class FakeQuery:
     """A query whose answers a test may look at."""
 
     def __init__(self, key: str, payload: bytes = b"", *, asked: str | None = None) -> None:

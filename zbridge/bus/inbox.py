@@ -48,8 +48,11 @@ class Inbox:
         self._dropped = metrics.count("bus_in_dropped")
         self._folded = metrics.count("bus_in_folded")
 
-    def source(self, handler: Handler, read: Read) -> Source:
-        """Give what one subscription or queryable puts its items in. read: makes of each what the handler takes."""
+    def source(self, handler: Handler, read: Read | None = None) -> Source:
+        """Make the source of one subscription or queryable.
+
+        read: makes of each item what the handler takes, on the event loop's thread; None: the handler takes the item.
+        """
         return Source(self, handler, read, self._dropped, self._folded)
 
     def attend(self) -> None:
@@ -96,7 +99,7 @@ class Inbox:
             queue.listed = True
             line.append(queue)
         try:
-            source.handler(source.read(raw))
+            source.handler(raw if source.read is None else source.read(raw))
         except Exception:
             log.exception("a handler failed")
 
@@ -104,7 +107,7 @@ class Inbox:
 class Source:
     """Where one subscription or queryable puts what comes in."""
 
-    def __init__(self, inbox: Inbox, handler: Handler, read: Read, dropped: Count, folded: Count) -> None:
+    def __init__(self, inbox: Inbox, handler: Handler, read: Read | None, dropped: Count, folded: Count) -> None:
         self.handler = handler
         self.read = read
         self._inbox = inbox

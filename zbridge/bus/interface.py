@@ -47,7 +47,7 @@ class Sample(msgspec.Struct, frozen=True):
     attachment: bytes | None = None
 
 
-class Question(Protocol):
+class IncomingQuery(Protocol):
     """A query that waits for its answer; answer or refuse it once.
 
     key: the one that is answered. asked: what was asked for, perhaps with wildcards.
@@ -148,7 +148,7 @@ class Bus(Protocol):
         Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
         """
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:

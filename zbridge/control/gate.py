@@ -183,7 +183,7 @@ class CommandGate:
         return _Kind(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
 
 
-class QuestionGate:
+class QueryGate:
     """Sorts the holder's questions about the lease; each key has a gate, and numbers of its own."""
 
     def __init__(self, authority: Authority, clock: Clock) -> None:
@@ -191,7 +191,7 @@ class QuestionGate:
         self.sieve = self._prover.sieve
 
     def __repr__(self) -> str:
-        return f"<QuestionGate {self.sieve!r}>"
+        return f"<QueryGate {self.sieve!r}>"
 
     def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
         return self._prover.prove(key, shown, look)

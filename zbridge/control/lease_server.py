@@ -6,10 +6,10 @@ import asyncio
 import math
 from collections.abc import Callable
 
-from zbridge.bus import Bus, Handle, Question
+from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority, EventKind
-from zbridge.control.gate import CommandGate, NameGate, QuestionGate
+from zbridge.control.gate import CommandGate, NameGate, QueryGate
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.proof import read
 from zbridge.control.standstill import Standstill
@@ -36,7 +36,7 @@ TAKEOVERS_HZ = 5.0
 """Takeovers a second, of whoever asks."""
 _ANYBODY = "*"
 
-Decide = Callable[[Question], FleetMessage]
+Decide = Callable[[IncomingQuery], FleetMessage]
 
 
 class LeaseServer:
@@ -63,12 +63,12 @@ class LeaseServer:
         self.standstill = standstill
         self.gate = CommandGate(authority, keys, clock)
         """Sorts commands."""
-        self._gates: dict[str, CommandGate | QuestionGate | NameGate] = {
+        self._gates: dict[str, CommandGate | QueryGate | NameGate] = {
             "commands": self.gate,
             "acquire": NameGate(clock),
             "takeover": NameGate(clock),
-            "renew": QuestionGate(authority, clock),
-            "release": QuestionGate(authority, clock),
+            "renew": QueryGate(authority, clock),
+            "release": QueryGate(authority, clock),
             "refused": NameGate(clock),
         }
         self._takeovers = RateLimit(TAKEOVERS_HZ)
@@ -213,7 +213,7 @@ class LeaseServer:
         """Answer one kind of question, or refuse it where everybody sees."""
         command = name.removesuffix("/*")
 
-        def answer(question: Question) -> None:
+        def answer(question: IncomingQuery) -> None:
             if self._closing is not None:
                 question.refuse(NotReady(self._closing, Code.CLOSING))
                 return
@@ -229,22 +229,22 @@ class LeaseServer:
 
         return bus.answer(self._keys.key(f"@rpc/control/{name}"), answer, lane=self._gates[command])
 
-    def _acquire(self, question: Question) -> FleetMessage:
+    def _acquire(self, question: IncomingQuery) -> FleetMessage:
         return self.authority.acquire(_request(question), self._clock())
 
-    def _take_over(self, question: Question) -> FleetMessage:
+    def _take_over(self, question: IncomingQuery) -> FleetMessage:
         request = _request(question)
         if not self._takeovers.take(self._clock()):
             raise TooFast(f"more than {TAKEOVERS_HZ:g} takeovers a second")
         return self.authority.takeover(request, self._clock())
 
-    def _renew(self, question: Question) -> FleetMessage:
+    def _renew(self, question: IncomingQuery) -> FleetMessage:
         return self.authority.renew(read(question.payload), question.asked, self._clock())
 
-    def _release(self, question: Question) -> FleetMessage:
+    def _release(self, question: IncomingQuery) -> FleetMessage:
         return self.authority.release(read(question.payload), question.asked, self._clock())
 
-    def _take_told(self, question: Question) -> FleetMessage:
+    def _take_told(self, question: IncomingQuery) -> FleetMessage:
         """Show what a listener refused its HQ programs.
 
         Their names begin with ``hq.``, so that nobody can be told of a refusal in the name of any other program.
@@ -263,14 +263,14 @@ class LeaseServer:
         return Query()
 
 
-def _request(question: Question) -> Acquire:
+def _request(question: IncomingQuery) -> Acquire:
     """Read who asks for the lease; raise Malformed where it asks in another name than its key's."""
     request = payloads.decode(Acquire, question.payload)
     _require_own_name(question, request.who)
     return request
 
 
-def _require_own_name(question: Question, who: str) -> None:
+def _require_own_name(question: IncomingQuery, who: str) -> None:
     """Raise Malformed where somebody asks in another name than its key's."""
     name = question.asked.rpartition("/")[2]
     if not topics.speaks_for(who, name):

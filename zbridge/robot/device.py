@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 from zbridge.address import Address
-from zbridge.bus import Bus, Handle, Publisher, Question
+from zbridge.bus import Bus, Handle, IncomingQuery, Publisher
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
@@ -364,7 +364,7 @@ class Device:
 
     # Queries
 
-    def _on_question(self, question: Question) -> None:
+    def _on_question(self, question: IncomingQuery) -> None:
         topic = _ASKED[self._keys.path(question.key)]
         try:
             self._commands.require_ready()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from zbridge.bus import Question
+from zbridge.bus import IncomingQuery
 from zbridge.errors import Code, NotReady
 from zbridge.fleet.topics import Topic
 
@@ -20,12 +20,12 @@ class PendingQueries:
     def __init__(self, loop: asyncio.AbstractEventLoop, answer_s: float = ANSWER_S) -> None:
         self._loop = loop
         self._answer_s = answer_s
-        self.waiting: dict[str, list[tuple[Question, asyncio.TimerHandle]]] = {}
+        self.waiting: dict[str, list[tuple[IncomingQuery, asyncio.TimerHandle]]] = {}
 
     def __repr__(self) -> str:
         return f"<PendingQueries waiting for {sorted(self.waiting)}>"
 
-    def add(self, topic: Topic, question: Question) -> bool:
+    def add(self, topic: Topic, question: IncomingQuery) -> bool:
         """Let a question wait; tell whether it is the first, so that the robot must be asked."""
         waiting = self.waiting.setdefault(topic.path, [])
         if len(waiting) >= WAITING:
@@ -34,7 +34,7 @@ class PendingQueries:
         waiting.append((question, timer))
         return len(waiting) == 1
 
-    def remove(self, topic: Topic, question: Question) -> None:
+    def remove(self, topic: Topic, question: IncomingQuery) -> None:
         """Forget a question that will not be answered."""
         waiting = self.waiting.get(topic.path, [])
         for entry in [entry for entry in waiting if entry[0] is question]:
@@ -58,6 +58,6 @@ class PendingQueries:
                 timer.cancel()
                 question.refuse(NotReady(reason))
 
-    def _expire(self, topic: Topic, question: Question) -> None:
+    def _expire(self, topic: Topic, question: IncomingQuery) -> None:
         self.remove(topic, question)
         question.refuse(NotReady(f"the robot did not answer within {self._answer_s:g} s"))

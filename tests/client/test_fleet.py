@@ -286,7 +286,7 @@ async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_t
 async def test_a_refusal_of_long_ago_is_none_of_this_stop() -> None:
     world = World("r1")
     world.gateway.machine.unstoppable = "not now"
-    world.gateway.leases.stop("stop")
+    world.gateway.enforcer.stop("stop")
     world.gateway.machine.unstoppable = None
     await world.robot.stop()
     assert world.gateway.machine.stops >= 1

@@ -32,7 +32,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import ATTEND_EVERY, HEARTBEAT_S, Device
+from zbridge.robot.device import HEARTBEAT_S, Device
+from zbridge.robot.telemetry import ATTEND_EVERY
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
 
@@ -2109,7 +2110,7 @@ async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() 
         shown = await rig.refusals()
         assert [command for command, _, _ in shown] == ["drive", "mode", "lidar", "raw/tcpudp"]
         assert all("does not announce" in reason for _, reason, _ in shown)
-        assert not rig.device._leases.authority.moving, "there is nothing to stop"
+        assert not rig.device._enforcer.authority.moving, "there is nothing to stop"
 
 
 @jumping

@@ -155,6 +155,7 @@ class Gateway:
 
     def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
         control = self._plan.config.control
+        limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
             plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
             plan.addresses,
@@ -162,7 +163,7 @@ class Gateway:
             keys=self._keys,
             bus=bus,
             authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes),
-            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf),
+            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
             manager=self.sessions,
             metrics=self.metrics,
             audit=audit,

@@ -8,7 +8,7 @@ from tests.clock import jumping
 from zbridge.bus.fake import FakeQuery
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.robot.pending_queries import WAITING, PendingQueries
+from zbridge.robot.queries import WAITING, PendingQueries
 
 
 def questions() -> PendingQueries:

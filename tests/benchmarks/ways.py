@@ -29,8 +29,8 @@ import zenoh.ext
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 4.0
 """How long the robot is driven."""
-Call = tuple[str, str]
-"""File below the repository, and function."""
+Call = tuple[str, str, str]
+"""File below the repository, function, and the file that called it; "" where none of the project's did."""
 Way = tuple[Call, ...]
 
 
@@ -39,21 +39,21 @@ class Tracer:
 
     def __init__(self, done: Callable[[Way], None]) -> None:
         self._done = done
-        self._depth = 0
+        self._callers: list[str] = []
         self._calls: list[Call] = []
 
     def __call__(self, frame: FrameType, event: str, arg: object) -> None:
         if event not in ("call", "return"):
             return
-        call = _project_call(frame)
-        if call is None:
+        function = _project_function(frame)
+        if function is None:
             return
         if event == "call":
-            self._depth += 1
-            self._calls.append(call)
-        elif self._depth:
-            self._depth -= 1
-            if not self._depth:
+            self._calls.append((*function, self._callers[-1] if self._callers else ""))
+            self._callers.append(function[0])
+        elif self._callers:
+            self._callers.pop()
+            if not self._callers:
                 way, self._calls = tuple(self._calls), []
                 self._done(way)
 
@@ -73,10 +73,10 @@ class Ways:
 
     def on_loop(self, way: Way) -> None:
         """Take what one callback of the event loop has done."""
-        names = [name for _, name in way]
+        names = [name for _, name, _ in way]
         if "buffer_updated" in way[0][1] and any(name.endswith("put_all") for name in names):
             self._read = way
-        elif self._came and any(path.endswith("transport/tcp.py") and name.endswith(".write") for path, name in way):
+        elif self._came and any(path.endswith("transport/tcp.py") and name.endswith(".write") for path, name, _ in way):
             self.ways_in[self._came[-1] + way] += 1
             self._came.clear()
 
@@ -87,7 +87,7 @@ class Ways:
             self._read = None
 
 
-def _project_call(frame: FrameType) -> Call | None:
+def _project_function(frame: FrameType) -> tuple[str, str] | None:
     """Name the function of a frame; None where it is not the project's, or is a comprehension or a thread's loop."""
     code = frame.f_code
     path, name = code.co_filename, code.co_qualname
@@ -220,13 +220,17 @@ def show(title: str, ways: Counter[Way], *, calls: bool) -> None:
         print(f"{title}: nothing was seen")
         return
     way, times = ways.most_common(1)[0]
-    files = list(dict.fromkeys(path for path, _ in way))
+    files = list(dict.fromkeys(path for path, _, _ in way))
+    arrows = {(caller, path) for path, _, caller in way if caller not in ("", path)}
+    mutual = sorted(pair for pair in arrows if pair[::-1] in arrows and pair[0] < pair[1])
     changes = sum(one[0] != other[0] for one, other in itertools.pairwise(way))
     print(f"{title}: {len(files)} files, {len(way)} calls, {changes} changes of file ({times} of {ways.total()} alike)")
     for path in files:
         print(f"    {path}")
+    for one, other in mutual:
+        print(f"  both ways: {one} and {other}")
     if calls:
-        print(*(f"        {path}: {name}" for path, name in way), sep="\n")
+        print(*(f"        {path}: {name}" for path, name, _ in way), sep="\n")
 
 
 def main() -> None:

@@ -47,7 +47,9 @@ def decode(message: type[F], payload: bytes) -> F:
     ``ranges`` becomes a read-only float32[n], ``cells`` a read-only uint8[rows, columns].
     """
     try:
-        decoded: F = _shaped(_decoder(message).decode(payload or _EMPTY))
+        decoded: F = _decoder(message).decode(payload or _EMPTY)
+        if isinstance(decoded, Map):
+            return _shaped(decoded)
     except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message.__name__}: {error}") from error
     return decoded
@@ -89,9 +91,8 @@ def _array(kind: Any, value: Any) -> Any:
     return np.frombuffer(value, dtype)
 
 
-def _shaped(message: Any) -> Any:
-    if not isinstance(message, Map):
-        return message
+def _shaped(message: Map) -> Any:
+    """Give the cells their rows and columns; raise ValueError where they do not fill them."""
     rows, columns, cells = message.rows, message.columns, message.cells
     if rows < 0 or columns < 0 or rows * columns != cells.size:
         raise ValueError(f"{cells.size} cells do not fill {rows} rows x {columns} columns")

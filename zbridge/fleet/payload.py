@@ -49,7 +49,7 @@ def decode(message: type[F], payload: bytes) -> F:
     try:
         decoded: F = _decoder(message).decode(payload or _EMPTY)
         if isinstance(decoded, Map):
-            return _shaped(decoded)
+            decoded = _shaped(decoded)
     except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message.__name__}: {error}") from error
     return decoded

@@ -40,7 +40,7 @@ PATIENCE_US = 20_000
 LEAVE_S = 0.4
 """Longest time leaving the bus takes."""
 FLUSH_S = 2.0
-"""Longest time the bus may take to accept what blocks."""
+"""Longest time for which :meth:`ZenohBus.flush` waits."""
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
 _TIDY = 64
@@ -52,7 +52,7 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
 
 def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming what Zenoh does not take."""
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
         "connect/endpoints": settings.connect,
@@ -148,7 +148,7 @@ class ZenohBus:
         return self._keep(self._publishers.make(key, topic))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` when a source that was asked to pause may go on."""
+        """Call ``handler`` when a paused source may go on."""
         self._relief.append(handler)
 
     def subscribe(
@@ -159,9 +159,9 @@ class ZenohBus:
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
-        """Take samples by way of a lane; ``history`` asks for last values too.
+        """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
 
-        Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
+        Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
         if isinstance(lane, Lane):
             source = self._inbox.source(handler, read_sample)
@@ -186,7 +186,7 @@ class ZenohBus:
         return self._keep(Declared(self._session.declare_queryable(key, store)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect the replies that come within ``timeout_s``, as far as they are no flood."""
+        """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
         replies = await self._collect(
             key_expr,
             lambda handler: self._session.get(
@@ -204,7 +204,7 @@ class ZenohBus:
         return [read_reply(reply) for reply in replies]
 
     def attend(self) -> None:
-        """Hand over the stops and the holder's commands that wait: to be called in the midst of long work."""
+        """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
         self._inbox.attend()
 
     def announce(self, key: str) -> Handle:
@@ -219,12 +219,15 @@ class ZenohBus:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
-        """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+        """Call ``handler`` with the key of every liveliness token there is or comes (True), and of each that goes (False)."""
         store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
         return self._keep(Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
 
     async def flush(self) -> None:
-        """Wait until what may block, streams apart, is with the bus; raise BusError where that takes too long."""
+        """Wait until all queued states and answers are handed to Zenoh (streams excluded).
+
+        Raises BusError after :data:`FLUSH_S` seconds.
+        """
         loop = self._loop
         written: asyncio.Future[None] = loop.create_future()
 
@@ -243,7 +246,7 @@ class ZenohBus:
             raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
+        """Declare a key for raw frames; call ``listened`` when the first listener appears and when the last one leaves."""
         loop = self._loop
         plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
 
@@ -254,11 +257,11 @@ class ZenohBus:
         return self._keep(PlainPublisher(key, plain, None))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
-        """Be told when the first listener of ``key`` comes and when the last one goes."""
+        """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""
         return self.frames(key, handler)
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
-        """Be told when the first connection to the bus is made and when the last one is gone."""
+        """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
         loop, info = self._loop, self._session.info
 
         def changed(_: zenoh.TransportEvent) -> None:
@@ -267,7 +270,7 @@ class ZenohBus:
         return self._keep(Declared(info.declare_transport_events_listener(changed, history=True)))
 
     async def close(self) -> bool:
-        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as before a router that stands still."""
+        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
         left = threading.Event()
 
@@ -296,7 +299,7 @@ class ZenohBus:
                 self._loop.call_soon_threadsafe(handler)
 
     def _keep(self, handle: H) -> H:
-        """Remember what is to be taken back at the end; a client's comings and goings must not add up."""
+        """Remember a handle that is to be closed at the end; forget closed ones now and then, so that none add up."""
         self._handles.append(handle)
         if len(self._handles) >= self._tidy_at:
             self._handles = [kept for kept in self._handles if not getattr(kept, "closed", False)]
@@ -304,7 +307,7 @@ class ZenohBus:
         return handle
 
     async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
-        """Run a get whose replies are stored as they come; the last one's handler being dropped ends it."""
+        """Run a get and collect its replies. Zenoh drops the handler after the last reply, which ends the wait."""
         loop, replies = self._loop, Replies(key_expr, self._replies_dropped)
         done = loop.create_future()
 
@@ -318,6 +321,6 @@ class ZenohBus:
         except zenoh.ZError as error:
             raise BusError(_ORIGIN.sub("", str(error))) from error
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may swallow a cancellation
+            async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
                 await done
         return list(replies)

@@ -168,13 +168,13 @@ class Bus(Protocol):
         """List the liveliness tokens that exist."""
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
-        """Call ``handler`` with the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+        """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
 
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded); raise BusError after 2 s."""
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener appears and when the last one leaves."""
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""

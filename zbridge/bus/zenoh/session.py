@@ -219,7 +219,7 @@ class ZenohBus:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
-        """Call ``handler`` with the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+        """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
         store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
         return self._keep(Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
 
@@ -246,7 +246,7 @@ class ZenohBus:
             raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener appears and when the last one leaves."""
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
         loop = self._loop
         plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
 

@@ -48,9 +48,9 @@ class Hooks(msgspec.Struct, frozen=True):
     foreign: Count
     clock: Callable[[], float]
     before: Callable[[], object] = lambda: None
-    """Called before anything is written."""
+    """Called before a frame is written: a stop may have to be written first."""
     stalled: Callable[[bool], object] = lambda stalled: None
-    """Called when the link takes nothing any more (True), and when it does again (False)."""
+    """Called when the link stops taking bytes (True), and when it takes them again (False)."""
 
 
 class Links:
@@ -111,7 +111,7 @@ class Connection:
         return f"<Connection {self.name} {self.address} {self.state}>"
 
     async def run(self) -> None:
-        """Keep connected until :meth:`close`."""
+        """Connect, converse and connect again, until :meth:`close`."""
         backoff = Backoff()
         while not self._ending:
             reason, established = await self._converse()
@@ -123,7 +123,7 @@ class Connection:
             await asyncio.sleep(delay_s)
 
     async def close(self, reason: str, timeout_s: float) -> None:
-        """Take leave of the peer, for at most ``timeout_s`` seconds, and do not connect again."""
+        """End the conversation within ``timeout_s`` seconds, and do not connect again."""
         self._ending = True
         conversation = self.conversation
         if conversation is not None:
@@ -136,7 +136,7 @@ class Connection:
         return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
 
     def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
-        """Show the raw frames of one direction (``in`` or ``out``) from now on; None: no more."""
+        """Show the raw frames of one direction (``in`` or ``out``) from now on; None: show none."""
         if show is not None:
             self._watchers[direction] = show
         else:

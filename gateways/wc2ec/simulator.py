@@ -25,9 +25,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerSession
-from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import State
+from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Accepted, Conversation
 from zbridge.transport.link import Link

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.bus import Bus, Handle
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
@@ -35,7 +35,7 @@ from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport.tcp import connect
+from zbridge.transport.connect import connect
 
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
@@ -52,7 +52,7 @@ class Device:
     def __init__(
         self,
         robot: Robot,
-        addresses: tuple[Address, ...],
+        addresses: tuple[DeviceAddress, ...],
         *,
         protocol: str,
         keys: KeySpace,
@@ -84,14 +84,14 @@ class Device:
         self._telemetry = Telemetry(context, self._publishers, pending, links)
         self._presence = Presence(context, protocol, links, self._enforcer, self._standstill, self._commands, pending)
         conditions.changed = self._presence.publish_status
-        for index, (name, address) in enumerate(zip(robot.link_names, addresses, strict=True)):
-            hooks = self._hooks(index, name, address, connect, manager)
+        for name, address in zip(robot.link_names, addresses, strict=True):
+            hooks = self._hooks(name, address, connect, manager)
             links.add(Connection(name, f"{keys.robot} {name}", address, hooks))
 
-    def _hooks(self, index: int, name: str, address: Address, connect: Connect, sessions: SessionTable) -> Hooks:
+    def _hooks(self, name: str, address: DeviceAddress, connect: Connect, sessions: SessionTable) -> Hooks:
         context, presence = self._context, self._presence
         return Hooks(
-            session=partial(self._session, index, str(address)),
+            session=partial(self._session, name, str(address)),
             deliver=self._telemetry.deliver,
             session_changed=presence.session_changed,
             state_changed=presence.publish_status,
@@ -139,11 +139,11 @@ class Device:
         self._enforcer.refuse(command, refusal, who)
         self._enforcer.settle()
 
-    def _session(self, index: int, address: str) -> Session[Any]:
+    def _session(self, link: str, address: str) -> Session[Any]:
         """Make the session of a new connection; the names of the one before it are given up."""
-        if not index:
+        if link == self._links.first.name:
             self._publishers.forget_names()
-        return self._context.robot.session(index, address)
+        return self._context.robot.session(link, address)
 
     def _on_bus(self, connected: bool) -> None:
         if not connected:

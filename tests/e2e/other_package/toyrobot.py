@@ -76,7 +76,7 @@ class ToyRobot(Robot):
     def __init__(self, options: Options, links: int, metrics: Metrics) -> None:
         self._session: ToySession | None = None
 
-    def session(self, link: int, peer: str) -> ToySession:
+    def session(self, link: str, peer: str) -> ToySession:
         self._session = ToySession(Limits(frame_bytes=100, handshake_s=5.0))
         return self._session
 
@@ -103,7 +103,7 @@ class ToyRobot(Robot):
         if self._session is None:
             raise NotReady("no connection")
         frame = b"go %f %f\n" % (forward, turn)
-        self._session.outbox.stand("motion", (frame,), now, period_s=0.1, **more)
+        self._session.outbox.set("motion", (frame,), now, period_s=0.1, **more)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported("it cannot be asked")

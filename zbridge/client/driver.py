@@ -9,8 +9,8 @@ import socket
 from typing import Any
 
 from zbridge.bus import Answer, Bus, Publisher, Sample
-from zbridge.control.authority import NAMED
 from zbridge.control.proof import Signer
+from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, Code, Held, LeaseLost, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads

@@ -16,8 +16,9 @@ import math
 
 from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
-from zbridge.control.authority import Authority, Event, EventKind
+from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
+from zbridge.control.events import Event, EventKind
 from zbridge.control.gate import CommandGate, Sieve
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill

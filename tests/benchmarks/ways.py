@@ -168,7 +168,7 @@ def _free_port() -> int:
 
 _DRIVER = """
 import sys, time, zbridge
-with zbridge.blocking.connect(endpoints=[sys.argv[1]]) as fleet, fleet["r1"].control() as drive:
+with zbridge.blocking.connect(endpoints=[sys.argv[1]]) as fleet, fleet["r1"].control(deadman_s=2.0) as drive:
     for number in range(int(float(sys.argv[2]) * 10)):
         drive(forward=0.1 + 0.01 * (number % 5))
         time.sleep(0.1)

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from tests.hq.scene import COMMANDS, KEYS, Program, Scene, ToySession, ToySide, framed, serving, soon
-from zbridge.bus.interface import Question
+from zbridge.bus.interface import IncomingQuery
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -211,7 +211,7 @@ class Told:
         self.refusals: list[Refusal] = []
         scene.gateway.bus.answer(KEYS.key("@rpc/control/refused/hq.toy"), self._hear)
 
-    def _hear(self, question: Question) -> None:
+    def _hear(self, question: IncomingQuery) -> None:
         self.refusals += payloads.decode(Refusals, question.payload).refusals
         question.answer(payloads.encode(Query()))
 

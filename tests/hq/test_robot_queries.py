@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.hq.scene import COMMANDS, KEYS, MAP, Scene, serving, soon
-from zbridge.bus.interface import Answer, Question
+from zbridge.bus.interface import Answer, IncomingQuery
 from zbridge.errors import BusError, NotReady
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -23,10 +23,10 @@ pytestmark = pytest.mark.jumping
 # Questions
 
 
-def answering(scene: Scene, topic: Topic, answer: Callable[[Question], None]) -> list[Question]:
-    asked: list[Question] = []
+def answering(scene: Scene, topic: Topic, answer: Callable[[IncomingQuery], None]) -> list[IncomingQuery]:
+    asked: list[IncomingQuery] = []
 
-    def take(question: Question) -> None:
+    def take(question: IncomingQuery) -> None:
         asked.append(question)
         answer(question)
 

@@ -107,7 +107,7 @@ class Client:
 
     @property
     def silent_s(self) -> float:
-        """Seconds since the last sign of life of the program's machine."""
+        """Seconds for which the program's machine has owed an acknowledgement."""
         return self.conversation.silent_s
 
     def repeat(self) -> None:

@@ -11,8 +11,8 @@ from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
 from zbridge.control.lease_client import RETRY_S, LeaseClient
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
 from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, Held, LeaseLost, PayloadError, Refused
 from zbridge.errors import refusal as refused

@@ -21,13 +21,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from enum import StrEnum
 from typing import ClassVar, TypeAlias
 
 import msgspec
 
 from zbridge.bus import Answer
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind, Reply, code_of, passes, read
+from zbridge.control.lease_events import Input, LeaseEvent, LeaseEventKind, Reply, State, code_of, passes, read
 from zbridge.control.proof import Signer
 from zbridge.control.refusal_news import RefusalNews
 from zbridge.errors import BusError, Code, PayloadError
@@ -42,38 +41,6 @@ RETRY_S = 0.1
 """Seconds between two questions to a gateway that does not answer, or cannot say."""
 LEASE_S = 3.0
 """The length of a lease that does not tell its own, seconds."""
-
-
-class State(StrEnum):
-    """What a program has, and what it waits for."""
-
-    FREE = "free"
-    ASKING = "asking"
-    DROPPED = "dropped"
-    RECALLED = "recalled"
-    PAUSED = "paused"
-    HELD = "held"
-    CHECKING = "checking"
-    DOUBTED = "doubted"
-    RETURNING = "returning"
-    WANTED = "wanted"
-
-
-class Input(StrEnum):
-    """What the program wants, what was replied, and what is heard."""
-
-    WANT = "want"
-    DROP = "drop"
-    GRANTED = "granted"
-    DENIED = "denied"
-    LATER = "ask later"
-    CONFIRMED = "confirmed"
-    UNANSWERED = "unanswered"
-    ENDED = "ended"
-    RETURNED = "returned"
-    DOUBT = "doubt"
-    DUE = "due"
-    GATEWAY_LOST = "gateway lost"
 
 
 class Question(msgspec.Struct, frozen=True):

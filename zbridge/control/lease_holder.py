@@ -9,7 +9,7 @@ from typing import Any
 
 from zbridge.bus import Bus, Handle
 from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_replies import LeaseEvent
+from zbridge.control.lease_events import LeaseEvent
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
 

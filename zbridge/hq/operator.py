@@ -13,8 +13,8 @@ import math
 from collections.abc import Callable
 
 from zbridge.control.lease_client import LeaseClient
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
 from zbridge.errors import Code, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal

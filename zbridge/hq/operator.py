@@ -86,7 +86,7 @@ class Operator:
     # What the client says
 
     def command(self, topic: Topic, message: FleetMessage) -> None:
-        """Carry out a command of the client; raise Refused with the reason where it may not be."""
+        """Carry out a command of the client; raise Refused with the reason if it may not be."""
         now = self._clock()
         if isinstance(message, Drive | Motor):
             self._move(topic, message, now)
@@ -104,7 +104,7 @@ class Operator:
             self._bridge.put(topic, message)
 
     def tick(self) -> None:
-        """Repeat what is held, keep the lease or give it back; to be called every :data:`REPEAT_S` while active."""
+        """Repeat what was set once, renew or release the lease; must be called every :data:`REPEAT_S` while active."""
         now, intent = self._clock(), self.intent
         intent.expire(now)
         if not intent.held:
@@ -209,7 +209,7 @@ class Operator:
             raise NotReady(missing)
 
     def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
-        """Tell the robot its control mode, if it is of a protocol that has any."""
+        """Send the robot its control mode, if its protocol has control modes."""
         if self.intent.held and self._modes is not None and self._bridge.view.protocol == self._modes:
             send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
 

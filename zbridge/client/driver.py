@@ -148,7 +148,7 @@ class Driver:
             self._refusal = refused(refusal.code, text)
 
     async def release(self) -> None:
-        """Give the lease back and wait until the gateway was asked; a moving robot is stopped."""
+        """Release the lease and wait for the answer; a moving robot is stopped."""
         for task in self._tasks:
             task.cancel()
         self._granted.cancel()

@@ -60,7 +60,7 @@ class LeaseHolder:
         self._settle()
 
     def drop(self) -> None:
-        """Give the lease back, or give up asking for it. No event follows."""
+        """Release the lease, or stop asking for it. No event follows."""
         self.client.drop(self._clock())
         self._settle()
 

@@ -14,8 +14,8 @@ import math
 from collections.abc import Callable
 
 from zbridge.control.lease_client import LeaseClient
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
 from zbridge.errors import Code, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
@@ -85,7 +85,7 @@ class Operator:
     # What the client says
 
     def command(self, topic: Topic, message: FleetMessage) -> None:
-        """Carry out a command of the client; raise Refused with the reason where it may not be."""
+        """Carry out a command of the client; raise Refused with the reason if it may not be."""
         now = self._clock()
         if isinstance(message, Drive | Motor):
             self._move(topic, message, now)

@@ -292,16 +292,24 @@ def test_a_simulated_robot_that_does_not_move_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         await deaf(simulation, 0.0)
 
-    (claim,) = failed(check_motion(broken(simulate=simulate), 5.0))
-    assert claim == "the simulated robot drives"
+    drives, turns = failed(check_motion(broken(simulate=simulate), 5.0))
+    assert (drives, turns) == ("the simulated robot drives", "a turn of the simulated robot is counter-clockwise")
+
+
+def test_a_robot_that_drives_backwards_and_turns_clockwise_is_found() -> None:
+    def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
+        toy.ToyRobot._go(self, -forward, -turn, now, **more)
+
+    drives, turns = failed(check_motion(with_robot(_go=go), 5.0)).values()
+    assert drives.startswith("it moved -0.")
+    assert turns.startswith("its heading changed by -0.")
 
 
 def test_a_simulated_robot_that_does_not_stand_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         await deaf(simulation, 0.1)
 
-    (claim,) = failed(check_motion(broken(simulate=simulate), 5.0))
-    assert claim == "the simulated robot stands after its stop"
+    assert "the simulated robot stands after its stop" in failed(check_motion(broken(simulate=simulate), 5.0))
 
 
 async def deaf(simulation: Simulation, step_m: float) -> None:

@@ -47,7 +47,6 @@ def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m zbridge.simulation.check NAME\n")
         return 2
-    logging.disable(logging.CRITICAL)
     try:
         protocol = find_protocol(arguments[0])
     except ConfigError as error:
@@ -63,4 +62,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.CRITICAL)  # of this process alone: the findings say what is wrong
     sys.exit(main(sys.argv[1:]))

@@ -44,6 +44,14 @@ TOY: Protocol = toy.PROTOCOL
 LINES = TOY.codecs[0]
 
 
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Watch the toy for a shorter time: it shows its pose ten times a second."""
+    times = {"DRIVE_S": 0.5, "IDLE_S": 0.1, "STAND_S": 0.4, "TURN_S": 0.3, "WATCHED_S": 0.5}
+    for name, seconds in times.items():
+        monkeypatch.setattr(f"zbridge.simulation.check_motion.{name}", seconds)
+
+
 @pytest.fixture(scope="module")
 def heard() -> Recording:
     """What the sound robot says."""

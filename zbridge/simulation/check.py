@@ -63,4 +63,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.CRITICAL)  # of this process alone: the findings say what is wrong
     sys.exit(main(sys.argv[1:]))

@@ -16,7 +16,8 @@ import pytest
 
 from gateways.alf.conformance import parser
 from gateways.alf.conformance.fragile_robot import FragileVehicle, simulate_fragile
-from gateways.alf.conformance.parser import Dialect, Machine, Repeats, Scale, Times
+from gateways.alf.conformance.machine import Machine
+from gateways.alf.conformance.parser import Dialect, Repeats, Scale, Times
 
 QUICK = Times(
     cycle_s=0.005,
@@ -801,7 +802,7 @@ async def test_a_close_within_a_message_is_noted(dialect: Dialect, part: bytes) 
         await violated(vehicle, "the connection ended within a message: ")
 
 
-@pytest.mark.parametrize("after", ["standing", "over"])
+@pytest.mark.parametrize("after", ["connected", "over"])
 async def test_a_second_connection_is_accepted_and_never_answered(after: str) -> None:
     vehicle = quick(laser=True)
     async with connected(vehicle) as hq:

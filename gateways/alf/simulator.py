@@ -17,6 +17,7 @@ import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleSession
+from gateways.alf.translate import DRIVE, LASER
 from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import State
@@ -118,7 +119,7 @@ class Simulator:
     def __init__(self, seed: int, dialect: Dialect) -> None:
         self.car = Car(seed, dialect)
         self._dialect = dialect
-        self._peers: dict[str, set[Conversation]] = {"drive": set(), "laser": set()}
+        self._peers: dict[str, set[Conversation]] = {DRIVE: set(), LASER: set()}
         self._loop = asyncio.get_running_loop()
 
     def __repr__(self) -> str:
@@ -126,7 +127,7 @@ class Simulator:
 
     async def run(self, simulation: Simulation) -> None:
         """Listen and live until cancelled; then say END."""
-        parts = [{"drive"}, {"laser"}] if len(simulation.addresses) > 1 else [{"drive", "laser"}]
+        parts = [{DRIVE}, {LASER}] if len(simulation.addresses) > 1 else [{DRIVE, LASER}]
         async with contextlib.AsyncExitStack() as stack:
             addresses = [
                 await stack.enter_async_context(listen(address, self._accepting(part)))
@@ -152,7 +153,7 @@ class Simulator:
 
     def _greet(self, conversation: Conversation, parts: set[str]) -> None:
         """Describe the scanner, and only then send what it measures."""
-        if "laser" in parts:
+        if LASER in parts:
             _send(conversation, SCANNER)
         for part in () if conversation.ended.done() else parts:
             self._peers[part].add(conversation)
@@ -175,9 +176,9 @@ class Simulator:
             steps += 1
             self.car.step(STEP_S)
             if steps % _SCAN_EVERY == 0:
-                self._tell("laser", self.car.measure())
+                self._tell(LASER, self.car.measure())
             if steps % _INFO_EVERY == 0:
-                self._tell("drive", self.car.info())
+                self._tell(DRIVE, self.car.info())
 
 
 def _send(conversation: Conversation, message: AlfMessage) -> None:

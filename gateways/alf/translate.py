@@ -34,6 +34,10 @@ from zbridge.protocol.device_clock import DeviceClock
 from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
 
 NAME = "alf"
+VEHICLE = "vehicle"
+"""The link of a vehicle that has one."""
+DRIVE, LASER = "drive", "laser"
+"""The links of a vehicle that has two."""
 STANDARD_GRAVITY = 9.80665
 FULL_LOCK_DEG = 90
 """The steering angle at ``turn`` = -1 or 1."""
@@ -71,10 +75,10 @@ class AlfRobot(Robot):
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
-        self.link_names = ("vehicle",) if links == 1 else ("drive", "laser")
+        self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = Dialect(options.dialect)
-        self._sessions: list[HqSession | None] = [None] * links
+        self._session: HqSession | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
@@ -89,10 +93,11 @@ class AlfRobot(Robot):
 
     @property
     def driving(self) -> HqSession | None:
-        return self._sessions[0]
+        return self._session
 
-    def session(self, link: int, peer: str) -> HqSession:
-        if link == 0:
+    def session(self, link: str, peer: str) -> HqSession:
+        drives = link == self.link_names[0]
+        if drives:
             self._backward = False
             self._command = self._neutral()
         session = HqSession(
@@ -100,9 +105,10 @@ class AlfRobot(Robot):
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,
             gap_s=self.options.gap_s,
-            drives=self._command if link == 0 else None,
+            drives=self._command if drives else None,
         )
-        self._sessions[link] = session
+        if drives:
+            self._session = session
         return session
 
     # Messages to telemetry
@@ -202,10 +208,9 @@ class AlfRobot(Robot):
         return DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
 
     def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
-        session = self._sessions[0]
-        if session is None:
+        if self._session is None:
             raise NotReady("offline")
-        session.drive(command, now, urgent=urgent)
+        self._session.drive(command, now, urgent=urgent)
         self._command = command
         self._backward = command.direction == _BACKWARD
 

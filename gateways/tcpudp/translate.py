@@ -110,7 +110,7 @@ class TcpUdpRobot(Robot):
     def driving(self) -> HqSession | None:
         return self._session
 
-    def session(self, link: int, peer: str) -> HqSession:
+    def session(self, link: str, peer: str) -> HqSession:
         self._session = HqSession(
             limits(self.options.gap_s),
             udp=self.options.udp,

@@ -166,7 +166,7 @@ class Wc2EcRobot(Robot):
             return ()
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
-    def session(self, link: int, peer: str) -> ExternalSession:
+    def session(self, link: str, peer: str) -> ExternalSession:
         self._session = ExternalSession(self._dialect)
         self._table = Table()
         self._ring = Ring(self.options) if self.options.bearings_deg else None

@@ -22,7 +22,7 @@ class ToyRobot(Robot):
     def __init__(self) -> None:
         self.current: Toy | None = None
 
-    def session(self, link: int, peer: str) -> Toy:
+    def session(self, link: str, peer: str) -> Toy:
         self.current = Toy(LIMITS)
         return self.current
 
@@ -46,7 +46,7 @@ class ToyRobot(Robot):
 def test_a_robot_is_ready_while_its_driving_session_is_established() -> None:
     robot = ToyRobot()
     assert not robot.ready
-    session = robot.session(0, "")
+    session = robot.session("robot", "")
     assert not robot.ready
     session.open(0.0)
     assert not robot.ready

@@ -43,11 +43,11 @@ class Robot(ABC):
 
     dialect: ClassVar[str | None] = None
     link_names: tuple[str, ...]
-    """One name for each configured address; the first link is the one that drives."""
+    """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 
     @abstractmethod
-    def session(self, link: int, peer: str) -> Session[Any]:
-        """Make the session for a new connection of one link."""
+    def session(self, link: str, peer: str) -> Session[Any]:
+        """Make the session for a new connection of the link of this name; ``peer``: its address, for logs."""
 
     @property
     @abstractmethod

@@ -76,7 +76,7 @@ class ToyRobot(Robot):
     def __init__(self, options: Options, links: int, metrics: Metrics) -> None:
         self._session: ToySession | None = None
 
-    def session(self, link: int, peer: str) -> ToySession:
+    def session(self, link: str, peer: str) -> ToySession:
         self._session = ToySession(Limits(frame_bytes=100, handshake_s=5.0))
         return self._session
 

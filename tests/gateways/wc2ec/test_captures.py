@@ -48,7 +48,7 @@ def delivered(session: ExternalSession, data: bytes) -> list[Wc2EcMessage]:
 
 def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
     """What the fleet is told of everything the controller sent, each segment at its recorded time."""
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     telemetry: list[tuple[Topic, FleetMessage]] = []
     for record in payloads(NAME, source=PORT):

@@ -1063,7 +1063,7 @@ def test_the_recorded_controller_says_nothing_and_so_commands_nothing() -> None:
 )
 def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_was(sent: bytes) -> None:
     robot, scene = Wc2EcRobot(Options()), Scene(None)
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     written = b""
     for message in session.receive(sent, 0.0):

@@ -116,7 +116,7 @@ class Wire:
             self.told(greeting)
 
     def connect(self) -> None:
-        self.session = self.robot.session(0, "tcp://robot.test:1")
+        self.session = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(self.now)
         if self.session.state is State.ESTABLISHED:
             self.begun = self.robot.begun(STAMP)

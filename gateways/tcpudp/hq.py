@@ -46,7 +46,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.session import CLIENT_PORT, RobotSession
+from gateways.tcpudp.session import CLIENT_PORT, RobotRole
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, Length, PacketId, Scale
 from zbridge.errors import EncodeError, ProtocolError
@@ -100,7 +100,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("slam_map_size is smaller than slam_map_interval: a map of no cells")
 
 
-class HqClient(RobotSession):
+class HqClient(RobotRole):
     """The session of one client, the size of the map that it was told, and what it has asked for."""
 
     def __init__(self, bounds: Limits, settings: Settings, number: int, options: HqOptions, geometry: Geometry) -> None:
@@ -375,7 +375,7 @@ _NO_MAP = Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
 
 def _to_all(slot: str, packet: Packet) -> Send:
     """Encode a packet once for every client; one that datagrams may carry, in both forms."""
-    frame = encode_packet(packet, RobotSession.sender_id)
+    frame = encode_packet(packet, RobotRole.sender_id)
     datagram = Datagram(frame) if _may_go_by_datagram(packet) else frame
 
     def send(session: HqClient, now: float) -> None:
@@ -390,7 +390,7 @@ def _may_go_by_datagram(packet: Packet) -> bool:
 
 def _once(packet: Packet) -> Send:
     """Encode a packet once; it is queued, and nothing replaces it."""
-    frame = encode_packet(packet, RobotSession.sender_id)
+    frame = encode_packet(packet, RobotRole.sender_id)
     if len(frame) > TCP_BYTES:
         raise EncodeError(f"packet of {len(frame)} bytes, HQ programs take {TCP_BYTES} by TCP")
     packet_id = frame[5]
@@ -404,7 +404,7 @@ def _once(packet: Packet) -> Send:
     return send
 
 
-_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotSession.sender_id)
+_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotRole.sender_id)
 
 
 def _request(session: HqClient, now: float) -> None:

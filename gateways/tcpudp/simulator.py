@@ -35,7 +35,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.session import RobotSession, limits
+from gateways.tcpudp.session import RobotRole, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
 from zbridge.errors import EncodeError, Refused
@@ -194,7 +194,7 @@ class Simulator:
         client_id = self._ids.take(self._loop.time())
         if client_id is None:
             return None
-        session = RobotSession(limits(0.0), self._settings, client_id, self._versions)
+        session = RobotRole(limits(0.0), self._settings, client_id, self._versions)
         session.name = f"hq {client_id}"
         conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
         conversation.ended.add_done_callback(lambda _: self._dismiss(client_id))
@@ -259,7 +259,7 @@ class Simulator:
 def _send(conversation: Conversation, message: Packet) -> None:
     try:
         session = conversation.session
-        assert isinstance(session, RobotSession)
+        assert isinstance(session, RobotRole)
         session.may_send(message)
         session.send(message)
     except (Refused, EncodeError) as error:

@@ -35,7 +35,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.session import HqSession, limits
+from gateways.tcpudp.session import HqRole, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import ANNOUNCED
 from zbridge.errors import Malformed, NotReady, ProtocolError, Refused, Unsupported
@@ -93,7 +93,7 @@ class TcpUdpRobot(Robot):
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
         self._announce = tuple(Feature(name) for name in options.announce)
-        self._session: HqSession | None = None
+        self._session: HqRole | None = None
         self._chosen: str | None = None
         """The mode that was commanded last."""
         self._paired_until = self._rests_until = -math.inf
@@ -107,11 +107,11 @@ class TcpUdpRobot(Robot):
         self._heading_offset = options.heading_offset
 
     @property
-    def driving(self) -> HqSession | None:
+    def driving(self) -> HqRole | None:
         return self._session
 
-    def session(self, link: str, peer: str) -> HqSession:
-        self._session = HqSession(
+    def session(self, link: str, peer: str) -> HqRole:
+        self._session = HqRole(
             limits(self.options.gap_s),
             udp=self.options.udp,
             force=self._force,
@@ -289,13 +289,13 @@ class TcpUdpRobot(Robot):
         session.outbox.stand(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
         self._rests_until, self._paired_until = until, until if paired else -math.inf
 
-    def _connected(self) -> HqSession:
+    def _connected(self) -> HqRole:
         if self._session is None:
             raise NotReady("offline")
         return self._session
 
 
-def _sendable(session: HqSession, packets: Iterable[Packet]) -> tuple[bytes, ...]:
+def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
     """Write the packets that the robot may be sent; raise Refused where it may be sent none of them."""
     frames, refusal = [], None
     for packet in packets:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet
-from gateways.tcpudp.session import HqSession, RobotSession
+from gateways.tcpudp.session import HqRole, RobotRole
 from zbridge.protocol.session import Datagram
 
 LISTED = b"1.1,1.2,1.3"
@@ -62,7 +62,7 @@ class Sent:
 class Timed:
     """A session whose timers fire when they are due, and what left it when and by which channel."""
 
-    def __init__(self, session: HqSession | RobotSession) -> None:
+    def __init__(self, session: HqRole | RobotRole) -> None:
         self.session = session
         self.now = 0.0
         self.sent: list[Sent] = []

@@ -26,7 +26,7 @@ class Machine:
 
     def __init__(self, random: Random, points: int = POINTS, speed_full: int = FULL_PERCENT) -> None:
         """Set up at a seeded place; ``points``: of a measurement; ``speed_full``: the field that is full speed."""
-        self.place = Body(random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3))
+        self.place = Body.somewhere(random)
         self.light = False
         self.points, self._speed_full = points, speed_full
         self._random = random

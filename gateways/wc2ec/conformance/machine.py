@@ -61,7 +61,7 @@ class Robot:
 
     def __init__(self, devices: Sequence[Device], random: Random, values: int) -> None:
         """Set up at a seeded place; ``values``: how many configuration values each light sensor has."""
-        self.place = Body(random.uniform(-0.5, 0.5), random.uniform(-0.5, 0.5), random.uniform(-0.3, 0.3))
+        self.place = Body.somewhere(random)
         self.motors = {device.name: Motor(device) for device in devices if device.motor}
         lights = [device.number for device in devices if device.kind is Kind.LIGHT]
         self.enabled: set[int] = set()

@@ -8,11 +8,9 @@
 from __future__ import annotations
 
 from gateways.alf.hq import AlfHq, HqOptions
-from gateways.alf.messages import Dialect
+from gateways.alf.messages import Dialect, codecs
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
@@ -95,5 +93,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

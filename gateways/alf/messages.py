@@ -10,11 +10,12 @@ import math
 import re
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import (
     F32,
     I32,
@@ -266,3 +267,17 @@ def write_binary(message: AlfMessage) -> bytes:
 
 _SKIPPED = 4096
 """Bytes of the longest stretch without a message that is counted as one."""
+
+
+def codecs() -> tuple[Codec, ...]:
+    """List the messages of both dialects and both sides for the conformance kit; one measurement has two points."""
+    found = []
+    for sender in (Sender.VEHICLE, Sender.HQ):
+        ids = sent_by(sender)
+        messages = tuple(MESSAGES[number].message for number in sorted(ids))
+        end = binary_frame_end(ids, lambda: 2)
+        found += [
+            Codec(f"text, {sender.value}", write_text, partial(read_text, ids=ids), text_frame_end(4096), messages),
+            Codec(f"binary, {sender.value}", write_binary, partial(read_binary, ids=ids), end, messages),
+        ]
+    return tuple(found)

@@ -28,8 +28,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from zbridge.errors import Code, NotReady, ProtocolError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import Code, Limits, NotReady, ProtocolError, Role, Session, State
 
 REPEAT_S = 0.02
 """Seconds between repetitions of the drive command."""
@@ -136,7 +135,7 @@ class HqSession(AlfSession):
         """Send a command at once, and again every 20 ms until the next one."""
         if self.over:
             raise NotReady("closing", Code.CLOSING)
-        self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
+        self.outbox.set(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
 class VehicleSession(AlfSession):

@@ -14,7 +14,8 @@ import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleSession
-from zbridge.protocol.plugin import Simulation
+from gateways.alf.translate import DRIVE, LASER, VEHICLE
+from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Conversation
@@ -109,23 +110,22 @@ class VehicleSimulator(Simulator[AlfMessage]):
     """Serves one car: on one link, or drive commands on the first and measurements on the second ("Roles")."""
 
     def __init__(self, seed: int, dialect: Dialect, links: int) -> None:
-        super().__init__(log)
+        super().__init__(log, links=(DRIVE, LASER) if links > 1 else (VEHICLE,))
         self.car = Car(seed, dialect)
         self._dialect = dialect
-        self._drive: int | None = None if links == 1 else 0
-        self._laser: int | None = None if links == 1 else 1
+        self._drive, self._laser = (DRIVE, LASER) if links > 1 else (VEHICLE, VEHICLE)
 
     def __repr__(self) -> str:
         return f"<VehicleSimulator {self.car}>"
 
-    def session(self, peer: str, link: int) -> VehicleSession:
+    def session(self, peer: str, link: str) -> VehicleSession:
         session = VehicleSession(self._dialect)
         session.name = f"hq {peer}"
         return session
 
-    def greet(self, client: Conversation, link: int) -> None:
+    def greet(self, client: Conversation, link: str) -> None:
         """Describe the scanner, before anything is measured."""
-        if self._laser in (None, link):
+        if link == self._laser:
             self.send(client, SCANNER)
 
     def take(self, client: Conversation, message: AlfMessage) -> None:

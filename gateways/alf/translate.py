@@ -25,13 +25,20 @@ from gateways.alf.messages import (
     ScannerInit,
 )
 from gateways.alf.session import HqSession, points_of
-from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.device_clock import DeviceClock
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    DeviceClock,
+    Metrics,
+    NotReady,
+    Outcome,
+    ProtocolError,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "alf"
 VEHICLE = "vehicle"

@@ -36,9 +36,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotRole, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import Session
-from zbridge.protocol.session_table import ClientIds
+from zbridge.protocol import ClientIds, Session, Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport.conversation import Conversation
@@ -166,8 +164,7 @@ class RobotSimulator(Simulator[Packet]):
     """Serves one vehicle to the HQ programs that connect."""
 
     def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
-        super().__init__(log)
-        self.datagrams = udp
+        super().__init__(log, datagrams=udp)
         self.vehicle = Vehicle(seed)
         self.vehicle.look()
         self._versions = VERSIONS[version].listed.split(",")
@@ -178,7 +175,7 @@ class RobotSimulator(Simulator[Packet]):
     def __repr__(self) -> str:
         return f"<RobotSimulator {self.vehicle}>"
 
-    def session(self, peer: str, link: int) -> RobotRole | None:
+    def session(self, peer: str, link: str) -> RobotRole | None:
         client_id = self._ids.take(self._loop.time())
         if client_id is None:
             return None

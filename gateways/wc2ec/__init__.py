@@ -9,11 +9,9 @@ the others.
 from __future__ import annotations
 
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq
-from gateways.wc2ec.messages import Dialect
+from gateways.wc2ec.messages import Dialect, codecs
 from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -122,5 +120,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

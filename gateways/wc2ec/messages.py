@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from zbridge.errors import ProtocolError
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import F64, U8, BinaryCodec, Message
 from zbridge.wire.fields import CountedBytes, Filling
 from zbridge.wire.frames import FrameEnd
@@ -171,3 +172,18 @@ def write(message: Wc2EcMessage, dialect: Dialect) -> bytes:
     """Write one message; raise EncodeError where a value has no form in it."""
     command = message.commands[dialect]
     return bytes((command,)) + MESSAGES[dialect][command].codec.encode(message)
+
+
+def codecs() -> tuple[Codec, ...]:
+    """List the messages of both dialects and both sides for the conformance kit; a sensor has two values."""
+    return tuple(
+        Codec(
+            f"{dialect.value}, {sender.value}",
+            partial(write, dialect=dialect),
+            partial(read, dialect=dialect),
+            frame_end(dialect, sender, values=2),
+            tuple(spec.message for spec in MESSAGES[dialect].values() if spec.sender is sender),
+        )
+        for dialect in Dialect
+        for sender in Sender
+    )

@@ -19,8 +19,7 @@ from gateways.wc2ec.messages import (
     read,
     write,
 )
-from zbridge.errors import EncodeError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import EncodeError, Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
 SETTLE_S = 0.1
@@ -74,7 +73,7 @@ class ExternalSession(Wc2EcSession):
     def accept(self, message: Wc2EcMessage, now: float) -> bool:
         if self.state is State.HANDSHAKING:
             if isinstance(message, RegisterSensor):
-                self._limit_at = math.inf
+                self.lift_limit()
                 self._settled_at = now + SETTLE_S
             elif isinstance(message, SensorData):
                 self._settle()

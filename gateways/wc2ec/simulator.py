@@ -24,7 +24,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerSession
-from zbridge.protocol.plugin import Simulation
+from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Conversation
@@ -120,12 +120,12 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
     def __repr__(self) -> str:
         return f"<ControllerSimulator {self.machine}>"
 
-    def session(self, peer: str, link: int) -> ControllerSession:
+    def session(self, peer: str, link: str) -> ControllerSession:
         session = ControllerSession(self._dialect, values=VALUES)
         session.name = f"controller {peer}"
         return session
 
-    def greet(self, client: Conversation, link: int) -> None:
+    def greet(self, client: Conversation, link: str) -> None:
         """Register the devices, before any data."""
         if self._dialect is Dialect.DEPLOYED:
             self.send(client, *DEVICES)

@@ -37,18 +37,30 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ExternalSession
-from zbridge.errors import ConfigError, Malformed, NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Text
+from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    BearingScan,
+    ConfigError,
+    Differential,
+    Factors,
+    Malformed,
+    Metrics,
+    NotReady,
+    Outcome,
+    Positive,
+    ProtocolError,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "wc2ec"
 STOP_REPEAT_S = 0.1
 
 Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
-Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 Bearing = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 
@@ -61,23 +73,12 @@ class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: str = LIGHT
 
 
-class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two sides of wheels. speed_full, turn_full: m/s and rad/s of a drive of 1."""
+class WheelMotors(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Two sides of wheels, by the names of their motors."""
 
     left: tuple[str, ...]
     right: tuple[str, ...]
     wheel_radius_m: Positive
-    track_m: Positive
-    speed_full_m_s: Positive = 0.5
-    turn_full_rad_s: Positive = 1.0
-
-
-class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """rad/s of one motor for a drive of 1."""
-
-    forward: Number = 0.0
-    left: Number = 0.0
-    turn: Number = 0.0
 
 
 class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -101,7 +102,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     devices: tuple[DeviceOption, ...] = ()
     motor_types: MotorTypes = MotorTypes()
     motors: MotorNames = MotorNames()
-    differential: Differential | None = None
+    differential: WheelMotors | None = None
     factors: dict[str, Factors] = {}
     bounds: dict[str, tuple[Number, Number]] = {}
     bounds_default: tuple[Number, Number] | None = None
@@ -148,7 +149,7 @@ class Wc2EcRobot(Robot):
         self._session: ExternalSession | None = None
         self._table = Table()
         self._listened: set[str] = set(options.pinned)
-        self._ring: Ring | None = None
+        self._ring: BearingScan | None = None
         self._tables = {name: np.array(table).T for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
         self._unregistered = metrics.count("sensor_unregistered")
@@ -169,10 +170,14 @@ class Wc2EcRobot(Robot):
     def session(self, link: str, peer: str) -> ExternalSession:
         self._session = ExternalSession(self._dialect)
         self._table = Table()
-        self._ring = Ring(self.options) if self.options.bearings_deg else None
+        self._ring = self._new_ring()
         for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
             self._table.add(Device(option.name, option.name, option.number, 0, option.kind))
         return self._session
+
+    def _new_ring(self) -> BearingScan | None:
+        options = self.options
+        return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         if self._dialect is Dialect.DRAFT:
@@ -180,7 +185,7 @@ class Wc2EcRobot(Robot):
             devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
             frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
             if frames:
-                session.outbox.stand("enable", frames, -math.inf)
+                session.outbox.set("enable", frames, -math.inf)
             return ((topics.DEVICES, self._table.message(stamp_ns)),)
         return ()
 
@@ -280,18 +285,11 @@ class Wc2EcRobot(Robot):
         """Give the velocity of every driven motor, rad/s."""
         wheels = self.options.differential
         if wheels is not None:
-            if command.left and not (command.forward or command.turn):
-                raise Unsupported("left: a robot with two sides of wheels does not move sideways")
-            along = command.forward * wheels.speed_full_m_s
-            across = command.turn * wheels.turn_full_rad_s * wheels.track_m / 2
-            left, right = (along - across) / wheels.wheel_radius_m, (along + across) / wheels.wheel_radius_m
+            left, right = (side_m_s / wheels.wheel_radius_m for side_m_s in wheels.sides_m_s(command))
             return {**dict.fromkeys(wheels.left, left), **dict.fromkeys(wheels.right, right)}
         if not self.options.factors:
             raise Unsupported("no kinematics in the configuration (differential or factors)")
-        return {
-            name: command.forward * factor.forward + command.left * factor.left + command.turn * factor.turn
-            for name, factor in self.options.factors.items()
-        }
+        return {name: factors.value(command) for name, factors in self.options.factors.items()}
 
     def _stand(
         self,
@@ -310,7 +308,7 @@ class Wc2EcRobot(Robot):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
         frame = session.encode(SetValue(device.type, device.number, value))
-        session.outbox.stand(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
+        session.outbox.set(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
 
     def _motor(self, name: str, value: float, now: float) -> None:
         device = self._table.named(name)
@@ -357,43 +355,6 @@ class Wc2EcRobot(Robot):
 def _slot(device: Device) -> str:
     """Name the place in the outbox where the newest value of a motor waits."""
     return f"motor {device.number}"
-
-
-class Ring:
-    """Distance sensors with bearings, as one scan: a point a degree where they are not evenly spread."""
-
-    def __init__(self, options: Options) -> None:
-        self._range = options.scan_range_m
-        bearings = sorted(options.bearings_deg.values())
-        steps = {round(high - low, 6) for low, high in pairwise(bearings)}
-        self._first_deg = bearings[0]
-        self._step_deg = steps.pop() if len(steps) == 1 and min(steps) > 0 else 1.0
-        count = round((bearings[-1] - bearings[0]) / self._step_deg) + 1
-        self._ranges = np.full(count, np.nan, np.float32)
-        self._places = {
-            name: round((bearing - self._first_deg) / self._step_deg) for name, bearing in options.bearings_deg.items()
-        }
-        self._fresh: set[str] = set()
-
-    def take(self, name: str, value_m: float, stamp_ns: int) -> Scan | None:
-        """Take one reading; give the scan when every sensor has a new one."""
-        place = self._places.get(name)
-        if place is None:
-            return None
-        low, high = self._range
-        self._ranges[place] = value_m if low <= value_m <= high else np.nan
-        self._fresh.add(name)
-        if len(self._fresh) < len(self._places):
-            return None
-        self._fresh.clear()
-        return Scan(
-            math.radians(self._first_deg),
-            math.radians(self._step_deg),
-            low,
-            high,
-            self._ranges.copy(),
-            stamp_ns=stamp_ns,
-        )
 
 
 _TELEMETRY: dict[type[Wc2EcMessage], Callable[[Wc2EcRobot, Any, int], tuple[Telemetry, ...]]] = {

@@ -51,14 +51,14 @@ class Toy(Simulator[str]):
     """Greets, echoes, and tells every tenth step on each link; has two places."""
 
     def __init__(self) -> None:
-        super().__init__(logging.getLogger("test"))
+        super().__init__(logging.getLogger("test"), links=("drive", "laser"))
         self.places = 2
 
-    def session(self, peer: str, link: int) -> Lines | None:
+    def session(self, peer: str, link: str) -> Lines | None:
         self.places -= 1
         return Lines() if self.places >= 0 else None
 
-    def greet(self, client: Conversation, link: int) -> None:
+    def greet(self, client: Conversation, link: str) -> None:
         self.send(client, f"hello {link}")
 
     def take(self, client: Conversation, message: str) -> None:
@@ -70,8 +70,8 @@ class Toy(Simulator[str]):
 
     def step(self, steps: int) -> None:
         if steps % 10 == 0:
-            self.tell("first", link=0)
-            self.tell("second", link=1)
+            self.tell("first", link="drive")
+            self.tell("second", link="laser")
 
 
 @contextlib.asynccontextmanager
@@ -94,7 +94,7 @@ async def connect(address: Address) -> Streams:
 
 async def test_each_link_greets_first_and_is_told_its_own() -> None:
     async with living(Toy()) as (first, second):
-        for address, lines in ((first, [b"hello 0\n", b"first\n"]), (second, [b"hello 1\n", b"second\n"])):
+        for address, lines in ((first, [b"hello drive\n", b"first\n"]), (second, [b"hello laser\n", b"second\n"])):
             reader, writer = await connect(address)
             assert [await reader.readline() for _ in lines] == lines
             writer.close()
@@ -105,7 +105,7 @@ async def test_a_client_is_answered_up_to_what_it_may_not_be_sent() -> None:
         reader, writer = await connect(first)
         writer.write(b"one\n")
         answers = {await reader.readline() for _ in range(4)}
-        assert answers == {b"hello 0\n", b"echo one\n", b"first\n"}
+        assert answers == {b"hello drive\n", b"echo one\n", b"first\n"}
         writer.close()
 
 
@@ -113,7 +113,7 @@ async def test_who_finds_no_place_is_closed() -> None:
     async with living(Toy()) as (first, _):
         served = [await connect(first), await connect(first)]
         for reader, _ in served:
-            assert await reader.readline() == b"hello 0\n"
+            assert await reader.readline() == b"hello drive\n"
         reader, writer = await connect(first)
         assert await reader.read() == b""
         for _, one in [*served, (reader, writer)]:
@@ -123,6 +123,6 @@ async def test_who_finds_no_place_is_closed() -> None:
 async def test_its_end_closes_every_conversation() -> None:
     async with living(Toy()) as (first, _):
         reader, writer = await connect(first)
-        assert await reader.readline() == b"hello 0\n"
+        assert await reader.readline() == b"hello drive\n"
     assert (await reader.read()).strip(b"first\n") == b""
     writer.close()

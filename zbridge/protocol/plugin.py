@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from importlib.metadata import entry_points
 from typing import Any, ClassVar
 
 import msgspec
@@ -19,6 +18,7 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
 
 GROUP = "zbridge.protocols"
@@ -219,17 +219,23 @@ class Protocol(msgspec.Struct, frozen=True):
     """Be an HQ program of this protocol until cancelled, or until it dies."""
     template: str = ""
     """The commented ``[device]`` table of a configuration, ``[device.options]`` with it."""
+    codecs: tuple[Codec, ...] = ()
+    """The messages, for the conformance kit."""
     hq_template: str = ""
     """What a commented ``[[hq]]`` table says of this protocol: ``protocol``, ``listen`` and ``[hq.options]``."""
 
 
 def protocol_names() -> tuple[str, ...]:
     """List the installed protocols."""
+    from importlib.metadata import entry_points  # here: it loads sockets and threads
+
     return tuple(sorted(point.name for point in entry_points(group=GROUP)))
 
 
 def find_protocol(name: str) -> Protocol:
     """Find an installed protocol; raise ConfigError naming the ones there are."""
+    from importlib.metadata import entry_points
+
     for point in entry_points(group=GROUP, name=name):
         protocol = point.load()
         if isinstance(protocol, Protocol):

@@ -29,21 +29,21 @@ M = TypeVar("M")
 
 
 class Simulator(ABC, Generic[M]):
-    """One simulated robot on its links. A protocol contributes :meth:`session`, :meth:`take` and :meth:`step`."""
+    """One simulated robot on its links. A protocol contributes :meth:`session`, :meth:`take` and :meth:`step`.
 
-    datagrams = False
-    """True if the robot takes datagrams on the number of its TCP port."""
+    ``links``: one name for each address of the simulation. ``datagrams``: take datagrams on the number of the TCP port.
+    """
 
-    def __init__(self, log: logging.Logger) -> None:
-        self._log = log
+    def __init__(self, log: logging.Logger, *, links: tuple[str, ...] = ("robot",), datagrams: bool = False) -> None:
+        self._log, self._links, self._datagrams = log, links, datagrams
         self._loop = asyncio.get_running_loop()
-        self._clients: dict[Conversation, int] = {}
+        self._clients: dict[Conversation, str] = {}
 
     # What a protocol contributes
 
     @abstractmethod
-    def session(self, peer: str, link: int) -> Session[M] | None:
-        """Make the session for a connection to one link; None closes the connection: no place is free."""
+    def session(self, peer: str, link: str) -> Session[M] | None:
+        """Make the session for a connection to the link of this name; None closes it: no place is free."""
 
     @abstractmethod
     def take(self, client: Conversation, message: M) -> None:
@@ -53,7 +53,7 @@ class Simulator(ABC, Generic[M]):
     def step(self, steps: int) -> None:
         """Live for :data:`STEP_S`, and tell what is due; ``steps`` counts from 1."""
 
-    def greet(self, client: Conversation, link: int) -> None:
+    def greet(self, client: Conversation, link: str) -> None:
         """Send what a new client gets first. Nothing that :meth:`tell` sends comes before it."""
 
     def dismiss(self, client: Conversation) -> None:
@@ -64,13 +64,13 @@ class Simulator(ABC, Generic[M]):
 
     # What a protocol calls
 
-    def clients(self, link: int | None = None) -> Iterator[Conversation]:
+    def clients(self, link: str | None = None) -> Iterator[Conversation]:
         """Give the clients whose sessions are established, of one link or of all."""
-        for client, number in tuple(self._clients.items()):
-            if link in (None, number) and client.session.state is State.ESTABLISHED:
+        for client, name in tuple(self._clients.items()):
+            if link in (None, name) and client.session.state is State.ESTABLISHED:
                 yield client
 
-    def tell(self, *messages: M, link: int | None = None) -> None:
+    def tell(self, *messages: M, link: str | None = None) -> None:
         """Send messages to the clients of one link, or of all."""
         for client in self.clients(link):
             self.send(client, *messages)
@@ -93,8 +93,8 @@ class Simulator(ABC, Generic[M]):
         """Listen on each address and live until cancelled; then close every conversation."""
         async with contextlib.AsyncExitStack() as stack:
             addresses = [
-                await stack.enter_async_context(listen(address, self._accepting(link), datagrams=self.datagrams))
-                for link, address in enumerate(simulation.addresses)
+                await stack.enter_async_context(listen(address, self._accepting(name), datagrams=self._datagrams))
+                for name, address in zip(self._links, simulation.addresses, strict=True)
             ]
             simulation.ready(tuple(addresses))
             try:
@@ -110,11 +110,11 @@ class Simulator(ABC, Generic[M]):
             steps += 1
             self.step(steps)
 
-    def _accepting(self, number: int) -> Callable[[], Receiver]:
-        return lambda: Accepted(lambda link: self._admit(link, number))
+    def _accepting(self, name: str) -> Callable[[], Receiver]:
+        return lambda: Accepted(lambda link: self._admit(link, name))
 
-    def _admit(self, link: Link, number: int) -> Conversation | None:
-        session = self.session(link.peer, number)
+    def _admit(self, link: Link, name: str) -> Conversation | None:
+        session = self.session(link.peer, name)
         if session is None:
             return None
         client: Conversation = Conversation(
@@ -122,13 +122,13 @@ class Simulator(ABC, Generic[M]):
         )
         client.ended.add_done_callback(lambda _: self._dismiss(client))
         self._log.info("%s: connected as %s", link.peer, session.name)
-        self._loop.call_soon(self._greet, client, number)  # the session is opened first
+        self._loop.call_soon(self._greet, client, name)  # the session is opened first
         return client
 
-    def _greet(self, client: Conversation, number: int) -> None:
-        self.greet(client, number)
+    def _greet(self, client: Conversation, name: str) -> None:
+        self.greet(client, name)
         if not client.ended.done():
-            self._clients[client] = number
+            self._clients[client] = name
 
     def _deliver(self, client: Conversation, messages: list[Any]) -> None:
         for message in messages:

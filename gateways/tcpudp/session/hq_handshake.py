@@ -31,10 +31,7 @@ from gateways.tcpudp.session.packets import PacketSession, decoders
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import VERSIONS, announced
-from zbridge.errors import ProtocolError
-from zbridge.protocol.handshake import Handshake
-from zbridge.protocol.negotiation import agree, parse_versions
-from zbridge.protocol.session import Datagram, Limits, Role
+from zbridge.protocol import Datagram, Handshake, Limits, ProtocolError, Role, agree, parse_versions
 
 PROBE_S = 2.0
 """Seconds a robot has for packet 4, and then for packet 6."""
@@ -164,7 +161,7 @@ class HqHandshake(PacketSession):
 
     def _await_start(self, now: float) -> None:
         """Wait for a 4, without the time limit of the settings."""
-        self._limit_at = math.inf
+        self.lift_limit()
 
     def _probe(self, now: float) -> None:
         """Send 5 by UDP; begin the silence by TCP."""

@@ -24,9 +24,7 @@ from gateways.tcpudp.session.hq_handshake import HqHandshake
 from gateways.tcpudp.session.registered import Registered
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.errors import EncodeError, Malformed
-from zbridge.protocol.outbox import LIMIT
-from zbridge.protocol.session import Limits
+from zbridge.protocol import LIMIT, EncodeError, Limits, Malformed
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -98,7 +96,7 @@ class HqRole(HqHandshake):
     def switch_lidar(self, mode: int, now: float) -> None:
         """Send a lidar mode; raise Refused."""
         self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
-        self._signs.asked(self._heard, 1 + self.outbox.stands(_LIDAR_AGAIN))
+        self._signs.asked(self._heard, 1 + self.outbox.is_set(_LIDAR_AGAIN))
 
     def send_nothing_again(self) -> None:
         """Cancel all repetitions: the robot is stopped."""
@@ -133,11 +131,11 @@ class HqRole(HqHandshake):
         frame = super().outgoing(now)
         if type(frame) is _Chosen:
             # A robot that may have misread another mode is in mode 3 until that was sent again.
-            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.stands(_MODE_AGAIN))
+            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.is_set(_MODE_AGAIN))
         return frame
 
     def _send_surely(self, frame: bytes, again: str, now: float) -> None:
         """Send a packet, to robots that misread some again; a newer one replaces the repetition of an older one."""
         self.outbox.put(frame)
         if self._agreed in _MISREADING:
-            self.outbox.stand(again, (frame,), now + AGAIN_S)
+            self.outbox.set(again, (frame,), now + AGAIN_S)

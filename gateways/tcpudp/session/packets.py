@@ -19,8 +19,7 @@ from gateways.tcpudp.messages import (
     encode_packet,
     frame_end,
 )
-from zbridge.errors import ProtocolError
-from zbridge.protocol.session import Datagram, Limits, Role, Session
+from zbridge.protocol import Datagram, Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
 _QUOTED = 80

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from gateways.tcpudp.messages import OpaquePacket, Packet
 from gateways.tcpudp.settings import Feature, Settings
-from zbridge.errors import Unsupported
+from zbridge.protocol import Unsupported
 
 
 class Registered:

@@ -31,10 +31,19 @@ from gateways.tcpudp.session.packets import PacketSession, id_of
 from gateways.tcpudp.session.source import CLIENT_PORT, FROM_HQ, ClientSource
 from gateways.tcpudp.settings import HQ_BLOCKS, Settings, read_settings
 from gateways.tcpudp.versions import LISTED, VERSIONS
-from zbridge.errors import NotReady, ProtocolError, Unsupported
-from zbridge.protocol.handshake import Handshake
-from zbridge.protocol.negotiation import agree, newest, parse_versions
-from zbridge.protocol.session import Datagram, Limits, Role, State
+from zbridge.protocol import (
+    Datagram,
+    Handshake,
+    Limits,
+    NotReady,
+    ProtocolError,
+    Role,
+    State,
+    Unsupported,
+    agree,
+    newest,
+    parse_versions,
+)
 
 PROBE_S = 2.0
 """Seconds an HQ program has for its datagram 5."""
@@ -215,7 +224,7 @@ class RobotRole(PacketSession):
 
     def _offer_udp(self, now: float) -> None:
         """Send 4; the time limit of the settings ends."""
-        self._limit_at = math.inf
+        self.lift_limit()
         self.send_first(ServerStartUDP())
         self._report_until = now + PROBE_S
 

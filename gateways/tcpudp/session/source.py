@@ -18,8 +18,7 @@ from __future__ import annotations
 
 from gateways.tcpudp.messages import SERVER_ID, ClientUDPConnection, read_header
 from gateways.tcpudp.session.packets import Decode, decoders
-from zbridge.errors import ProtocolError
-from zbridge.protocol.session import Role
+from zbridge.protocol import ProtocolError, Role
 
 CLIENT_PORT = 11000
 """The UDP port that deployed HQ programs bind."""

@@ -103,7 +103,7 @@ class ToyRobot(Robot):
         if self._session is None:
             raise NotReady("no connection")
         frame = b"go %f %f\n" % (forward, turn)
-        self._session.outbox.stand("motion", (frame,), now, period_s=0.1, **more)
+        self._session.outbox.set("motion", (frame,), now, period_s=0.1, **more)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported("it cannot be asked")

@@ -26,7 +26,7 @@ SPEED_M_S = 1.0
 """Speed over ground at 100 percent."""
 WHEELBASE_M = 0.35
 LOCK_RAD = math.radians(30.0)
-"""How far the wheels turn at full lock."""
+"""Steering angle at full lock."""
 ACCELERATION_M_S2 = 2.0
 SILENT_CYCLES = 20
 """Cycles without a drive command after which the motor stops."""
@@ -74,7 +74,7 @@ class Car:
         self._silent = 0
 
     def step(self, dt: float) -> None:
-        """Live for ``dt`` seconds: Ackermann steering, limited acceleration, walls."""
+        """Advance by ``dt`` seconds: Ackermann steering, limited acceleration, walls."""
         self._clock_ms += round(dt * 1000)
         self._silent += 1
         wanted = self._wanted_m_s if self._silent <= SILENT_CYCLES else 0.0
@@ -87,7 +87,7 @@ class Car:
             self.speed_m_s = 0.0
 
     def measure(self) -> Measurement:
-        """Sweep with the laser: mm, 0 where nothing was measured."""
+        """Sweep with the laser: mm, 0 for no measurement."""
         self._sequence += 1
         range_max = SCANNER.range_max_mm / 1000
         ranges = cast(self.body.x, self.body.y, self.body.heading + _ANGLES, range_max)
@@ -141,6 +141,6 @@ class VehicleSimulator(Simulator[AlfMessage]):
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a simulated vehicle until cancelled."""
+    """Run a simulated vehicle until cancelled."""
     dialect = Dialect(simulation.dialect or "text")
     await VehicleSimulator(simulation.seed, dialect, len(simulation.addresses)).run(simulation)

@@ -347,5 +347,6 @@ _DECODERS: dict[type[Packet], Callable[[bytes, int], Packet]] = {
 
 def codecs() -> tuple[Codec, ...]:
     """List the packets for the conformance kit."""
-    messages = (*(spec.packet for spec in PACKETS.values()), OpaquePacket(70, b"led"))
+    declared = (spec.packet for spec in PACKETS.values() if spec.packet is not ServerSLAMMapPart)
+    messages = (*declared, ServerSLAMMapPart(1, 3, b"ab"), OpaquePacket(70, b"led"))
     return (Codec("packets", partial(encode_packet, sender_id=SERVER_ID), decode_packet, frame_end, messages),)

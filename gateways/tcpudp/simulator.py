@@ -229,5 +229,5 @@ class RobotSimulator(Simulator[Packet]):
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a simulated robot until cancelled."""
+    """Run a simulated robot until cancelled."""
     await RobotSimulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)

@@ -27,7 +27,8 @@ from gateways.wc2ec.messages import (
     write,
 )
 from gateways.wc2ec.session import ControllerSession
-from gateways.wc2ec.translate import NAME, Byte, DeviceOption
+from gateways.wc2ec.settings import Byte, DeviceOption
+from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Device,

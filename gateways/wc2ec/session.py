@@ -23,13 +23,13 @@ from zbridge.protocol import EncodeError, Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
 SETTLE_S = 0.1
-"""Seconds without another registration, or data, after which all devices are taken to be registered."""
+"""Seconds after a registration without another one or data: then the registrations are complete."""
 
 _BOUNDS = Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S)
 
 
 class Wc2EcSession(Session[Wc2EcMessage]):
-    """What both roles share. values: configuration values of a sensor, which framing has to know.
+    """Both roles. ``values``: configuration values of a sensor; the framing depends on it.
 
     bounds: what a listener demands of its clients.
     """

@@ -1,7 +1,7 @@
 """The configuration of one process: a TOML file, checked whole before anything starts.
 
-Unknown keys are errors; ``${VAR}`` in a string is taken from the environment. Knows no protocol: the
-``options`` tables are checked against what the named protocol declares.
+Unknown keys are errors. ``${VAR}`` in a string is replaced from the environment. Knows no protocol: ``options`` tables
+are checked against the declaration of the named protocol.
 """
 
 from __future__ import annotations

@@ -41,14 +41,14 @@ class Lines(Generic[L]):
         found = data.find(b"\n", start)
         return found + 1 if found >= 0 else len(data) + 1
 
-    def read(self, line: bytes) -> L:
+    def read(self, frame: bytes) -> L:
         """Read one line; raise ProtocolError where it is none of the messages or a number is out of range."""
-        word, *numbers = line.rstrip(b"\r\n").split(self._separator)
+        word, *numbers = frame.rstrip(b"\r\n").split(self._separator)
         codec = self._codecs.get(word)
         if codec is None:
-            raise ProtocolError(f"{line[:_QUOTED]!r} begins no message")
+            raise ProtocolError(f"{frame[:_QUOTED]!r} begins no message")
         if not all(map(_NUMBER.fullmatch, numbers)):
-            raise ProtocolError(f"{line[:_QUOTED]!r}: expected numbers")
+            raise ProtocolError(f"{frame[:_QUOTED]!r}: expected numbers")
         return codec.decode(b"|".join(numbers))
 
     def write(self, message: L) -> bytes:

@@ -18,6 +18,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Pose
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
 from zbridge.protocol.session import Limits, Role, Session
 
@@ -47,21 +48,29 @@ def line_end(data: bytes, start: int) -> int:
     return len(data) + 1 if end < 0 else end + 1
 
 
+def write(message: At) -> bytes:
+    return b"at %f %f %f\n" % (message.x, message.y, message.heading)
+
+
+def read(frame: bytes) -> At:
+    try:
+        word, x, y, heading = frame.split()
+        if word != b"at":
+            raise ValueError(word)
+        return At(float(x), float(y), float(heading))
+    except ValueError as error:
+        raise ProtocolError(f"{frame!r}: {error}") from error
+
+
 class ToySession(Session[At]):
     role = Role.HQ
     frame_end = staticmethod(line_end)
 
     def encode(self, message: At) -> bytes:
-        raise NotImplementedError
+        return write(message)
 
     def decode(self, frame: bytes) -> At:
-        try:
-            word, x, y, heading = frame.split()
-            if word != b"at":
-                raise ValueError(word)
-            return At(float(x), float(y), float(heading))
-        except ValueError as error:
-            raise ProtocolError(f"{frame!r}: {error}") from error
+        return read(frame)
 
     def opened(self, now: float) -> None:
         self.establish("7.0", ("wheels",))
@@ -141,4 +150,5 @@ PROTOCOL = Protocol(
     robot=ToyRobot,
     simulate=simulate,
     template=TEMPLATE,
+    codecs=(Codec("lines", write, read, line_end, (At,)),),
 )

@@ -9,7 +9,8 @@ import pytest
 
 from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
 from gateways.wc2ec.session import ControllerSession, ExternalSession
-from gateways.wc2ec.translate import Options, Wc2EcRobot
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading

@@ -17,7 +17,8 @@ from gateways.wc2ec.conformance.fragile_hq import Reader
 from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect as WireDialect
 from gateways.wc2ec.messages import Wc2EcMessage
-from gateways.wc2ec.translate import DeviceOption, Options, Wc2EcRobot
+from gateways.wc2ec.settings import DeviceOption, Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet import payload, topics

@@ -2,8 +2,7 @@
 
 from khepera.messages import LINES
 from khepera.translate import KheperaRobot, Options
-from zbridge.protocol.codec import Codec
-from zbridge.protocol.plugin import Protocol, Simulation
+from zbridge.protocol import Codec, Protocol, Simulation
 
 TEMPLATE = """\
 [device]

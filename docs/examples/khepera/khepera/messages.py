@@ -4,10 +4,8 @@ from typing import Annotated
 
 from zbridge.wire import I32, U8, Line, Lines, Scalar, Whole
 
-Wheel = Annotated[int, Scalar("h"), Whole(-127, 127)]
-"""The speed of a wheel: 1 is 8 mm/s."""
-Light = Annotated[int, Scalar("H"), Whole(0, 1023)]
-"""Reflected light: the nearer an obstacle, the more."""
+Wheel = Annotated[int, Scalar("h"), Whole(-127, 127)]  # speed: 1 is 8 mm/s
+Light = Annotated[int, Scalar("H"), Whole(0, 1023)]  # the nearer an obstacle, the more
 
 
 class ReadVersion(Line, frozen=True):

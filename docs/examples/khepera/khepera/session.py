@@ -1,11 +1,10 @@
 """The conversation: one request at a time, the version first, then polls at 20 Hz. Sans-IO."""
 
-from khepera.messages import LINES, Line, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
-from zbridge.protocol.exchange import ExchangeSession
-from zbridge.protocol.session import Role
+from khepera.messages import LINES, ReadPositions, ReadProximity, ReadSpeeds, ReadVersion, Version
+from zbridge.protocol import ExchangeSession, Role
+from zbridge.wire import Line
 
-POLL_S = 0.05
-VERSION_S = 0.5
+POLL_S, VERSION_S = 0.05, 0.5
 _POLLS = {"positions": ReadPositions(), "speeds": ReadSpeeds(), "proximity": ReadProximity()}
 
 
@@ -13,14 +12,8 @@ class KheperaSession(ExchangeSession[Line]):
     """We ask, the robot answers."""
 
     role = Role.HQ
-    frame_end = staticmethod(LINES.end)
+    frame_end, encode, read = staticmethod(LINES.end), staticmethod(LINES.write), staticmethod(LINES.read)
     answer_s = 0.1
-
-    def encode(self, message: Line) -> bytes:
-        return LINES.write(message)
-
-    def read(self, frame: bytes) -> Line:
-        return LINES.read(frame)
 
     def answers(self, request: bytes, message: Line) -> bool:
         return message.word == request[:1].lower()

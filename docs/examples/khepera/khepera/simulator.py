@@ -10,7 +10,6 @@ import numpy as np
 from khepera.messages import (
     LINES,
     LedSet,
-    Line,
     Positions,
     Proximity,
     ReadPositions,
@@ -24,10 +23,9 @@ from khepera.messages import (
     Version,
 )
 from khepera.translate import BEARINGS_DEG, DISTANCE_M, LIGHT, PULSE_M, UNIT_M_S
-from zbridge.address import Address
-from zbridge.errors import ConfigError, ProtocolError
-from zbridge.protocol.plugin import Simulation
+from zbridge.protocol import Address, ConfigError, ProtocolError, Simulation
 from zbridge.simulation.world import Body, cast
+from zbridge.wire import Line
 
 STEP_S = 0.01
 SILENCE_S = 1.0

@@ -101,7 +101,10 @@ class TcpUdpRobot(Robot):
         return carry_out(self, command, now) or _NOTHING
 
     def stop(self, now: float, until: float) -> None:
-        """Send packet 13, in mode 3 the pair 1, 13; what was still to be sent again is not, unless this is routine."""
+        """Send packet 13, in mode 3 the pair 1, 13.
+
+        A stop that is repeated cancels the repetitions of other commands; a single one, which is routine, does not.
+        """
         session = self._connected()
         session.withdraw_autonomous()
         session.withdraw_raw()
@@ -147,7 +150,7 @@ class TcpUdpRobot(Robot):
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _mode(self, command: Mode, now: float) -> None:
-        """Send the mode; a stop that stands ends where the robot is to move by itself, and is no pair in any other."""
+        """Send the mode. While a stop is repeated: mode 3 ends it, any other mode turns the pair into 13 alone."""
         self._connected().choose_mode(_MODES[command.mode], now)
         self._chosen = command.mode
         if command.mode == AUTONOMOUS:

@@ -95,7 +95,7 @@ class TelemetryTranslator:
         )
 
     def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Turn the x-major cells (index = x * side + y) into rows of y, cells that are not 0, 1, 2 into unknown."""
+        """Turn x-major cells (index = x * side + y) into rows of y; cells other than 0, 1, 2 become unknown."""
         self._map_awaited = False
         settings = self._session.settings if self._session is not None else None
         values = message.cells
@@ -107,7 +107,7 @@ class TelemetryTranslator:
         return ((topics.MAP, Map(side, side, cell, origin, cells, stamp_ns=stamp_ns)),)
 
     def _map_part(self, message: ServerSLAMMapPart, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Put a part in its place, cut where the map ends; the last one makes a map, and one that is waited for."""
+        """Enter a part, cut at the end of the map. Give the map with its last part, or if a query waits."""
         assert self._session is not None
         self._parts_from = self._session.version
         side = announced_side(self._session.settings)
@@ -139,7 +139,7 @@ class TelemetryTranslator:
         return ((topics.CAMERA, _switch(message.mode, stamp_ns)),)
 
     def _raw(self, message: Packet, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Pass on what no fleet message holds, as it came."""
+        """Pass on unchanged what no fleet message holds."""
         if isinstance(message, OpaquePacket):
             raw = Raw(message.id, message.body, stamp_ns=stamp_ns)
         else:
@@ -148,7 +148,7 @@ class TelemetryTranslator:
 
 
 def announced_side(settings: Settings | None) -> int:
-    """Give the cells along a side of the map as the robot announces them; 0 where it does not, or absurdly."""
+    """Give the cells along a side of the map as the robot announces them; 0 for none or an absurd number."""
     if not isinstance(settings, RobotSettings13) or settings.slam_map_interval <= 0:
         return 0
     side = settings.slam_map_size // settings.slam_map_interval
@@ -156,7 +156,7 @@ def announced_side(settings: Settings | None) -> int:
 
 
 def _side(cells: int, settings: Settings | None) -> int:
-    """Find the side of a square map: size / interval where that fits the body, else the root of its length."""
+    """Find the side of a square map: size / interval if that fits the body, else the root of its length."""
     announced = announced_side(settings)
     if announced and announced * announced == cells:
         return announced
@@ -167,7 +167,7 @@ def _side(cells: int, settings: Settings | None) -> int:
 
 
 def _known_cells(cells: Cells) -> Cells:
-    """Take cells that are none of 0, 1, 2 as unknown."""
+    """Turn cells other than 0, 1, 2 into unknown."""
     if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED:
         return cells
     return np.where(cells <= _OCCUPIED, cells, np.uint8(0))

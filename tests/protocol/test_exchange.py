@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import ProtocolError, Refused
-from zbridge.protocol.exchange import SILENT, Exchange, ExchangeSession
+from zbridge.protocol.exchange import LATE_S, SILENT, Exchange, ExchangeSession
 from zbridge.protocol.session import Limits, Role, State
 
 
@@ -146,6 +146,19 @@ def test_a_request_without_an_answer_fails_is_counted_and_the_next_one_goes(aske
     asker.expire(1.2)
     assert (asker.failures, asker.traffic.unanswered, asker.exchange.failed) == ([b"H\n"], 1, 1)
     assert asker.outgoing(1.2) == b"N\n"
+
+
+def test_an_answer_that_waited_while_the_process_stood_still_is_in_time(asker: Asker) -> None:
+    asker.send(Line("H"))
+    asker.outgoing(1.0)
+    asker.expire(9.0)
+    assert asker.deadline() == pytest.approx(9.0 + LATE_S)
+    assert asker.receive(b"h,1\n", 9.0) == [Line("h,1")]
+    asker.send(Line("H"))
+    asker.outgoing(9.1)
+    asker.expire(12.0)
+    asker.expire(13.0)
+    assert asker.failures == [b"H\n"]
 
 
 def test_the_time_limit_begins_when_the_request_was_written(asker: Asker) -> None:

@@ -13,7 +13,6 @@ class KheperaSession(ExchangeSession[Line]):
 
     role = Role.HQ
     frame_end, encode, read = staticmethod(LINES.end), staticmethod(LINES.write), staticmethod(LINES.read)
-    answer_s = 0.1
 
     def answers(self, request: bytes, message: Line) -> bool:
         return message.word == request[:1].lower()

@@ -11,13 +11,14 @@ import sys
 import threading
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
+from khepera.messages import SetSpeeds
 from khepera.simulator import STEP_S, Khepera
 
 import zbridge
-from zbridge.errors import BusError
+from zbridge.errors import BusError, Refused
 
 WAIT_S = 20.0
 
@@ -40,32 +41,38 @@ def running(*arguments: str) -> Iterator[None]:
         assert process.wait(10) == 0
 
 
-@contextlib.contextmanager
-def on_a_serial_line() -> Iterator[str]:
-    """Run a simulated robot at the far end of a serial line; give the address of the near end."""
-    far, near = os.openpty()
-    tty.setraw(near)
-    os.set_blocking(far, False)
-    robot, waiting, over = Khepera(), b"", threading.Event()
+class SerialKhepera:
+    """A simulated robot at the far end of a serial line; ``address``: the near end. A mute one obeys, but is silent."""
 
-    def live() -> None:
-        nonlocal waiting
-        while not over.wait(STEP_S):
-            robot.step(STEP_S)
+    def __init__(self) -> None:
+        self.robot, self.mute = Khepera(), False
+        self._far, self._near = os.openpty()
+        tty.setraw(self._near)
+        os.set_blocking(self._far, False)
+        self.address = f"serial://{os.ttyname(self._near)}?baud=57600"
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._live)
+
+    def __enter__(self) -> SerialKhepera:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._over.set()
+        self._thread.join()
+        os.close(self._far)
+        os.close(self._near)
+
+    def _live(self) -> None:
+        waiting = b""
+        while not self._over.wait(STEP_S):
+            self.robot.step(STEP_S)
             with contextlib.suppress(BlockingIOError):
-                waiting += os.read(far, 4096)
+                waiting += os.read(self._far, 4096)
             *lines, waiting = waiting.split(b"\n")
-            os.write(far, b"".join(robot.answer(line + b"\n") for line in lines))
-
-    thread = threading.Thread(target=live)
-    thread.start()
-    try:
-        yield f"serial://{os.ttyname(near)}?baud=57600"
-    finally:
-        over.set()
-        thread.join()
-        os.close(far)
-        os.close(near)
+            answers = [self.robot.answer(line + b"\n") for line in lines]
+            if not self.mute:
+                os.write(self._far, b"".join(answers))
 
 
 async def connected(endpoint: str, stack: contextlib.AsyncExitStack) -> zbridge.Fleet:
@@ -80,8 +87,9 @@ async def connected(endpoint: str, stack: contextlib.AsyncExitStack) -> zbridge.
             await asyncio.sleep(0.2)
 
 
-async def drive(address: str, folder: Path) -> None:
-    """Run a gateway for the robot at an address, drive it through the bus, and see it stand."""
+@contextlib.asynccontextmanager
+async def gateway(address: str, folder: Path) -> AsyncIterator[zbridge.Robot]:
+    """Run a gateway for the robot at an address; give the robot as it is on the bus, once it is established."""
     endpoint, file = f"tcp/127.0.0.1:{free_port()}", folder / "k1.toml"
     file.write_text(
         f'[robot]\nname = "k1"\n[device]\nprotocol = "khepera"\nconnect = ["{address}"]\n'
@@ -94,18 +102,24 @@ async def drive(address: str, folder: Path) -> None:
                 if status.state == "established":
                     break
             assert (status.protocol, status.version) == ("khepera", "5.1")
-            async with robot.control() as control:
-                await control.during(1.5, forward=0.4)
-            async for scan in robot.scan:
-                assert len(scan.ranges) == 301
+            yield robot
+
+
+async def drive(address: str, folder: Path) -> None:
+    """Drive the robot at an address through the bus, and see it stand."""
+    async with gateway(address, folder) as robot:
+        async with robot.control() as control:
+            await control.during(1.5, forward=0.4)
+        async for scan in robot.scan:
+            assert len(scan.ranges) == 301
+            break
+        await asyncio.sleep(0.5)
+        async for motion in robot.motion:
+            if motion.speed == 0.0:
                 break
-            await asyncio.sleep(0.5)
-            async for motion in robot.motion:
-                if motion.speed == 0.0:
-                    break
-            async for pose in robot.pose:
-                assert 0.2 < pose.x < 0.45
-                break
+        async for pose in robot.pose:
+            assert 0.1 < pose.x < 0.6
+            break
 
 
 async def test_a_robot_on_tcp_is_driven_from_the_bus(tmp_path: Path) -> None:
@@ -115,5 +129,20 @@ async def test_a_robot_on_tcp_is_driven_from_the_bus(tmp_path: Path) -> None:
 
 
 async def test_a_robot_on_a_serial_line_is_driven_from_the_bus(tmp_path: Path) -> None:
-    with on_a_serial_line() as address:
-        await drive(address, tmp_path)
+    with SerialKhepera() as far:
+        await drive(far.address, tmp_path)
+
+
+async def test_a_robot_that_falls_silent_is_stopped(tmp_path: Path) -> None:
+    with SerialKhepera() as far:
+        async with gateway(far.address, tmp_path) as robot, robot.control() as control:
+            for _ in range(10):
+                await control(forward=0.4)
+                await asyncio.sleep(0.05)
+            assert far.robot.speeds == SetSpeeds(25, 25)
+            far.mute = True
+            for _ in range(20):
+                with contextlib.suppress(Refused):
+                    await control(forward=0.4)
+                await asyncio.sleep(0.05)
+            assert far.robot.speeds == SetSpeeds(0, 0)

@@ -114,12 +114,12 @@ def test_a_stop_goes_before_what_waits_and_the_robot_stands(scene: Scene) -> Non
     assert scene.simulated.leds == {0: True}
 
 
-def test_a_robot_that_falls_silent_takes_no_commands_and_is_lost_after_a_second(scene: Scene) -> None:
+def test_a_robot_that_falls_silent_takes_no_commands_and_is_lost_in_the_end(scene: Scene) -> None:
     scene.drive(1.0)
     scene.answers = False
-    scene.run(0.3)
+    scene.run(0.6)
     assert (scene.session.busy, scene.robot.ready) == ("the robot does not answer", False)
-    scene.run(1.0)
+    scene.run(2.0)
     assert scene.session.reason == "no answer to 10 requests in a row"
 
 

@@ -7,8 +7,8 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zbridge.bus import Answer, Lane, Question, Sample, Sort
-from zbridge.bus.fake import FakeBus, FakeQuestion, matches, meet
+from zbridge.bus import Answer, IncomingQuery, Lane, Sample, Sort
+from zbridge.bus.fake import FakeBus, FakeQuery, matches, meet
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
 
@@ -69,7 +69,9 @@ def test_a_key_expression_matches_as_zenoh_itself_says(key_expr: str, key: str) 
     assert matches(str(canonical), key) is canonical.includes(zenoh.KeyExpr(key))
 
 
-@given(*2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)])
+@given(
+    *2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)],
+)
 def test_two_key_expressions_meet_as_zenoh_itself_says(one: str, other: str) -> None:
     first, second = zenoh.KeyExpr.autocanonize(one), zenoh.KeyExpr.autocanonize(other)
     assert meet(str(first), str(second)) is first.intersects(second)
@@ -145,7 +147,7 @@ async def test_a_query_gets_last_values_until_their_publisher_goes() -> None:
 async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> None:
     bus = FakeBus()
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         question.answer(question.payload + b"!")
 
     bus.answer("fleet/r1/@rpc/map", answer)
@@ -271,7 +273,7 @@ async def test_frames_are_wanted_only_while_somebody_listens() -> None:
 
 
 def test_a_question_keeps_its_replies() -> None:
-    question = FakeQuestion("k", b"?")
+    question = FakeQuery("k", b"?")
     question.answer(b"a")
     no = NotReady("no")
     question.refuse(no)

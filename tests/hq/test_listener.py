@@ -23,7 +23,7 @@ from tests.clock import scene_of
 from tests.hq.test_operator import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import Answer, Question
+from zbridge.bus.interface import Answer, IncomingQuery
 from zbridge.errors import BusError, EncodeError, NotReady, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -133,7 +133,7 @@ class ToySide(HqSide):
 
         def send(session: ToySession, now: float) -> None:
             if isinstance(message, Pose) or session.scans:
-                session.outbox.stand(topic.path, (frame,), now)
+                session.outbox.set(topic.path, (frame,), now)
 
         return send
 
@@ -717,7 +717,7 @@ class Told:
         self.refusals: list[Refusal] = []
         scene.gateway.bus.answer(KEYS.key("@rpc/control/refused/hq.toy"), self._hear)
 
-    def _hear(self, question: Question) -> None:
+    def _hear(self, question: IncomingQuery) -> None:
         self.refusals += payloads.decode(Refusals, question.payload).refusals
         question.answer(payloads.encode(Query()))
 
@@ -979,10 +979,10 @@ async def test_a_driver_whose_gateway_went_must_let_go_first(scene: Scene) -> No
 # Questions
 
 
-def answering(scene: Scene, topic: Topic, answer: Callable[[Question], None]) -> list[Question]:
-    asked: list[Question] = []
+def answering(scene: Scene, topic: Topic, answer: Callable[[IncomingQuery], None]) -> list[IncomingQuery]:
+    asked: list[IncomingQuery] = []
 
-    def take(question: Question) -> None:
+    def take(question: IncomingQuery) -> None:
         asked.append(question)
         answer(question)
 

@@ -9,7 +9,8 @@ from typing import Any
 import msgpack
 import pytest
 
-from zbridge.bus import Answer, Handle, Lane, Question
+from tests.tables import documented, executed
+from zbridge.bus import Answer, Handle, IncomingQuery, Lane
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.fleet.topics import KeySpace
@@ -139,7 +140,7 @@ CLAIM = "fleet/r1/@rpc/claim/gateway"
 def forge(bus: FakeBus, *claims: Any) -> Handle:
     """Answer for a gateway that there is not: with these claims, or these bytes, one after the other."""
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         for claim in claims:
             question.answer(claim if isinstance(claim, bytes) else msgpack.packb(claim))
 
@@ -357,7 +358,7 @@ class Distant(FakeBus):
 
         return Declared()
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         return self._later(lambda: super(Distant, self).answer(key, handler, lane=lane))
 
     def announce(self, key: str) -> Handle:
@@ -397,3 +398,7 @@ async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hun
             take.cancel()
         await asyncio.gather(*takes, return_exceptions=True)
     assert settled == [1] * 100
+
+
+def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
+    assert documented("control.md", "found") == executed(Ownership.TABLE)

@@ -1,6 +1,6 @@
 """The binary codec: a message declaration compiled once into functions between bytes and message. Sans-IO.
 
-Little endian throughout; every legacy protocol of this project is.
+Little endian; a message of fields of fixed width can be big-endian.
 """
 
 from __future__ import annotations
@@ -34,9 +34,8 @@ Encode = Callable[[Any], bytes]
 class BinaryCodec(Generic[M]):
     """Turns the bytes of one message class into messages and back.
 
-    ``decode(data, start)`` reads the body ``data[start:]`` whole; it raises ProtocolError where the bytes
-    are too few, too many or lie about a count. ``encode(message)`` raises EncodeError for values the
-    wire types cannot carry.
+    ``decode(data, start)`` reads the whole body ``data[start:]``; it raises ProtocolError for too few or too many bytes
+    and for a count that exceeds them. ``encode(message)`` raises EncodeError for values outside the wire types.
     """
 
     decode: Callable[[bytes, int], M]
@@ -52,10 +51,12 @@ class BinaryCodec(Generic[M]):
         if any(field.optional for field in fields[:-1]):
             raise TypeError(f"{message.__name__}: only the last field may be missing")
         if scalars is None:
+            if message.byte_order != "<":
+                raise TypeError(f"{message.__name__}: only fields of fixed width can be big-endian")
             self._steps = [_Step(field, fields[place + 1 :]) for place, field in enumerate(fields)]
             self.decode, self.encode = self._decode_steps, self._encode_steps
         else:
-            self._fixed = struct.Struct("<" + scalars)
+            self._fixed = struct.Struct(message.byte_order + scalars)
             self._names = [field.name for field in fields]
             self.decode = _fixed_decoder(message, self._fixed)
             self.encode = self._encode_fixed
@@ -98,7 +99,7 @@ class BinaryCodec(Generic[M]):
 
 
 class _Step:
-    """One field of a message whose length is not fixed."""
+    """One field of a message of variable length."""
 
     def __init__(self, field: Field, behind: Sequence[Field]) -> None:
         self.name = field.name
@@ -172,7 +173,7 @@ def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
 
     def decode(data: bytes, position: int) -> tuple[str, int]:
         raw, end = decode_bytes(data, position)
-        # A byte that is not ASCII shows as \xNN: people see the rest of the text, and nobody's session ends.
+        # A byte that is not ASCII becomes \xNN: the rest stays readable, and no session ends for it.
         return raw.decode("ascii", "backslashreplace"), end
 
     def encode(value: str) -> bytes:

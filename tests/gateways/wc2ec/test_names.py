@@ -1,5 +1,7 @@
 """A Webots robot that registers new names on every connection: what its gateway keeps of the old ones."""
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import struct
@@ -8,7 +10,8 @@ from collections.abc import AsyncIterator
 import msgpack
 import pytest
 
-from gateways.wc2ec.translate import Options, Wc2EcRobot
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.clock import scene_of
 from zbridge.address import Address
 from zbridge.bus import Publisher

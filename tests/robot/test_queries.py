@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from zbridge.bus.fake import FakeQuestion
+from zbridge.bus.fake import FakeQuery
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.robot.pending_queries import WAITING, PendingQueries
+from zbridge.robot.queries import WAITING, PendingQueries
 
 pytestmark = pytest.mark.jumping
 
@@ -16,8 +16,8 @@ def questions() -> PendingQueries:
     return PendingQueries(asyncio.get_running_loop(), answer_s=2.0)
 
 
-def question() -> FakeQuestion:
-    return FakeQuestion("fleet/r1/@rpc/map")
+def question() -> FakeQuery:
+    return FakeQuery("fleet/r1/@rpc/map")
 
 
 async def test_the_first_question_of_a_topic_must_be_put_to_the_robot_and_the_others_not() -> None:

@@ -184,9 +184,7 @@ async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> 
     await seen.until(lambda: seen == [b"mode"])
 
 
-async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
-    bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(bus, monkeypatch) -> None:
     monkeypatch.setattr(session, "FLUSH_S", 0.01)
     go = threading.Event()
     bus._writer.put(lambda: go.wait(SOON_S))
@@ -230,9 +228,7 @@ def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it
     assert len(entity.asked) == 31
 
 
-def test_a_callback_that_never_ends_is_given_up_and_said_so(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_callback_that_never_ends_is_given_up_and_said_so(caplog, monkeypatch) -> None:
     monkeypatch.setattr(declared, "UNDECLARE_S", 0.05)
     entity = Busy(10**9)
     declared.Declared(entity).close()

@@ -24,9 +24,9 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.captures import Record, payloads
 from tests.e2e.conftest import Bench
+from tests.e2e.fragile import fragile_robot
 from tests.e2e.hq_churn import CLIENTS, Churn, churn, crowd
 from tests.e2e.hq_judge import RANGES, judge, stage
-from tests.e2e.hq_robot import fragile_robot
 from tests.e2e.hq_scene import HOST, NEUTRAL, ByHand, device, gateway, listener, playing, ports, sessions, soon
 from tests.e2e.robots import SETTINGS, ScriptedRobot, position
 
@@ -58,7 +58,7 @@ async def test_programs_of_every_protocol_see_one_robot_and_drive_it_in_turn_and
 
 
 async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_bus_sees_it() -> None:
-    with fragile_robot("tcpudp-1.2") as process:
+    with fragile_robot("tcpudp-1.2", misnamed=0.0, times={"unasked_s": 0.05}) as process:
         async with stage("tcpudp-1.2", process) as on:
             await on.all_see()
             asked = {program.name: program.judge for program in on.programs if isinstance(program.judge, TcpHq)}
@@ -81,9 +81,7 @@ async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_b
 # A process of its own
 
 
-async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes_and_goes(
-    bench: Bench, stack: contextlib.ExitStack
-) -> None:
+async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes_and_goes(bench, stack) -> None:
     robot, tcp, alf, ec = ports(4)
     hq = gateway(
         bench,
@@ -120,9 +118,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         assert not _charges(one.violations)
 
 
-async def test_what_a_listener_refuses_shows_on_control_of_the_robot_whose_process_is_another(
-    bench: Bench, stack: contextlib.ExitStack
-) -> None:
+async def test_what_a_listener_refuses_shows_on_control_of_the_robot_whose_process_is_another(bench, stack) -> None:
     robot, tcp = ports(2)
     bench.simulator(robot)
     hq = gateway(bench, stack, listener("tcp", "tcpudp", tcp), name="hq")
@@ -207,9 +203,7 @@ class _Feed(threading.Thread):
         self._robot.close()
 
 
-async def test_programs_that_behave_badly_cost_a_good_one_nothing_and_are_closed_with_a_reason(
-    bench: Bench, stack: contextlib.ExitStack
-) -> None:
+async def test_programs_that_behave_badly_cost_a_good_one_nothing_and_are_closed_with_a_reason(bench, stack) -> None:
     feed, (port,) = _Feed(), ports(1)
     stack.callback(feed.close)
     limits = 'options = { udp = false }\nallow = ["127.0.0.1/32"]\nhandshake_s = 1.0\nrate_hz = 200'

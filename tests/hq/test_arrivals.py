@@ -1,7 +1,5 @@
 """How many connections of an address are let in, and what a log tells of them."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -526,7 +526,7 @@ class Program(RuleBasedStateMachine):
 
 
 TestProgram = Program.TestCase
-TestProgram.settings = settings(max_examples=400, stateful_step_count=30)
+TestProgram.settings = settings(max_examples=4 * settings().max_examples, stateful_step_count=30)
 
 
 @given(st.lists(st.floats(0.0, 1.24), max_size=20), st.floats(1.26, 1e6))

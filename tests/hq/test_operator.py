@@ -436,9 +436,7 @@ async def test_a_flush_that_fails_does_not_stop_what_waits(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("late", [True, False])
-async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(
-    late: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(late, monkeypatch) -> None:
     scene = Scene()
     helm = await scene.driving()
     taken = asyncio.Event()

@@ -8,8 +8,8 @@ from collections.abc import Coroutine
 from typing import Any
 
 import msgpack
+import pytest
 
-from tests.clock import jumping
 from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import Code, LeaseLost, NeutralFirst, NotReady, Refused
@@ -17,6 +17,8 @@ from zbridge.fleet.messages import TOLD
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.refusals import EVERY_S, Teller
 from zbridge.metrics import Metrics
+
+pytestmark = pytest.mark.jumping
 
 KEY = "fleet/r1/@rpc/control/refused/hq.desk"
 OFFLINE = NotReady("offline")
@@ -50,7 +52,6 @@ class Scene:
         task.add_done_callback(self.tasks.discard)
 
 
-@jumping
 async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reason() -> None:
     scene = Scene()
     scene.serve()
@@ -70,7 +71,6 @@ async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reaso
     ]
 
 
-@jumping
 async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> None:
     scene = Scene()
     scene.serve()
@@ -91,7 +91,6 @@ async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> 
     assert counts == {"hq.desk.3": 100, "hq.desk.4": 100}
 
 
-@jumping
 async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> None:
     scene = Scene()
     scene.teller.note("hq.desk.3", "drive", OFFLINE)
@@ -114,7 +113,6 @@ async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> No
     ]
 
 
-@jumping
 async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted() -> None:
     scene = Scene()
     scene.serve()
@@ -125,7 +123,6 @@ async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted(
     assert scene.metrics.total("untold") == 200 - 1 - TOLD
 
 
-@jumping
 async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_again() -> None:
     scene = Scene()
     scene.teller.note("hq.desk.3", "drive", OFFLINE)
@@ -137,7 +134,6 @@ async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_agai
     assert not scene.tasks
 
 
-@jumping
 async def test_a_teller_that_is_closed_tells_nothing_more() -> None:
     scene = Scene()
     scene.serve()

@@ -1,7 +1,5 @@
 """What HQ programs of ALF are shown and what they command: texts and bytes of the protocol page, written by hand."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterable
@@ -452,9 +450,7 @@ published = st.one_of(
 
 @pytest.mark.parametrize("dialect", DIALECTS)
 @given(history=st.lists(published, max_size=8), points=st.sampled_from([2, 12, 769]))
-def test_whatever_is_on_the_bus_deployed_receivers_break_on_nothing(
-    dialect: Any, history: list[tuple[Topic, FleetMessage]], points: int
-) -> None:
+def test_whatever_is_on_the_bus_deployed_receivers_break_on_nothing(dialect, history, points) -> None:
     """An ``EncodeError`` or ``ProtocolError`` is what a listener counts; it sends nothing then."""
     scene, readers = Scene(dialect=dialect, points=points), [Reader(dialect, points)]
     kinds: list[list[int]] = [[]]
@@ -534,9 +530,7 @@ def test_a_command_of_the_document_has_its_own_scales(said: str, drive: Drive) -
 @pytest.mark.parametrize(("protocol", "turn"), [("alf", -0.5), ("tcpudp", 0.0), ("wc2ec", 0.0), (None, 0.0)])
 @pytest.mark.parametrize("direction", [0, 1])
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_wheels_that_are_set_without_speed_turn_only_a_robot_that_has_some(
-    dialect: str, direction: int, protocol: str | None, turn: float
-) -> None:
+def test_wheels_that_are_set_without_speed_turn_only_a_robot_that_has_some(dialect, direction, protocol, turn) -> None:
     """45 degrees to the right; with forward 0 a vehicle only sets its wheels, by -turn, whatever the direction."""
     said = b"3|0|%d|45|0;" % direction if dialect == "text" else bytes((3, 0, direction, 135, 0))
     ((_, command),) = Scene(protocol=protocol, dialect=dialect).says(said)
@@ -600,12 +594,7 @@ def test_what_its_programs_are_is_said_to_the_core() -> None:
 
 @pytest.mark.parametrize(
     ("serve", "kinds"),
-    [
-        ("auto", [b"2|", b"1|"]),
-        ("both", [b"2|", b"1|", b"4|"]),
-        ("laser", [b"2|", b"1|"]),
-        ("drive", [b"4|"]),
-    ],
+    [("auto", [b"2|", b"1|"]), ("both", [b"2|", b"1|", b"4|"]), ("laser", [b"2|", b"1|"]), ("drive", [b"4|"])],
 )
 def test_a_listener_serves_what_it_was_told_to(serve: str, kinds: list[bytes]) -> None:
     scene = Scene(serve=serve, clients=0)
@@ -723,9 +712,7 @@ def test_a_command_behind_end_is_none() -> None:
 
 
 @pytest.mark.parametrize(("dialect", "writer"), [("text", "write_text"), ("binary", "write_binary")])
-def test_a_message_is_encoded_once_however_many_clients_there_are(
-    dialect: str, writer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_message_is_encoded_once_however_many_clients_there_are(dialect, writer, monkeypatch) -> None:
     write: Callable[[AlfMessage], bytes] = getattr(module, writer)
     encoded: list[str] = []
 

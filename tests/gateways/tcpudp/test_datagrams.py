@@ -37,11 +37,7 @@ SOON_S = 5.0
 PROBE_S = 0.3
 OLD = ("1.1", "1.2")
 VERSIONS = (*OLD, "1.3")
-ANSWERS = {
-    "1.1": (b"1.1", "0100000000"),
-    "1.2": (b"1.2", "010000000000"),
-    "1.3": (b"1.1,1.2,1.3", "01000000000000"),
-}
+ANSWERS = {"1.1": (b"1.1", "0100000000"), "1.2": (b"1.2", "010000000000"), "1.3": (b"1.1,1.2,1.3", "01000000000000")}
 FORWARD = Drive(forward=1.0)
 RIVAL = "another source of datagrams claims to be this client"
 VOID = "packets by UDP from another port than this client's are not taken"
@@ -399,9 +395,7 @@ async def test_a_5_that_two_waiting_clients_could_have_sent_is_neithers(version:
 
 @pytest.mark.parametrize("sender", [None, 0, 1])
 @pytest.mark.parametrize("version", VERSIONS)
-async def test_an_attacker_whose_5_came_first_is_not_heard_and_the_client_is_let_go(
-    version: str, sender: int | None
-) -> None:
+async def test_an_attacker_whose_5_came_first_is_not_heard_and_the_client_is_let_go(version, sender) -> None:
     async with serving() as scene, program(scene, version) as client:
         await client.greet()
         with udp() as attacker:

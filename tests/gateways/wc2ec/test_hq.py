@@ -1,7 +1,5 @@
 """What external controllers are shown and what they command: bytes of the protocol page, written by hand."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterable
@@ -681,9 +679,7 @@ def test_a_webots_robot_whose_table_is_not_known_yet_gets_none() -> None:
         (0.0, 0.0, 0.0, 0.0),
     ],
 )
-def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(
-    left: float, right: float, forward: float, turn: float
-) -> None:
+def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(left, right, forward, turn) -> None:
     """Wheels of 5 cm, 30 cm apart; full scale is 0.5 m/s and 1 rad/s. Too fast keeps the curve: 1.2, 4/3 is 0.9, 1."""
     scene = Scene("tcpudp")
     *neutral, (topic, command) = scene.means(set_value(0, left) + set_value(1, right))
@@ -995,9 +991,7 @@ published = st.one_of(
 
 
 @given(history=st.lists(published | st.just(None), max_size=12))
-def test_whatever_is_on_the_bus_each_name_and_number_is_registered_once_and_before_its_data(
-    history: list[tuple[Topic, FleetMessage] | None],
-) -> None:
+def test_whatever_is_on_the_bus_each_name_and_number_is_registered_once_and_before_its_data(history) -> None:
     scene = Scene(None)
     readers = [Reader("deployed")]
     known: list[dict[int, tuple[int, str]]] = [{}]

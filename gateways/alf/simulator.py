@@ -13,7 +13,7 @@ import random
 import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import VehicleSession
+from gateways.alf.session import VehicleRole
 from gateways.alf.translate import DRIVE, LASER, VEHICLE
 from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
@@ -118,8 +118,8 @@ class VehicleSimulator(Simulator[AlfMessage]):
     def __repr__(self) -> str:
         return f"<VehicleSimulator {self.car}>"
 
-    def session(self, peer: str, link: str) -> VehicleSession:
-        session = VehicleSession(self._dialect)
+    def session(self, peer: str, link: str) -> VehicleRole:
+        session = VehicleRole(self._dialect)
         session.name = f"hq {peer}"
         return session
 

@@ -23,7 +23,7 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ControllerSession
+from gateways.wc2ec.session import ControllerRole
 from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
@@ -120,8 +120,8 @@ class ControllerSimulator(Simulator[Wc2EcMessage]):
     def __repr__(self) -> str:
         return f"<ControllerSimulator {self.machine}>"
 
-    def session(self, peer: str, link: str) -> ControllerSession:
-        session = ControllerSession(self._dialect, values=VALUES)
+    def session(self, peer: str, link: str) -> ControllerRole:
+        session = ControllerRole(self._dialect, values=VALUES)
         session.name = f"controller {peer}"
         return session
 

@@ -25,7 +25,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import VehicleRole
+from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
@@ -58,7 +58,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
-class HqClient(VehicleRole):
+class HqClient(VehicleSession):
     """The session of one client, and the scanner init that it was sent last.
 
     laser: it is shown measurements and scanner init. drive: it is shown drive info.

@@ -108,7 +108,7 @@ class AlfSession(Session[AlfMessage]):
         super().close(reason, now)
 
 
-class HqRole(AlfSession):
+class HqSession(AlfSession):
     """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
 
     role = Role.HQ
@@ -138,7 +138,7 @@ class HqRole(AlfSession):
         self.outbox.set(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
-class VehicleRole(AlfSession):
+class VehicleSession(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT

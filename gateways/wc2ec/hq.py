@@ -26,7 +26,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
     write,
 )
-from gateways.wc2ec.session import ControllerRole
+from gateways.wc2ec.session import ControllerSession
 from gateways.wc2ec.settings import Byte, DeviceOption
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
@@ -115,7 +115,7 @@ class Shown(msgspec.Struct, frozen=True):
         return self.kind in (ROTATIONAL, LINEAR)
 
 
-class HqClient(ControllerRole):
+class HqClient(ControllerSession):
     """The session of one controller: what it was told there is, what it wants to know, what it set."""
 
     handled = frozenset({SetValue})

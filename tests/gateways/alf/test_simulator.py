@@ -9,7 +9,7 @@ import pytest
 
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
-from gateways.alf.session import HqRole, VehicleRole
+from gateways.alf.session import HqSession, VehicleSession
 from gateways.alf.simulator import SCANNER, STEP_S, Car
 from zbridge.address import Address
 from zbridge.errors import ConfigError
@@ -379,7 +379,7 @@ def test_info_says_how_fast_it_turns_and_what_pulls_it_to_the_side(right_deg: in
 @pytest.mark.parametrize("speed", [0, 60, 100, 255])
 def test_everything_it_says_can_be_sent_and_is_read_back(speed: int, dialect: Dialect) -> None:
     told = car(dialect=dialect)
-    sender, reader = VehicleRole(dialect), HqRole(dialect)
+    sender, reader = VehicleSession(dialect), HqSession(dialect)
     for session in (sender, reader):
         session.open(0.0)
     for right_deg in (-90, 90):

@@ -12,7 +12,7 @@ import pytest
 
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import HqRole
+from gateways.alf.session import HqSession
 from gateways.alf.translate import AlfRobot, Options, points_of, ranges_m
 from zbridge.app import config
 from zbridge.app.templates import robot_template
@@ -54,7 +54,7 @@ class Wire:
         self.robot = AlfRobot(options or Options(points=3), links, self.metrics)
         self.now = 0.0
         self.arrived_ns = STAMP
-        self.sessions: list[HqRole] = []
+        self.sessions: list[HqSession] = []
         for link in range(links):
             self.connect(link)
 

@@ -38,7 +38,8 @@ from zbridge.fleet.view import RobotView
 from zbridge.hq.bridge import PUBLISHERS, Bridge
 from zbridge.hq.command_queue import WAITING
 from zbridge.hq.intent import LEASE_S, Intent
-from zbridge.hq.operator import REPEAT_S, Operator
+from zbridge.hq.operator import Operator
+from zbridge.protocol.plugin import ATTEND_S
 
 KEYS = KeySpace("fleet", "r1")
 DEADMAN_S = 1.25
@@ -122,6 +123,18 @@ class Gateway:
         return commands
 
 
+class RepeatingOperator(Operator):
+    """The operator of a program that sets motion once."""
+
+    def tick(self) -> None:
+        self.repeat()
+        super().tick()
+
+
+def is_motion_of_wheels(command: Drive | Motor) -> bool:
+    return bool(command.value if isinstance(command, Motor) else command.forward or command.left)
+
+
 class Scene:
     """A robot, its gateway, and any number of programs; nothing is answered before :meth:`settle`."""
 
@@ -153,20 +166,23 @@ class Scene:
         who: str = "hq.toy.1",
         *,
         needs_mode: bool = False,
-        modes: str | None = None,
+        protocol: str = "toy",
         steers: bool = False,
         hold: bool = False,
     ) -> Operator:
-        return Operator(
-            Intent(DEADMAN_S, modes=needs_mode),
+        kind = RepeatingOperator if hold else Operator
+        operator = kind(
+            Intent(DEADMAN_S),
             self.bridge,
             who=who,
-            modes=modes,
-            steers=steers,
-            hold=hold,
+            protocol=protocol,
+            is_motion=is_motion_of_wheels if steers else lambda command: command.moving,
             tell=self.told.append,
             clock=lambda: self.now,
         )
+        if needs_mode:
+            operator.command(topics.CMD_MODE, Mode("none"))
+        return operator
 
     def look(self, *helms: Operator) -> None:
         """Let the gateway say how things stand."""
@@ -205,7 +221,7 @@ async def test_nothing_moves_and_nothing_is_asked_before_neutral() -> None:
     scene = Scene()
     helm = scene.helm()
     for _ in range(3):
-        with pytest.raises(Refused, match="connected: let go of the stick first"):
+        with pytest.raises(Refused, match="connected: release the stick first"):
             helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert (scene.gateway.asked, scene.bus.values("fleet/r1/@cmd/**")) == ([], [])
@@ -267,7 +283,7 @@ async def test_a_robot_that_somebody_else_drives_is_refused_and_neutral_must_com
     assert scene.told == ["not driving: held by operator (priority 0)"]
     assert scene.gateway.taken() == []
     assert not helm.active
-    with pytest.raises(Refused, match=r"held by operator \(priority 0\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"held by operator \(priority 0\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert len(scene.told) == 1, "the refusal of the question itself is not told again"
@@ -338,7 +354,7 @@ async def test_a_robot_that_is_not_there_is_not_asked_for(status: Status, alive:
         helm.command(topics.CMD_DRIVE, GO)
     scene.view.note(topics.STATUS, Status(state="established", protocol="toy"))
     scene.view.alive = True
-    with pytest.raises(Refused, match=f"{reason}: let go of the stick first"):
+    with pytest.raises(Refused, match=f"{reason}: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.asked == []
 
@@ -436,9 +452,7 @@ async def test_a_flush_that_fails_does_not_stop_what_waits(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("late", [True, False])
-async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(
-    late: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(late, monkeypatch) -> None:
     scene = Scene()
     helm = await scene.driving()
     taken = asyncio.Event()
@@ -571,7 +585,7 @@ async def test_turning_is_motion_to_a_program_that_does_not_steer() -> None:
 
 async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     await scene.settle()
@@ -583,7 +597,7 @@ async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> N
 
 async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -596,7 +610,7 @@ async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
 
 async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -613,7 +627,7 @@ async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
 
 async def test_mode_none_is_told_although_another_command_is_still_on_its_way() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
@@ -632,7 +646,7 @@ async def test_mode_none_is_told_although_another_command_is_still_on_its_way() 
 
 async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -646,7 +660,7 @@ async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted
 
 async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds_one_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -664,13 +678,13 @@ async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds
 
 async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
     assert scene.gateway.taken() == [("mode", Mode(mode="autonomous"))]
     for _ in range(200):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.intent.heard(scene.now)
         helm.tick()
         await scene.settle()
@@ -678,7 +692,7 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     renewals = scene.gateway.asked.count("renew")
     assert 15 <= renewals <= 21, "once in a third of the lease"
     for _ in range(31):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.report().state == "free", "total silence"
@@ -686,8 +700,8 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
 
 async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
-    with pytest.raises(Refused, match="connected: let go of the stick first"):
+    helm = scene.helm(needs_mode=True)
+    with pytest.raises(Refused, match="connected: release the stick first"):
         helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     helm.command(topics.CMD_DRIVE, STAND)
     scene.view.alive = False
@@ -707,7 +721,7 @@ async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     scene.look(helm)
     await scene.settle()
     assert scene.told == ["not driving: the lease has ended (stop)"]
-    with pytest.raises(Refused, match=r"the lease has ended \(stop\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"the lease has ended \(stop\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "renew"]
@@ -779,7 +793,7 @@ async def test_news_older_than_the_lease_does_not_end_it() -> None:
 
 async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -829,7 +843,7 @@ async def test_the_gateway_going_away_ends_the_drive() -> None:
     helm.gateway_lost()
     helm.gateway_lost()
     assert scene.told == ["not driving: the robot's gateway is gone"]
-    with pytest.raises(Refused, match="the robot's gateway is gone: let go of the stick first"):
+    with pytest.raises(Refused, match="the robot's gateway is gone: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
 
 
@@ -937,7 +951,7 @@ async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> Non
 
 async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     with pytest.raises(Refused, match="does not move by itself"):
         helm.command(topics.CMD_MODE, Mode("autonomous"))
@@ -962,7 +976,7 @@ async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -
     helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert scene.told == ["drive: busy: map: send a neutral drive first"]
-    with pytest.raises(Refused, match="motion was refused: let go of the stick first"):
+    with pytest.raises(Refused, match="motion was refused: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_DRIVE, GO)
@@ -980,7 +994,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
     await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))]
     for _ in range(100):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))] * 100
@@ -989,7 +1003,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
     helm.command(LEFT, Motor(value=0.0))
     await scene.settle()
     scene.gateway.taken()
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     await scene.settle()
     assert scene.gateway.taken() == [], "neutral is not repeated"
@@ -998,7 +1012,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
 async def test_what_other_programs_set_is_not_repeated() -> None:
     scene = Scene()
     helm = await scene.driving()
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     await scene.settle()
     assert scene.gateway.taken() == []
@@ -1013,7 +1027,7 @@ async def test_every_motor_there_can_be_is_set_and_held() -> None:
         helm.command(motor, Motor(value=1.0))
     await scene.settle()
     assert len(scene.gateway.taken()) == 255
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     helm.tick()
     await scene.settle()
@@ -1033,8 +1047,8 @@ async def test_one_motor_at_rest_is_no_neutral_while_another_is_still_set() -> N
     await scene.settle()
     scene.gateway.taken()
     for _ in range(10):
-        scene.now += REPEAT_S
-        with pytest.raises(Refused, match="let go of the stick first"):
+        scene.now += ATTEND_S
+        with pytest.raises(Refused, match="release the stick first"):
             helm.command(LEFT, Motor(value=5.0))
         helm.command(RIGHT, Motor(value=0.0))
         helm.tick()
@@ -1111,13 +1125,13 @@ async def test_neutral_for_the_time_of_the_lease_gives_the_robot_back() -> None:
     scene = Scene()
     helm = await scene.driving()
     for _ in range(26):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.command(topics.CMD_DRIVE, STAND)
         helm.tick()
         await scene.settle()
         assert helm.intent.held
     for _ in range(2):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
     await scene.settle()
     assert scene.gateway.report().state == "free"
@@ -1132,7 +1146,7 @@ async def test_silence_lets_the_motion_lapse_and_gives_the_robot_back() -> None:
     scene = Scene()
     helm = await scene.driving()
     for _ in range(31):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.report().state in ("free", "stopped")

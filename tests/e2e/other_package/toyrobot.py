@@ -3,8 +3,6 @@
 The robot says ``at X Y HEADING`` ten times a second, and takes ``go FORWARD TURN``.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Iterable
@@ -23,8 +21,6 @@ from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Teleme
 from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\
-[robot]
-name = "{name}"
 [device]
 protocol = "toy"
 connect = ["tcp://127.0.0.1:4000"]

@@ -1,7 +1,5 @@
 """Both recorded sessions through the sessions of both roles, each segment at its recorded time, and on to the fleet."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -78,9 +76,7 @@ def told(robot: AlfRobot, link: str, name: str, port: int) -> list[tuple[Topic, 
 
 
 @pytest.mark.parametrize(("name", "port", "count"), [(DRIVE, DRIVE_PORT, 6), (LASER, LASER_PORT, 7)])
-def test_what_a_vehicle_sent_is_read_as_hq_and_written_as_vehicle_to_the_same_bytes(
-    name: str, port: int, count: int
-) -> None:
+def test_what_a_vehicle_sent_is_read_as_hq_and_written_as_vehicle_to_the_same_bytes(name, port, count) -> None:
     recorded = stream(name, source=port)
     reader = session_of(HqSession(Dialect.TEXT))
     messages = delivered(reader, recorded)

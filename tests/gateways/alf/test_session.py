@@ -1,7 +1,5 @@
 """Sessions of ALF in both roles and dialects: texts and bytes from the protocol page, by hand; time is an argument."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 from itertools import pairwise
@@ -75,9 +73,7 @@ def timed(sent: list[tuple[float, bytes]]) -> list[tuple[int, bytes]]:
 
 @pytest.mark.parametrize("dialect", Dialect)
 @pytest.mark.parametrize(("kind", "role"), [(HqSession, Role.HQ), (VehicleSession, Role.ROBOT)])
-def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(
-    kind: type[AlfSession], role: Role, dialect: Dialect
-) -> None:
+def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, role, dialect) -> None:
     session = kind(dialect)
     before = session.state
     session.open(0.0)

@@ -1,7 +1,5 @@
 """The simulated vehicle itself: what commands make it do, what it sees, and what it says of itself."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -294,9 +292,7 @@ def test_measurements_are_numbered_and_their_counter_is_in_milliseconds() -> Non
         (3.0, 2.0, 180, 0, 0.5),
     ],
 )
-def test_ranges_are_those_to_the_walls_and_boxes(
-    x: float, y: float, heading_deg: float, angle_deg: float, range_m: float
-) -> None:
+def test_ranges_are_those_to_the_walls_and_boxes(x, y, heading_deg, angle_deg, range_m) -> None:
     assert seen_m(car(x, y, math.radians(heading_deg)), angle_deg) == pytest.approx(range_m, abs=0.04)
 
 

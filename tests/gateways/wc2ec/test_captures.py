@@ -3,10 +3,6 @@
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from __future__ import annotations
-
-import pytest
-
 from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
 from gateways.wc2ec.session import ControllerSession, ExternalSession
 from gateways.wc2ec.settings import Options
@@ -74,25 +70,6 @@ def test_what_is_read_as_external_controller_is_written_as_controller_to_the_sam
         writer.send(message)
         written += writer.outgoing(0.0) or b""
     assert written == recorded
-
-
-def test_the_messages_written_by_hand_are_the_recorded_bytes() -> None:
-    writer, written = ControllerSession(Dialect.DEPLOYED), b""
-    writer.open(0.0)
-    for message in [*REGISTRATIONS, *READINGS]:
-        writer.send(message)
-        written += writer.outgoing(0.0) or b""
-    assert written == stream(NAME, source=PORT)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 7, 11, 100])
-def test_however_the_recording_is_cut_it_is_the_same(size: int) -> None:
-    recorded, session = stream(NAME, source=PORT), ExternalSession(Dialect.DEPLOYED)
-    session.open(0.0)
-    messages: list[Wc2EcMessage] = []
-    for start in range(0, len(recorded), size):
-        messages += session.receive(recorded[start : start + size], 0.0)
-    assert messages == [*REGISTRATIONS, *READINGS]
 
 
 def test_the_recorded_controller_is_established_with_its_first_data() -> None:

@@ -28,8 +28,9 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 FILE = re.compile(r"(?<![\w/.-])(?:zbridge|gateways|tests|docs|deploy|\.ci)/[\w./<>*@-]*")
 BARE_FILE = re.compile(r"(?<![\w/.*-])\w+\.(?:py|toml|md|hex)\b(?!\()")
 MODULE = re.compile(r"(?<![\w./:@\"-])(?:zbridge|gateways|tests)(?:\.[A-Za-z_]\w*)+")
-COMMAND = re.compile(r"(?:^|`|&& )zbridge ([a-z]+)([^`\n]*)", re.MULTILINE)
+COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z]+)(.*)", re.MULTILINE)
 SPAN = re.compile(r"`([^`\n]+)`")
+BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 GROUPS = ("zbridge.protocols",)
 """Dotted names that are no modules: the entry-point group."""
@@ -64,7 +65,7 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
     for name in FILE.findall(text):
         path = re.sub(r"<\w+>", "*", name).rstrip(".")
         assert list(ROOT.glob(path)) or (ROOT / path).exists(), name
-    for name in BARE_FILE.findall("\n".join(SPAN.findall(text))):
+    for name in BARE_FILE.findall("\n".join(SPAN.findall(BLOCK.sub("", text)))):
         found = (
             path for top in ("zbridge", "gateways", "tests", "docs", "deploy") for path in (ROOT / top).rglob(name)
         )
@@ -97,7 +98,8 @@ def is_there(name: str) -> bool:
 @on_every_page(PRESENT)
 def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None:
     commands = typer.main.get_group(app).commands
-    for name, rest in COMMAND.findall(page.read_text()):
+    text = page.read_text()
+    for name, rest in COMMAND.findall("\n".join([*BLOCK.findall(text), *SPAN.findall(BLOCK.sub("", text))])):
         assert name in commands, f"zbridge {name}"
         known = {option for parameter in commands[name].params for option in parameter.opts}
         unknown = set(re.findall(r"--[a-z-]+", rest.partition("#")[0].partition("&&")[0])) - known

@@ -72,6 +72,12 @@ def test_every_file_that_is_named_exists(page: Path) -> None:
         assert name in THEIRS or next(found, None), name
 
 
+def test_the_page_of_the_architecture_names_every_room() -> None:
+    rooms = {f"`{path.parent.relative_to(ROOT)}/`" for path in ROOT.glob("zbridge/*/__init__.py")}
+    named = set(re.findall(r"^\| (`zbridge/\w+/`) \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE))
+    assert named == rooms
+
+
 @on_every_page(PRESENT)
 def test_every_module_that_is_named_exists(page: Path) -> None:
     for name in MODULE.findall(page.read_text()):

@@ -1,34 +1,84 @@
-"""Where a peer of a legacy protocol is: host and port, as configurations and logs write it. Opens nothing."""
+"""Where a peer of a legacy protocol is, as configurations and logs write it. Opens nothing.
+
+A robot is at a :data:`DeviceAddress`: a TCP port or a serial line. Listeners and simulators are at TCP ports only.
+"""
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
 import msgspec
 
 from zbridge.errors import LinkError
 
+_TCP = "tcp://host:port"
+_SERIAL = "serial:///path?baud=N"
+
 
 class Address(msgspec.Struct, frozen=True):
-    """Where a peer is: ``tcp://host:port``."""
+    """A TCP port: ``tcp://host:port``."""
 
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Read ``tcp://host:port``; raise LinkError saying what was expected."""
-        try:
-            parts = urlsplit(text)
-            host, port = parts.hostname, parts.port
-            (host or "").encode("idna")
-        except ValueError as error:
-            raise LinkError(f"{text!r}: {error}; expected tcp://host:port") from error
-        odd = parts.path or parts.query or parts.fragment or parts.username is not None
-        if parts.scheme != "tcp" or not host or port is None or odd:
-            raise LinkError(f"{text!r}: expected tcp://host:port")
-        return cls(host, port)
+        """Read ``tcp://host:port``; raise LinkError that names what was expected."""
+        parts = _split(text, _TCP)
+        if parts.scheme == "serial":
+            raise LinkError(f"{text!r}: expected {_TCP}; only a robot is connected by a serial line")
+        return _tcp(text, parts, _TCP)
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"tcp://{host}:{self.port}"
+
+
+class SerialAddress(msgspec.Struct, frozen=True):
+    """A serial line: ``serial:///dev/ttyUSB0?baud=57600``. ``baud``: bits a second."""
+
+    path: str
+    baud: int
+
+    def __str__(self) -> str:
+        return f"serial://{quote(self.path)}?baud={self.baud}"
+
+
+DeviceAddress = Address | SerialAddress
+"""Where a robot is."""
+
+
+def parse_device_address(text: str) -> DeviceAddress:
+    """Read ``tcp://host:port`` or ``serial:///path?baud=N``; raise LinkError that names what was expected."""
+    expected = f"{_TCP} or {_SERIAL}"
+    parts = _split(text, expected)
+    return _serial(text, parts) if parts.scheme == "serial" else _tcp(text, parts, expected)
+
+
+def _split(text: str, expected: str) -> SplitResult:
+    try:
+        return urlsplit(text)
+    except ValueError as error:
+        raise LinkError(f"{text!r}: {error}; expected {expected}") from error
+
+
+def _tcp(text: str, parts: SplitResult, expected: str) -> Address:
+    try:
+        host, port = parts.hostname, parts.port
+        (host or "").encode("idna")
+    except ValueError as error:
+        raise LinkError(f"{text!r}: {error}; expected {expected}") from error
+    odd = parts.path or parts.query or parts.fragment or parts.username is not None
+    if parts.scheme != "tcp" or not host or port is None or odd:
+        raise LinkError(f"{text!r}: expected {expected}")
+    return Address(host, port)
+
+
+def _serial(text: str, parts: SplitResult) -> SerialAddress:
+    path = unquote(parts.path)
+    settings = parse_qsl(parts.query, keep_blank_values=True)
+    bauds = [value for name, value in settings if name == "baud" and value.isascii() and value.isdecimal()]
+    odd = parts.netloc or parts.fragment or len(settings) != 1 or "\0" in path
+    if odd or len(path) < 2 or len(bauds) != 1 or not 0 < int(bauds[0][:10]) < 2**31:
+        raise LinkError(f"{text!r}: expected {_SERIAL}")
+    return SerialAddress(path, int(bauds[0]))

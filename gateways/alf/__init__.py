@@ -1,18 +1,16 @@
 """ALF: a vehicle with a laser scanner, in the document's binary form or the field's text form.
 
-``messages`` declares the five messages for both dialects, ``session`` holds the conversation in both roles,
-``translate`` turns messages into fleet messages and commands into messages, ``simulator`` is a vehicle to play with,
-``fragile`` one that is as fragile as the deployed ones and shares no code with the others.
+``messages`` declares the five messages for both dialects; ``session`` holds the conversation in both roles;
+``translate`` is the device side, ``hq`` the HQ side. ``simulator`` is a simulated vehicle; ``conformance`` has peers as
+fragile as deployed ones, which share no code with the rest.
 """
 
 from __future__ import annotations
 
 from gateways.alf.hq import AlfHq, HqOptions
-from gateways.alf.messages import Dialect
+from gateways.alf.messages import Dialect, codecs
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
@@ -95,5 +93,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

@@ -27,14 +27,11 @@ from gateways.alf.messages import (
 )
 from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
-from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import HqSide, Send, Telemetry
-from zbridge.protocol.session import Limits
+from zbridge.protocol import EncodeError, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
 """Deployed HQ programs repeat their command every 20 ms."""
@@ -195,7 +192,7 @@ class AlfHq(HqSide):
         def send(session: HqClient, now: float) -> None:
             if session.laser:
                 session.know(sweep.init)
-                session.outbox.stand("scan", (frame,), now)
+                session.outbox.set("scan", (frame,), now)
 
         return send
 
@@ -207,7 +204,7 @@ class AlfHq(HqSide):
         speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
         message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
-        return lambda session, now: session.outbox.stand("info", (frame,), now) if session.drive else None
+        return lambda session, now: session.outbox.set("info", (frame,), now) if session.drive else None
 
     def _measured(self, value: float) -> float:
         value = _finite(value)

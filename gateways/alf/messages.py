@@ -1,7 +1,7 @@
-"""The five messages of ALF, each declared once for both dialects, and how they are framed.
+"""The five messages of ALF, each declared once for both dialects, and their framing.
 
 Source: the message table, "Dialect `binary`" and "Dialect `text`" of the protocol page. A field's type is its
-binary form; what is another number in text says so beside it. Sans-IO.
+binary form; a comment tells where the text form is a different number. Sans-IO.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ import math
 import re
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import (
     F32,
     I32,
@@ -39,7 +40,7 @@ POINT_BYTES = 8
 
 
 class Dialect(Enum):
-    """The document's packed fields, or the field's ASCII."""
+    """The packed fields of the document, or the ASCII of deployed programs."""
 
     BINARY = "binary"
     TEXT = "text"
@@ -132,7 +133,7 @@ class ScannerInit(AlfMessage, frozen=True):
 
 @message(3, "drive command", Sender.HQ)
 class DriveCommand(AlfMessage, frozen=True):
-    """What the vehicle is to do; direction 0 is forward, 1 backward."""
+    """How the vehicle shall move. ``direction``: 0 forward, 1 backward."""
 
     speed: Speed
     direction: U8
@@ -142,7 +143,7 @@ class DriveCommand(AlfMessage, frozen=True):
 
 @message(4, "drive info", Sender.VEHICLE)
 class DriveInfo(AlfMessage, frozen=True):
-    """What the vehicle does. Accelerations lateral to the right, vertical towards the ground."""
+    """How the vehicle moves. Accelerations: ``lateral`` to the right, ``vertical`` towards the ground."""
 
     speed: Speed
     longitudinal: Raw16
@@ -161,7 +162,7 @@ class DriveInfo(AlfMessage, frozen=True):
 
 @message(255, "end", Sender.BOTH)
 class End(AlfMessage, frozen=True):
-    """The communication is over: both sides close."""
+    """The end of the conversation: both sides close."""
 
     always_1: U8 = 1
 
@@ -184,12 +185,12 @@ _TERMINATOR = b";"
 
 
 def text_limit(points: int) -> int:
-    """Give the bytes of the longest text message that is taken."""
+    """Give the length of the longest text message that is accepted, bytes."""
     return (points + _FIXED_FIELDS) * _FIELD_BYTES
 
 
 def text_frame_end(limit: int) -> FrameEnd:
-    """Make the framing of text: up to the next ``;``, or ``limit`` bytes of what never ends."""
+    """Make the framing function of the text dialect: up to the next ``;``, or ``limit`` bytes without one."""
 
     def frame_end(data: bytes, start: int) -> int:
         found = data.find(_TERMINATOR, start, start + limit)
@@ -201,7 +202,7 @@ def text_frame_end(limit: int) -> FrameEnd:
 
 
 def read_text(frame: bytes, ids: frozenset[int]) -> AlfMessage:
-    """Read one text message; raise ProtocolError where it is none of ``ids`` or its fields are not right."""
+    """Read one text message; raise ProtocolError if its id is not in ``ids`` or its fields are wrong."""
     if not frame.endswith(_TERMINATOR):
         raise ProtocolError(f"{len(frame)} bytes without ';'")
     number = _NUMBER.search(frame)
@@ -213,7 +214,7 @@ def read_text(frame: bytes, ids: frozenset[int]) -> AlfMessage:
 
 
 def write_text(message: AlfMessage) -> bytes:
-    """Write one text message; raise EncodeError where a value has no form in it."""
+    """Write one text message; raise EncodeError for a value that its type cannot carry."""
     spec = message.spec
     return b"%d|%b;" % (spec.id, spec.text.encode(message))
 
@@ -229,13 +230,13 @@ def _known(number: bytes, ids: frozenset[int]) -> Spec:
 
 
 def binary_size(message_id: int, points: int) -> int:
-    """Give the bytes of a binary message, its id included."""
+    """Give the length of a binary message with its id, bytes."""
     size = 1 + MESSAGES[message_id].binary.fixed_size
     return size + POINT_BYTES * points if message_id == Measurement.spec.id else size
 
 
 def binary_frame_end(ids: frozenset[int], points: Callable[[], int]) -> FrameEnd:
-    """Make the framing of binary: the id gives the length, and ``points`` that of a measurement.
+    """Make the framing function of the binary dialect: the id tells the length; ``points()``, that of a measurement.
 
     Bytes that begin no message make a frame of their own, up to the next byte that might.
     """
@@ -252,17 +253,31 @@ def binary_frame_end(ids: frozenset[int], points: Callable[[], int]) -> FrameEnd
 
 
 def read_binary(frame: bytes, ids: frozenset[int]) -> AlfMessage:
-    """Read one binary message; raise ProtocolError where it is none of ``ids`` or its fields are not right."""
+    """Read one binary message; raise ProtocolError if its id is not in ``ids`` or its fields are wrong."""
     if frame[0] not in ids:
         raise ProtocolError(f"{len(frame)} bytes that begin no message: id {frame[0]}, expected {sorted(ids)}")
     return MESSAGES[frame[0]].binary.decode(frame, 1)
 
 
 def write_binary(message: AlfMessage) -> bytes:
-    """Write one binary message; raise EncodeError where a value has no form in it."""
+    """Write one binary message; raise EncodeError for a value that its type cannot carry."""
     spec = message.spec
     return bytes((spec.id,)) + spec.binary.encode(message)
 
 
 _SKIPPED = 4096
-"""Bytes of the longest stretch without a message that is counted as one."""
+"""Bytes without a message that are skipped, and counted, as one."""
+
+
+def codecs() -> tuple[Codec, ...]:
+    """List the messages of both dialects and both sides for the conformance kit; one measurement has two points."""
+    found = []
+    for sender, whole in ((Sender.VEHICLE, (DriveInfo(1, 2, 3, 4, 5, 6, 7, 0.5),)), (Sender.HQ, ())):
+        ids = sent_by(sender)
+        messages = (*(MESSAGES[number].message for number in sorted(ids - {DriveInfo.spec.id})), *whole)
+        end = binary_frame_end(ids, lambda: 2)
+        found += [
+            Codec(f"text, {sender.value}", write_text, partial(read_text, ids=ids), text_frame_end(4096), messages),
+            Codec(f"binary, {sender.value}", write_binary, partial(read_binary, ids=ids), end, messages),
+        ]
+    return tuple(found)

@@ -1,7 +1,7 @@
-"""Sessions of ALF in both roles and dialects: framing, END, and the drive command that is never silent. Sans-IO.
+"""Sessions of ALF in both roles and dialects: framing, END, and the drive command that repeats for ever. Sans-IO.
 
-Source: "Roles", "The gateway as HQ" and the dialects of the protocol page. There is no handshake: who is connected
-is established.
+Source: "Roles", "The gateway as HQ" and the dialects of the protocol page. There is no handshake: a session
+is established at once.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from zbridge.errors import Code, NotReady, ProtocolError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import Code, Limits, NotReady, ProtocolError, Role, Session, State
 
 REPEAT_S = 0.02
 """Seconds between repetitions of the drive command."""
@@ -40,9 +39,9 @@ _BOUNDS = Limits(frame_bytes=0, handshake_s=HANDSHAKE_S)
 
 
 class AlfSession(Session[AlfMessage]):
-    """What both roles share. points: of a measurement, which binary framing has to know.
+    """Both roles. ``points``: points of a measurement; the binary framing depends on it.
 
-    bounds: what a listener demands of its clients.
+    ``bounds``: what a listener demands of its clients.
     """
 
     handled = frozenset({End})
@@ -83,7 +82,7 @@ class AlfSession(Session[AlfMessage]):
     def decode(self, frame: bytes) -> AlfMessage:
         if self.dialect is Dialect.TEXT:
             broken, self._broken = self._broken, not frame.endswith(b";")
-            if broken:  # what comes before the next ';' belongs to what was too long
+            if broken:  # these bytes are the rest of a message that was too long
                 raise ProtocolError(f"{len(frame)} bytes more of a message without an end")
         message = self._read(frame, self._ids)
         if isinstance(message, ScannerInit) and self._points_from_scanner:
@@ -102,7 +101,7 @@ class AlfSession(Session[AlfMessage]):
         return True
 
     def close(self, reason: str, now: float) -> None:
-        """Say END, once, and nothing after it."""
+        """Send END once; nothing follows it."""
         if self.state is State.ESTABLISHED:
             self.outbox.clear(_DRIVE)
             super().send(End())
@@ -110,7 +109,7 @@ class AlfSession(Session[AlfMessage]):
 
 
 class HqSession(AlfSession):
-    """We play HQ towards a vehicle. drives: this link takes drive commands, so it always gets one, neutral at first."""
+    """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
 
     role = Role.HQ
     _SENT_BY_PEER = sent_by(Sender.VEHICLE)
@@ -136,7 +135,7 @@ class HqSession(AlfSession):
         """Send a command at once, and again every 20 ms until the next one."""
         if self.over:
             raise NotReady("closing", Code.CLOSING)
-        self.outbox.stand(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
+        self.outbox.set(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
 class VehicleSession(AlfSession):
@@ -147,7 +146,7 @@ class VehicleSession(AlfSession):
 
 
 def points_of(scanner: ScannerInit) -> int:
-    """Reckon how many points a scanner's geometry gives; raise ProtocolError where that is absurd."""
+    """Compute the number of points from a scanner's geometry; raise ProtocolError if the number is absurd."""
     points = (scanner.angle_max_deg - scanner.angle_min_deg) / scanner.angle_increment_deg + 1
     if not 0.5 <= points <= MOST_POINTS:
         raise ProtocolError(f"scanner init with {points:g} points, expected 1 to {MOST_POINTS}")

@@ -1,4 +1,4 @@
-"""An ALF vehicle to play with: steers like a car, sees the small world with its laser, stops when nobody drives it.
+"""A simulated ALF vehicle: steers like a car, measures the small world with its laser, stops when nobody drives it.
 
 It speaks either dialect, on one port or two. Deterministic with a seed: the same commands at the same times give
 the same world. Source: the message table and "Dialect `text`" of the protocol page.
@@ -17,9 +17,8 @@ import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import VehicleSession
-from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import State
+from gateways.alf.translate import DRIVE, LASER
+from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Accepted, Conversation
 from zbridge.transport.link import Link, Receiver
@@ -32,7 +31,7 @@ SPEED_M_S = 1.0
 """Speed over ground at 100 percent."""
 WHEELBASE_M = 0.35
 LOCK_RAD = math.radians(30.0)
-"""How far the wheels turn at full lock."""
+"""Steering angle at full lock."""
 ACCELERATION_M_S2 = 2.0
 SILENT_CYCLES = 20
 """Cycles without a drive command after which the motor stops."""
@@ -48,7 +47,7 @@ _MOST_SPEED, _MOST_TEXT_SPEED = 100, 255
 
 
 class Car:
-    """The simulated vehicle itself: what commands make it do, and what it sees. Knows no connection."""
+    """The simulated vehicle: obeys commands, moves, measures. Knows no connection."""
 
     def __init__(self, seed: int, dialect: Dialect) -> None:
         rng = random.Random(seed)
@@ -80,7 +79,7 @@ class Car:
         self._silent = 0
 
     def step(self, dt: float) -> None:
-        """Live for ``dt`` seconds: Ackermann steering, limited acceleration, walls."""
+        """Advance by ``dt`` seconds: Ackermann steering, limited acceleration, walls."""
         self._clock_ms += round(dt * 1000)
         self._silent += 1
         wanted = self._wanted_m_s if self._silent <= SILENT_CYCLES else 0.0
@@ -93,7 +92,7 @@ class Car:
             self.speed_m_s = 0.0
 
     def measure(self) -> Measurement:
-        """Sweep with the laser: mm, 0 where nothing was measured."""
+        """Sweep with the laser: mm, 0 for no measurement."""
         self._sequence += 1
         range_max = SCANNER.range_max_mm / 1000
         ranges = cast(self.body.x, self.body.y, self.body.heading + _ANGLES, range_max)
@@ -103,7 +102,7 @@ class Car:
         return Measurement(self._sequence, self._clock_ms, np.maximum(points, 0), FIRST_VALID, LAST_VALID)
 
     def info(self) -> DriveInfo:
-        """Say how it moves, in the units of its dialect."""
+        """Describe the motion, in the units of the dialect."""
         g, degrees = STANDARD_GRAVITY, math.degrees(self._turn_rad_s)
         lateral = -self.speed_m_s * self._turn_rad_s / g
         values = (self._acceleration / g, lateral, 1.0, 0.0, 0.0, degrees)
@@ -118,15 +117,15 @@ class Simulator:
     def __init__(self, seed: int, dialect: Dialect) -> None:
         self.car = Car(seed, dialect)
         self._dialect = dialect
-        self._peers: dict[str, set[Conversation]] = {"drive": set(), "laser": set()}
+        self._peers: dict[str, set[Conversation]] = {DRIVE: set(), LASER: set()}
         self._loop = asyncio.get_running_loop()
 
     def __repr__(self) -> str:
         return f"<Simulator {self.car}>"
 
     async def run(self, simulation: Simulation) -> None:
-        """Listen and live until cancelled; then say END."""
-        parts = [{"drive"}, {"laser"}] if len(simulation.addresses) > 1 else [{"drive", "laser"}]
+        """Listen and simulate until cancelled; then send END."""
+        parts = [{DRIVE}, {LASER}] if len(simulation.addresses) > 1 else [{DRIVE, LASER}]
         async with contextlib.AsyncExitStack() as stack:
             addresses = [
                 await stack.enter_async_context(listen(address, self._accepting(part)))
@@ -151,8 +150,8 @@ class Simulator:
         return conversation
 
     def _greet(self, conversation: Conversation, parts: set[str]) -> None:
-        """Describe the scanner, and only then send what it measures."""
-        if "laser" in parts:
+        """Describe the scanner; from then on send measurements."""
+        if LASER in parts:
             _send(conversation, SCANNER)
         for part in () if conversation.ended.done() else parts:
             self._peers[part].add(conversation)
@@ -175,9 +174,9 @@ class Simulator:
             steps += 1
             self.car.step(STEP_S)
             if steps % _SCAN_EVERY == 0:
-                self._tell("laser", self.car.measure())
+                self._tell(LASER, self.car.measure())
             if steps % _INFO_EVERY == 0:
-                self._tell("drive", self.car.info())
+                self._tell(DRIVE, self.car.info())
 
 
 def _send(conversation: Conversation, message: AlfMessage) -> None:
@@ -190,5 +189,5 @@ def _send(conversation: Conversation, message: AlfMessage) -> None:
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a simulated vehicle until cancelled."""
+    """Run a simulated vehicle until cancelled."""
     await Simulator(simulation.seed, Dialect(simulation.dialect or "text")).run(simulation)

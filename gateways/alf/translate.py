@@ -1,4 +1,4 @@
-"""Between ALF messages and fleet messages, both ways, and one vehicle as a robot. Sans-IO.
+"""Translates between ALF messages and fleet messages, both ways: one vehicle. Sans-IO.
 
 Source: "Translation" and "The gateway as HQ" of the protocol page.
 """
@@ -25,15 +25,26 @@ from gateways.alf.messages import (
     ScannerInit,
 )
 from gateways.alf.session import HqSession, points_of
-from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.device_clock import DeviceClock
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    DeviceClock,
+    Metrics,
+    NotReady,
+    Outcome,
+    ProtocolError,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "alf"
+VEHICLE = "vehicle"
+"""The name of the link of a vehicle with one."""
+DRIVE, LASER = "drive", "laser"
+"""The names of the links of a vehicle with two."""
 STANDARD_GRAVITY = 9.80665
 FULL_LOCK_DEG = 90
 """The steering angle at ``turn`` = -1 or 1."""
@@ -47,14 +58,14 @@ UNITS = {
     Dialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
     Dialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
 }
-"""What one unit of acceleration (m/s2) and of gyro (rad/s) is where the options do not say."""
+"""One unit of acceleration (m/s2) and of gyro (rad/s), unless the options tell another."""
 
 Ints = npt.NDArray[np.int64]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
+    """``[device.options]``; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
     points: Annotated[int, msgspec.Meta(ge=1, le=MOST_POINTS)] = POINTS
@@ -66,15 +77,15 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AlfRobot(Robot):
-    """One vehicle, with one link or two: the first drives."""
+    """One vehicle, with one link or two; the first link drives."""
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
-        self.link_names = ("vehicle",) if links == 1 else ("drive", "laser")
+        self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = Dialect(options.dialect)
-        self._sessions: list[HqSession | None] = [None] * links
+        self._session: HqSession | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
@@ -89,10 +100,11 @@ class AlfRobot(Robot):
 
     @property
     def driving(self) -> HqSession | None:
-        return self._sessions[0]
+        return self._session
 
-    def session(self, link: int, peer: str) -> HqSession:
-        if link == 0:
+    def session(self, link: str, peer: str) -> HqSession:
+        drives = link == self.link_names[0]
+        if drives:
             self._backward = False
             self._command = self._neutral()
         session = HqSession(
@@ -100,9 +112,10 @@ class AlfRobot(Robot):
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,
             gap_s=self.options.gap_s,
-            drives=self._command if link == 0 else None,
+            drives=self._command if drives else None,
         )
-        self._sessions[link] = session
+        if drives:
+            self._session = session
         return session
 
     # Messages to telemetry
@@ -128,7 +141,7 @@ class AlfRobot(Robot):
         return ((topics.SCAN, scan),)
 
     def _count(self, sequence: int) -> None:
-        """Count what a sequence number shows: measurements that never came, and those that came twice."""
+        """Count the measurements that were lost, and those that came twice, by their sequence numbers."""
         before, self._sequence = self._sequence, sequence
         if before is None or sequence < before:  # the first, or a vehicle that was started anew
             return
@@ -193,25 +206,24 @@ class AlfRobot(Robot):
         return Outcome(left_out="left: an ALF vehicle steers, it does not move sideways" if command.left else None)
 
     def _neutral(self) -> DriveCommand:
-        """Stand, wheels straight; the direction stays, for a vehicle that still rolls."""
+        """Speed 0, wheels straight. The direction is kept: the vehicle may still roll."""
         return self._written(0, backward=self._backward, steering_deg=0)
 
     def _written(self, speed: int, *, backward: bool, steering_deg: int) -> DriveCommand:
-        """Make a command; steering_deg: to the right positive."""
+        """Make a command. ``steering_deg``: positive to the right."""
         straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
         return DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
 
     def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:
-        session = self._sessions[0]
-        if session is None:
+        if self._session is None:
             raise NotReady("offline")
-        session.drive(command, now, urgent=urgent)
+        self._session.drive(command, now, urgent=urgent)
         self._command = command
         self._backward = command.direction == _BACKWARD
 
 
 def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
-    """Give the ranges in metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
+    """Give the ranges, metres, float32[n]: NaN outside the valid indices (inclusive) and outside the range."""
     least, most = max(1, scanner.range_min_mm), max(0, scanner.range_max_mm)
     if most <= _MOST_TABLE_MM:
         ranges: Floats = _metres(least, most).take(message.points, mode="clip")
@@ -224,7 +236,7 @@ def ranges_m(message: Measurement, scanner: ScannerInit) -> Floats:
 
 @lru_cache(maxsize=8)
 def _metres(least: int, most: int) -> Floats:
-    """Tabulate the metres of every mm up to ``most``, and NaN behind it: half the time of comparing each point."""
+    """Tabulate the metres of each mm up to ``most``, then NaN: takes half the time of comparing each point."""
     return _in_metres(np.arange(most + 2), least, most)
 
 

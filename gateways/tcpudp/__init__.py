@@ -8,12 +8,11 @@ is as fragile as the deployed ones and shares no code with the others.
 from __future__ import annotations
 
 from gateways.tcpudp.hq import HqOptions, TcpUdpHq
+from gateways.tcpudp.messages import codecs
 from gateways.tcpudp.settings import HQ_BLOCKS
 from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -104,5 +103,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

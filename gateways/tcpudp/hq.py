@@ -49,15 +49,11 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import CLIENT_PORT, RobotSession
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME, OFF, ON, Angle, Length, PacketId, Scale
-from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Map, Mode, Pose, Query, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.negotiation import newest
-from zbridge.protocol.plugin import HqSide, Send, Telemetry
-from zbridge.protocol.session import Datagram, Limits
+from zbridge.protocol import Datagram, EncodeError, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry, newest
 
 DEADMAN_S = 1.3
 """Deployed HQ programs repeat what their stick says every 0.5 s."""
@@ -135,7 +131,7 @@ class HqClient(RobotSession):
     def show(self, slot: str, packet_id: int, frame: bytes, now: float) -> None:
         """Let a frame stand until it is written, the newest of its slot, if the client knows the packet."""
         if packet_id in self.known:
-            self.outbox.stand(slot, (frame,), now)
+            self.outbox.set(slot, (frame,), now)
         else:
             self.leave_out(packet_id)
 

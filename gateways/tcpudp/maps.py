@@ -10,8 +10,8 @@ import math
 import msgspec
 import numpy as np
 
-from zbridge.errors import EncodeError
 from zbridge.fleet.messages import Cells, Map
+from zbridge.protocol import EncodeError
 
 TCP_BYTES = 2199
 """Bytes of the longest packet that HQ programs take by TCP: they lose those of 2.2 kB and more."""

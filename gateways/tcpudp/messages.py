@@ -9,12 +9,13 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import ClassVar, TypeVar
 
 import msgspec
 
 from gateways.tcpudp.settings import Feature
-from zbridge.errors import EncodeError, ProtocolError
+from zbridge.protocol import Codec, EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64
@@ -342,3 +343,10 @@ _DECODERS: dict[type[Packet], Callable[[bytes, int], Packet]] = {
     DebugMessage: _decode_text,
     ServerSLAMMap: _decode_map,
 }
+
+
+def codecs() -> tuple[Codec, ...]:
+    """List the packets for the conformance kit."""
+    declared = (spec.packet for spec in PACKETS.values() if spec.packet is not ServerSLAMMapPart)
+    messages = (*declared, ServerSLAMMapPart(1, 3, b"ab"), OpaquePacket(70, b"led"))
+    return (Codec("packets", partial(encode_packet, sender_id=SERVER_ID), decode_packet, frame_end, messages),)

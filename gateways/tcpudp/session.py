@@ -37,11 +37,24 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.settings import HQ_BLOCKS, ROBOT_BLOCKS, Feature, Settings, read_settings
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import ANNOUNCED, LISTED, VERSIONS, announced
-from zbridge.errors import EncodeError, Malformed, NotReady, ProtocolError, Unsupported
-from zbridge.protocol.negotiation import agree, newest, parse_versions
-from zbridge.protocol.outbox import LIMIT
-from zbridge.protocol.session import Datagram, Limits, Role, Session, State
-from zbridge.protocol.udp_probe import Probe, Verdict
+from zbridge.protocol import (
+    LIMIT,
+    Datagram,
+    EncodeError,
+    Limits,
+    Malformed,
+    NotReady,
+    Probe,
+    ProtocolError,
+    Role,
+    Session,
+    State,
+    Unsupported,
+    Verdict,
+    agree,
+    newest,
+    parse_versions,
+)
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -245,13 +258,13 @@ class HqSession(_TcpUdpSession):
     def switch_lidar(self, mode: int, now: float) -> None:
         """Send a lidar mode."""
         self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
-        self._signs.asked(self._heard, 1 + self.outbox.stands(_LIDAR_AGAIN))
+        self._signs.asked(self._heard, 1 + self.outbox.is_set(_LIDAR_AGAIN))
 
     def _send_surely(self, frame: bytes, again: str, now: float) -> None:
         """Send a packet, to robots that misread some again; a newer one ends the repetition of an older one."""
         self.outbox.put(frame)
         if self._agreed in _MISREADING:
-            self.outbox.stand(again, (frame,), now + AGAIN_S)
+            self.outbox.set(again, (frame,), now + AGAIN_S)
 
     def send_nothing_again(self) -> None:
         """Drop what is still to be repeated: the robot is stopped."""
@@ -281,7 +294,7 @@ class HqSession(_TcpUdpSession):
         frame = super().outgoing(now)
         if type(frame) is _Chosen:
             # A robot that may have misread another mode is in mode 3 until that was sent again.
-            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.stands(_MODE_AGAIN))
+            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.is_set(_MODE_AGAIN))
         return frame
 
     def send(self, message: Packet) -> None:
@@ -308,7 +321,7 @@ class HqSession(_TcpUdpSession):
         features = self._announce if udp else self._announce - {Feature.UDP}
         self.send_first(ClientSettings(answer, announced(answer, features)))
         if udp:
-            self._limit_at = math.inf
+            self.lift_limit()
             self._start.begin(now)
         else:
             self._finish(now)
@@ -568,7 +581,7 @@ class RobotSession(_TcpUdpSession):
         row = newest((agreed,), known=VERSIONS)
         self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
         if self.settings.udp and self.client.udp:
-            self._limit_at = math.inf
+            self.lift_limit()
             self.send_first(ServerStartUDP())
             self._probe.begin(now)
             self._heard_until = now + PROBE_S

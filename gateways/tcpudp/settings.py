@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from zbridge.errors import ProtocolError
-from zbridge.protocol.negotiation import newest, parse_versions
+from zbridge.protocol import ProtocolError, newest, parse_versions
 from zbridge.wire import I32, BinaryCodec, Bool, Message
 
 

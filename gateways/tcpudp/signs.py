@@ -6,7 +6,7 @@ texts are left out, as they reach every client of a robot.
 
 from __future__ import annotations
 
-from zbridge.protocol.session import Traffic
+from zbridge.protocol import Traffic
 
 FIRST_CLIENT = 2
 """The id that a robot gives the first client after its start."""

@@ -38,10 +38,7 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import RobotSession, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import State
-from zbridge.protocol.session_table import ClientIds
+from zbridge.protocol import ClientIds, EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport.conversation import Accepted, Conversation
 from zbridge.transport.link import Link

@@ -38,12 +38,21 @@ from gateways.tcpudp.messages import (
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.errors import Malformed, NotReady, ProtocolError, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, Drive, FleetMessage, Map, Mode, Pose, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    Malformed,
+    Metrics,
+    NotReady,
+    Outcome,
+    ProtocolError,
+    Refused,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "tcpudp"
 ON, OFF = 1, 2
@@ -110,7 +119,7 @@ class TcpUdpRobot(Robot):
     def driving(self) -> HqSession | None:
         return self._session
 
-    def session(self, link: int, peer: str) -> HqSession:
+    def session(self, link: str, peer: str) -> HqSession:
         self._session = HqSession(
             limits(self.options.gap_s),
             udp=self.options.udp,
@@ -247,7 +256,7 @@ class TcpUdpRobot(Robot):
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
         session = self._connected()
         frames = tuple(session.encode(packet) for packet in packets)
-        session.outbox.stand(_MOTION, frames, now, period_s=REPEAT_S)
+        session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._rests_until = self._paired_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
@@ -286,7 +295,7 @@ class TcpUdpRobot(Robot):
         """Let packet 13 stand, ``paired`` with a mode 1 before it; raise Refused where it may not be sent."""
         session = self._connected()
         packets = (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
-        session.outbox.stand(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
+        session.outbox.set(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
         self._rests_until, self._paired_until = until, until if paired else -math.inf
 
     def _connected(self) -> HqSession:

@@ -10,7 +10,7 @@ from collections.abc import Collection
 import msgspec
 
 from gateways.tcpudp.settings import HQ_BLOCKS, Feature
-from zbridge.protocol.negotiation import newest, parse_versions
+from zbridge.protocol import newest, parse_versions
 
 LISTED = ("1.1", "1.2", "1.3")
 """What peers of version 1.3 list, and the only list deployed 1.3 and "1.4" robots take without crashing."""

@@ -1,19 +1,17 @@
 """WC2EC: Webots robots, by the controller program of the simulation, in the field's dialect or the document's.
 
-``messages`` declares the messages of both dialects, ``devices`` the table of what a robot has, ``session`` holds the
-conversation in both roles, ``translate`` turns readings into fleet messages and commands into motor values,
-``simulator`` is a robot to play with, ``fragile`` one that is as fragile as the deployed ones and shares no code with
-the others.
+``messages`` declares the messages of both dialects; ``devices`` is the table of a robot's devices; ``session`` holds
+the conversation in both roles; ``settings`` and ``translate`` are the device side, ``hq`` the HQ side. ``simulator`` is
+a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
 """
 
 from __future__ import annotations
 
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq
-from gateways.wc2ec.messages import Dialect
-from gateways.wc2ec.translate import NAME, Options, Wc2EcRobot
-from zbridge.address import Address
-from zbridge.errors import ConfigError
-from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation
+from gateways.wc2ec.messages import Dialect, codecs
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import NAME, Wc2EcRobot
+from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -122,5 +120,6 @@ PROTOCOL = Protocol(
     hq_options=HqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
+    codecs=codecs(),
     hq_template=HQ_TEMPLATE,
 )

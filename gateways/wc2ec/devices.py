@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import msgspec
 
-from zbridge.fleet.messages import Device as Entry
-from zbridge.fleet.messages import Devices
+from zbridge.fleet.messages import Device, Devices
 
 DISTANCE, LIGHT, ROTATIONAL, LINEAR = "distance", "light", "rotational", "linear"
 _SENSOR_KINDS = {37: DISTANCE, 38: DISTANCE}
-"""Webots node types; their numbers move with the version, so they only give a name to the kind."""
+"""Node types of Webots. The numbers change with the version of Webots, so only the shown kind depends on them."""
 
 
-class Device(msgspec.Struct, frozen=True):
-    """One device: its name in keys, as people see it, its number, its type byte and what kind it is."""
+class WebotsDevice(msgspec.Struct, frozen=True):
+    """One device. ``name``: in keys; ``shown``: to people; ``type``: its type byte; ``kind``: what that means."""
 
     name: str
     shown: str
@@ -26,7 +25,7 @@ class Device(msgspec.Struct, frozen=True):
 
     @property
     def motor(self) -> bool:
-        """Whether it can be set."""
+        """Whether the device can be set."""
         return self.kind in (ROTATIONAL, LINEAR)
 
 
@@ -35,14 +34,14 @@ class Table:
 
     def __init__(self) -> None:
         self.collisions: list[str] = []
-        self._by_number: dict[int, Device] = {}
-        self._by_name: dict[str, Device] = {}
+        self._by_number: dict[int, WebotsDevice] = {}
+        self._by_name: dict[str, WebotsDevice] = {}
 
     def __repr__(self) -> str:
         return f"<Table of {len(self._by_number)} devices>"
 
-    def add(self, device: Device) -> Device | None:
-        """Enter a device; None where its number has one already. A name that is taken gets its number behind it."""
+    def add(self, device: WebotsDevice) -> WebotsDevice | None:
+        """Enter a device; give it as entered: the number is added to a name that is taken. None: the number is taken."""
         if device.number in self._by_number:
             return None
         if device.name in self._by_name:
@@ -54,38 +53,38 @@ class Table:
         self._by_number[device.number] = self._by_name[device.name] = device
         return device
 
-    def numbered(self, number: int) -> Device | None:
-        """Find a device by its number."""
+    def numbered(self, number: int) -> WebotsDevice | None:
+        """Find a device by its number; None: there is none."""
         return self._by_number.get(number)
 
-    def named(self, name: str) -> Device | None:
-        """Find a device by its name in keys."""
+    def named(self, name: str) -> WebotsDevice | None:
+        """Find a device by its name in keys; None: there is none."""
         return self._by_name.get(name)
 
-    def motors(self, kind: str) -> list[Device]:
+    def motors(self, kind: str) -> list[WebotsDevice]:
         """List the motors of one kind."""
         return [device for device in self._by_number.values() if device.kind == kind]
 
     def message(self, stamp_ns: int) -> Devices:
-        """Show the table."""
-        entries = (Entry(device.shown, device.number, device.kind) for device in self._by_number.values())
+        """Give the table as a fleet message."""
+        entries = (Device(device.shown, device.number, device.kind) for device in self._by_number.values())
         return Devices(tuple(entries), stamp_ns=stamp_ns)
 
 
-def registered(raw: bytes, number: int, kind_byte: int, kind: str) -> Device:
-    """Make a device of a registration; bytes that are not UTF-8 stay what they are in the key."""
+def registered(raw: bytes, number: int, kind_byte: int, kind: str) -> WebotsDevice:
+    """Make a device from a registration; in the key, bytes that are not UTF-8 are kept."""
     name = raw.decode("utf-8", "surrogateescape")
-    return Device(name, raw.decode("utf-8", "backslashreplace"), number, kind_byte, kind)
+    return WebotsDevice(name, raw.decode("utf-8", "backslashreplace"), number, kind_byte, kind)
 
 
-def unnamed(number: int, kind_byte: int, kind: str) -> Device:
-    """Make a device that nobody has named."""
+def unnamed(number: int, kind_byte: int, kind: str) -> WebotsDevice:
+    """Make a device without a name: ``<kind>-<number>``."""
     name = f"{kind}-{number}"
-    return Device(name, name, number, kind_byte, kind)
+    return WebotsDevice(name, name, number, kind_byte, kind)
 
 
 def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
-    """Name the kind of a type byte."""
+    """Give the kind that a type byte means; motor types come first."""
     for kind, types in motor_types.items():
         if kind_byte in types:
             return kind

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Literal
 
 import msgspec
-import numpy as np
 
 from gateways.wc2ec.devices import DISTANCE, LINEAR, ROTATIONAL
 from gateways.wc2ec.messages import (
@@ -28,8 +27,8 @@ from gateways.wc2ec.messages import (
     write,
 )
 from gateways.wc2ec.session import ControllerSession
-from gateways.wc2ec.translate import NAME, Byte, DeviceOption, Positive
-from zbridge.errors import ConfigError, ProtocolError
+from gateways.wc2ec.settings import Byte, DeviceOption
+from gateways.wc2ec.translate import NAME
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
     Device,
@@ -45,13 +44,20 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import HqSide, Send, Telemetry
-from zbridge.protocol.session import Limits
+from zbridge.protocol import (
+    ConfigError,
+    Differential,
+    HqSide,
+    Limits,
+    Metrics,
+    Positive,
+    ProtocolError,
+    Sectors,
+    Send,
+    Telemetry,
+)
 
 DEADMAN_S = 0.5
-MOST_POINTS = 100_000
-"""Of a scanner that nobody has seen a scan of."""
 NUMBERS = 255
 """Devices there can be: numbers 0 to 254."""
 LEFT, RIGHT = "left", "right"
@@ -60,18 +66,15 @@ FAULT = -1.0
 """What a distance sensor shows of which nothing is known: deployed controllers take it as a fault, while anything from
 0 to 1000 would be a lie ("The gateway as Webots controller")."""
 _MOST = 1e9
-_MOST_RAD = 1e6
 _NAME_BYTES = 255
 _ESCAPED = re.compile(r"\\x([89a-f][0-9a-f])")
 
 
-class Wheels(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The two sides of wheels that are shown of a robot without motors. speed_full, turn_full: of a drive of 1."""
+class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The two sides of wheels that are shown of a robot without motors."""
 
     wheel_radius_m: Positive = 0.05
     track_m: Positive = 0.3
-    speed_full_m_s: Positive = 0.5
-    turn_full_rad_s: Positive = 1.0
 
 
 class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -153,9 +156,7 @@ class Wc2EcHq(HqSide):
         self._by_number: dict[int, Shown] = {}
         self._registrations: dict[int, bytes] = {}
         self._unregistered = (metrics or Metrics()).count("hq_devices_left_out")
-        self._sectors: tuple[Scan | None, dict[str, float]] = (None, {})
-        """The nearest point of each sector, and the scan that it is of."""
-        self._sectoring: tuple[tuple[float, float, int], list[tuple[str, Any]]] | None = None
+        self._sectors = Sectors(options.sectors)
         self._frames: dict[int, tuple[float, bytes]] = {}
         """The data that was encoded last of each device."""
         self._gone: dict[str, Reading] = {}
@@ -237,7 +238,7 @@ class Wc2EcHq(HqSide):
     def _sector_names(self) -> list[str]:
         """List the sectors there are, whether a scan has come or not: a controller without sensors is never ready."""
         for geometry in (self.view.scan, self.view.scanner):
-            names = [name for name, _ in self._sectors_of(geometry)] if geometry is not None else []
+            names = [f"sector{sector}" for sector in self._sectors.covered(geometry)] if geometry is not None else []
             if names:
                 return names
         return [] if self.view.readings else [f"sector{number}" for number in range(self.options.sectors)]
@@ -324,28 +325,8 @@ class Wc2EcHq(HqSide):
 
     def _nearest(self, scan: Scan) -> dict[str, float]:
         """Give the nearest point of each sector that a scan covers, in the unit of the controllers."""
-        if self._sectors[0] is not scan:
-            measured = np.where(scan.ranges >= 0, scan.ranges, np.float32(np.nan))
-            nearest = {
-                name: float(np.nanmin(measured[points], initial=scan.range_max)) / self.options.sector_unit_m
-                for name, points in self._sectors_of(scan)
-            }
-            self._sectors = (scan, nearest)
-        return self._sectors[1]
-
-    def _sectors_of(self, scan: Scan | Scanner) -> list[tuple[str, Any]]:
-        """Give the indices of each sector that a scan covers; sector 0 is ahead, they go on counter-clockwise."""
-        count = len(scan.ranges) if isinstance(scan, Scan) else min(max(scan.points, 0), MOST_POINTS)
-        geometry = (scan.angle_min, scan.angle_increment, count)
-        if not abs(scan.angle_min) + abs(scan.angle_increment) * count < _MOST_RAD:
-            return []
-        if self._sectoring is None or self._sectoring[0] != geometry:
-            angles = scan.angle_min + scan.angle_increment * np.arange(count)
-            width = 2 * math.pi / self.options.sectors
-            sectors = np.floor_divide(angles + width / 2, width).astype(np.int64) % self.options.sectors
-            cut = [(f"sector{number}", np.flatnonzero(sectors == number)) for number in range(self.options.sectors)]
-            self._sectoring = (geometry, [(name, points) for name, points in cut if points.size])
-        return self._sectoring[1]
+        unit_m = self.options.sector_unit_m
+        return {f"sector{sector}": range_m / unit_m for sector, range_m in self._sectors.nearest_m(scan).items()}
 
     def _data(self, values: Iterable[tuple[Shown, float | None]]) -> Send | None:
         """Encode sensor data once for every controller."""
@@ -371,7 +352,7 @@ class Wc2EcHq(HqSide):
         if device.number not in session.registered:
             self._register(session, now)
         if not self._draft or device.number in session.enabled:
-            session.outbox.stand(f"sensor {device.number}", (frame,), now)
+            session.outbox.set(f"sensor {device.number}", (frame,), now)
 
     # What controllers command
 
@@ -418,10 +399,7 @@ class Wc2EcHq(HqSide):
     def _drive(self, left: float, right: float) -> Drive:
         """Turn velocities of two sides, rad/s, into a drive, to full scale where they are more."""
         wheels = self.options.wheels
-        forward = wheels.wheel_radius_m * (left + right) / 2 / wheels.speed_full_m_s
-        turn = wheels.wheel_radius_m * (right - left) / wheels.track_m / wheels.turn_full_rad_s
-        scale = max(1.0, abs(forward), abs(turn))
-        return Drive(forward=forward / scale, turn=turn / scale)
+        return wheels.drive(wheels.wheel_radius_m * left, wheels.wheel_radius_m * right)
 
     def _enable(self, session: HqClient, device: Shown, message: EnableSensor) -> tuple[Telemetry, ...]:
         session.enabled.add(device.number)

@@ -1,4 +1,4 @@
-"""The messages of WC2EC, each declared once for the dialects that have it, and how they are framed.
+"""The messages of WC2EC, each declared once for all dialects that have it, and their framing.
 
 Source: "Dialect `draft`" and "Dialect `deployed`" of the protocol page. Every message begins with a byte of command,
 one of sensor type and one of sensor number; the command tells how the rest is read. Sans-IO.
@@ -8,25 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from zbridge.errors import ProtocolError
+from zbridge.protocol import Codec, ProtocolError
 from zbridge.wire import F64, U8, BinaryCodec, Message
 from zbridge.wire.fields import CountedBytes, Filling
 from zbridge.wire.frames import FrameEnd
 
 FROM_CONTROLLER = range(128)
-"""Commands of the Webots controller; the others are the external controller's."""
+"""Commands that the Webots controller sends; all others are sent by the external controller."""
 MAX_FRAME = 4096
 _QUOTED = 16
 
 
 class Dialect(Enum):
-    """The document's first draft, or what programs in the field speak."""
+    """The document's first draft, or the dialect of deployed programs."""
 
     DRAFT = "draft"
     DEPLOYED = "deployed"
@@ -40,7 +41,7 @@ class Sender(Enum):
 
 
 class Wc2EcMessage(Message, frozen=True):
-    """A message of this protocol: what follows its command."""
+    """A message; its fields follow the command byte."""
 
     kind: U8
     number: U8
@@ -63,7 +64,7 @@ class Spec(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def sender(self) -> Sender:
-        """Who sends it: the halves of the range say so."""
+        """Who sends it: the command tells."""
         return Sender.WC if self.command in FROM_CONTROLLER else Sender.EC
 
 
@@ -99,17 +100,17 @@ class SensorData(Wc2EcMessage, frozen=True):
 
 @message("error", deployed=127)
 class Error(Wc2EcMessage, frozen=True):
-    """Documented later, sent by nobody."""
+    """Documented, but sent by no deployed program."""
 
 
 @message("enableSensor", draft=128)
 class EnableSensor(Wc2EcMessage, frozen=True):
-    """Let a sensor measure."""
+    """Start a sensor."""
 
 
 @message("disableSensor", draft=129)
 class DisableSensor(Wc2EcMessage, frozen=True):
-    """Let a sensor rest."""
+    """Stop a sensor."""
 
 
 @message("changeSensor", draft=130)
@@ -122,7 +123,7 @@ class ChangeSensor(Wc2EcMessage, frozen=True):
 
 @message("setSensor", draft=131)
 class SetSensor(Wc2EcMessage, frozen=True, eq=False):
-    """Set all configuration values of a sensor; how many it has is a setting."""
+    """Set all configuration values of a sensor; their number is an option."""
 
     values: F64Fill
 
@@ -135,7 +136,7 @@ class SetValue(Wc2EcMessage, frozen=True):
 
 
 def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
-    """Make the framing of what one side sends. values: configuration values of a sensor.
+    """Make the framing function for what one side sends. ``values``: configuration values of a sensor.
 
     A command that the side cannot send breaks the stream: nothing tells how long it is.
     """
@@ -163,11 +164,26 @@ def frame_end(dialect: Dialect, sender: Sender, *, values: int = 0) -> FrameEnd:
 
 
 def read(frame: bytes, dialect: Dialect) -> Wc2EcMessage:
-    """Read one message; its framing has checked the command."""
+    """Read one message; the framing has checked the command."""
     return MESSAGES[dialect][frame[0]].codec.decode(frame, 1)
 
 
 def write(message: Wc2EcMessage, dialect: Dialect) -> bytes:
-    """Write one message; raise EncodeError where a value has no form in it."""
+    """Write one message; raise EncodeError for a value that its type cannot carry."""
     command = message.commands[dialect]
     return bytes((command,)) + MESSAGES[dialect][command].codec.encode(message)
+
+
+def codecs() -> tuple[Codec, ...]:
+    """List the messages of both dialects and both sides for the conformance kit; a sensor has two values."""
+    return tuple(
+        Codec(
+            f"{dialect.value}, {sender.value}",
+            partial(write, dialect=dialect),
+            partial(read, dialect=dialect),
+            frame_end(dialect, sender, values=2),
+            tuple(spec.message for spec in MESSAGES[dialect].values() if spec.sender is sender),
+        )
+        for dialect in Dialect
+        for sender in Sender
+    )

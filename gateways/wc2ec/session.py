@@ -19,18 +19,17 @@ from gateways.wc2ec.messages import (
     read,
     write,
 )
-from zbridge.errors import EncodeError
-from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol import EncodeError, Limits, Role, Session, State
 
 HANDSHAKE_S = 5.0
 SETTLE_S = 0.1
-"""Seconds without another registration, or data, after which all devices are taken to be registered."""
+"""Seconds after a registration without another one or data: then the registrations are complete."""
 
 _BOUNDS = Limits(frame_bytes=MAX_FRAME, handshake_s=HANDSHAKE_S)
 
 
 class Wc2EcSession(Session[Wc2EcMessage]):
-    """What both roles share. values: configuration values of a sensor, which framing has to know.
+    """Both roles. ``values``: configuration values of a sensor; the framing depends on it.
 
     bounds: what a listener demands of its clients.
     """
@@ -74,7 +73,7 @@ class ExternalSession(Wc2EcSession):
     def accept(self, message: Wc2EcMessage, now: float) -> bool:
         if self.state is State.HANDSHAKING:
             if isinstance(message, RegisterSensor):
-                self._limit_at = math.inf
+                self.lift_limit()
                 self._settled_at = now + SETTLE_S
             elif isinstance(message, SensorData):
                 self._settle()

@@ -1,4 +1,4 @@
-"""A Webots robot to play with, in either dialect: two wheels, a lift, a ring of distance sensors, or light sensors.
+"""A simulated Webots robot, in either dialect: two wheels, a lift, a ring of distance sensors, or light sensors.
 
 Deterministic with a seed: the same commands at the same times give the same world. Source: the dialects of the protocol
 page.
@@ -25,9 +25,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerSession
-from zbridge.errors import EncodeError, Refused
-from zbridge.protocol.plugin import Simulation
-from zbridge.protocol.session import State
+from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Accepted, Conversation
 from zbridge.transport.link import Link
@@ -43,9 +41,9 @@ RANGE_M = 1.0
 FULL = 1000.0
 """A distance sensor's value at the end of its range."""
 VALUES = 3
-"""Configuration values of a light sensor: gain, offset, and one that does nothing."""
+"""Configuration values of a light sensor: gain, offset, and an unused one."""
 LAMP = (2.0, -2.0, 50.0)
-"""Where the lamp is (m) and what it gives at a metre."""
+"""Position of the lamp (m), and its irradiance at a metre."""
 _DISTANCE, _LINEAR, _ROTATIONAL, _LIGHT = 37, 46, 53, 0
 _RING = 8
 _LIGHTS = 4
@@ -60,7 +58,7 @@ DEVICES = (
 
 
 class Machine:
-    """The simulated robot itself: what commands make it do, and what it senses. Knows no connection."""
+    """The simulated robot: obeys commands, moves, senses. Knows no connection."""
 
     def __init__(self, seed: int) -> None:
         rng = random.Random(seed)
@@ -91,19 +89,19 @@ class Machine:
                 self.settings[number] = values.tolist()
 
     def step(self, dt: float) -> None:
-        """Live for ``dt`` seconds."""
+        """Advance by ``dt`` seconds."""
         left, right = self.velocities[_LEFT] * WHEEL_RADIUS_M, self.velocities[_RIGHT] * WHEEL_RADIUS_M
         self.body.step((left + right) / 2, 0.0, (right - left) / TRACK_M, dt)
         way = self._lift_to_m - self.lift_m
         self.lift_m += max(-LIFT_M_S * dt, min(LIFT_M_S * dt, way))
 
     def distances(self) -> list[SensorData]:
-        """Read the ring: 0 at the sensor to FULL at the end of its range."""
+        """Read the distance sensors: 0 at the sensor, FULL at the end of the range."""
         ranges = cast(self.body.x, self.body.y, self.body.heading + _BEARINGS, RANGE_M)
         return [SensorData(_DISTANCE, number, value) for number, value in enumerate((ranges / RANGE_M * FULL).tolist())]
 
     def lights(self) -> list[SensorData]:
-        """Read the light sensors that are enabled: irradiance, by gain and offset."""
+        """Read the enabled light sensors: irradiance times gain plus offset."""
         x, y, power = LAMP
         readings = []
         for number in sorted(self.enabled):
@@ -127,7 +125,7 @@ class Simulator:
         return f"<Simulator {self.machine}>"
 
     async def run(self, simulation: Simulation) -> None:
-        """Listen and live until cancelled."""
+        """Listen and simulate until cancelled."""
         (wanted,) = simulation.addresses
         async with listen(wanted, lambda: Accepted(self._admit)) as address:
             simulation.ready((address,))
@@ -143,7 +141,7 @@ class Simulator:
         return conversation
 
     def _greet(self, conversation: Conversation) -> None:
-        """Register the devices, and only then send their data."""
+        """Register the devices; from then on send their data."""
         if self._dialect is Dialect.DEPLOYED:
             _send(conversation, list(DEVICES))
         if not conversation.ended.done():
@@ -175,5 +173,5 @@ def _send(conversation: Conversation, messages: list[SensorData] | list[Register
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a simulated robot until cancelled."""
+    """Run a simulated robot until cancelled."""
     await Simulator(simulation.seed, Dialect(simulation.dialect or "deployed")).run(simulation)

@@ -1,4 +1,4 @@
-"""Between WC2EC messages and fleet messages, both ways, and one Webots robot as a robot. Sans-IO.
+"""Translates between WC2EC messages and fleet messages, both ways: one Webots robot. Sans-IO.
 
 Source: the dialects and "The gateway as external controller" of the protocol page.
 """
@@ -8,8 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,8 +17,8 @@ from gateways.wc2ec.devices import (
     LIGHT,
     LINEAR,
     ROTATIONAL,
-    Device,
     Table,
+    WebotsDevice,
     kind_of,
     registered,
     unnamed,
@@ -37,102 +36,25 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ExternalSession
-from zbridge.errors import ConfigError, Malformed, NotReady, ProtocolError, Unsupported
+from gateways.wc2ec.settings import Options
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, Scan, SensorSetting, Text
+from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
 from zbridge.fleet.topics import Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot, Telemetry, Translate
+from zbridge.protocol import (
+    BearingScan,
+    Malformed,
+    Metrics,
+    NotReady,
+    Outcome,
+    ProtocolError,
+    Robot,
+    Telemetry,
+    Translate,
+    Unsupported,
+)
 
 NAME = "wc2ec"
 STOP_REPEAT_S = 0.1
-
-Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
-Positive = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
-Bearing = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
-
-
-class DeviceOption(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A device of the draft, which has no names."""
-
-    name: str
-    number: Byte
-    kind: str = LIGHT
-
-
-class Differential(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two sides of wheels. speed_full, turn_full: m/s and rad/s of a drive of 1."""
-
-    left: tuple[str, ...]
-    right: tuple[str, ...]
-    wheel_radius_m: Positive
-    track_m: Positive
-    speed_full_m_s: Positive = 0.5
-    turn_full_rad_s: Positive = 1.0
-
-
-class Factors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """rad/s of one motor for a drive of 1."""
-
-    forward: Number = 0.0
-    left: Number = 0.0
-    turn: Number = 0.0
-
-
-class MotorTypes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Type bytes that are motors."""
-
-    rotational: tuple[Byte, ...] = (53,)
-    linear: tuple[Byte, ...] = (46,)
-
-
-class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names that are motors whatever their type byte."""
-
-    rotational: tuple[str, ...] = ()
-    linear: tuple[str, ...] = ()
-
-
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
-
-    dialect: Literal["deployed", "draft"] = "deployed"
-    devices: tuple[DeviceOption, ...] = ()
-    motor_types: MotorTypes = MotorTypes()
-    motors: MotorNames = MotorNames()
-    differential: Differential | None = None
-    factors: dict[str, Factors] = {}
-    bounds: dict[str, tuple[Number, Number]] = {}
-    bounds_default: tuple[Number, Number] | None = None
-    tables: dict[str, tuple[tuple[Number, Number], ...]] = {}
-    bearings_deg: dict[str, Bearing] = {}
-    scan_range_m: tuple[Number, Positive] = (0.0, 10.0)
-    pinned: tuple[str, ...] = ()
-    values: Annotated[int, msgspec.Meta(ge=0, le=255)] = 3
-
-    def __post_init__(self) -> None:
-        """Raise ConfigError for what cannot go together."""
-        if (self.dialect == "draft") is not bool(self.devices):
-            raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
-        for field in ("number", "name"):
-            if len({getattr(device, field) for device in self.devices}) < len(self.devices):
-                raise ConfigError(f"devices: a {field} twice")
-        unknown = sorted(set(self.pinned) - {device.name for device in self.devices})
-        if unknown:
-            raise ConfigError(f"pinned: {unknown[0]!r} is none of the devices")
-        ranges = {"bounds_default": self.bounds_default, "scan_range_m": self.scan_range_m}
-        ranges |= {f"bounds.{name}": bounds for name, bounds in self.bounds.items()}
-        for name, pair in ranges.items():
-            if pair is not None and pair[0] > pair[1]:
-                raise ConfigError(f"{name} = {list(pair)}: expected the lower one first")
-        if self.differential is not None and set(self.differential.left) & set(self.differential.right):
-            raise ConfigError("differential: a motor on both sides")
-        if self.differential is not None and self.factors:
-            raise ConfigError("factors: either differential or factors")
-        for name, table in self.tables.items():
-            if len(table) < 2 or any(low[0] >= high[0] for low, high in pairwise(table)):
-                raise ConfigError(f"tables.{name}: expected at least two pairs with rising first values")
 
 
 class Wc2EcRobot(Robot):
@@ -148,7 +70,7 @@ class Wc2EcRobot(Robot):
         self._session: ExternalSession | None = None
         self._table = Table()
         self._listened: set[str] = set(options.pinned)
-        self._ring: Ring | None = None
+        self._ring: BearingScan | None = None
         self._tables = {name: np.array(table).T for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
         self._unregistered = metrics.count("sensor_unregistered")
@@ -161,18 +83,22 @@ class Wc2EcRobot(Robot):
 
     @property
     def on_demand(self) -> tuple[Topic, ...]:
-        """The draft's sensors measure while somebody listens."""
+        """Sensors of the draft: they measure while somebody listens."""
         if self._dialect is Dialect.DEPLOYED:
             return ()
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
-    def session(self, link: int, peer: str) -> ExternalSession:
+    def session(self, link: str, peer: str) -> ExternalSession:
         self._session = ExternalSession(self._dialect)
         self._table = Table()
-        self._ring = Ring(self.options) if self.options.bearings_deg else None
+        self._ring = self._new_ring()
         for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
-            self._table.add(Device(option.name, option.name, option.number, 0, option.kind))
+            self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
         return self._session
+
+    def _new_ring(self) -> BearingScan | None:
+        options = self.options
+        return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         if self._dialect is Dialect.DRAFT:
@@ -180,7 +106,7 @@ class Wc2EcRobot(Robot):
             devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
             frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
             if frames:
-                session.outbox.stand("enable", frames, -math.inf)
+                session.outbox.set("enable", frames, -math.inf)
             return ((topics.DEVICES, self._table.message(stamp_ns)),)
         return ()
 
@@ -253,12 +179,12 @@ class Wc2EcRobot(Robot):
         return Outcome()
 
     def stop(self, now: float, until: float) -> None:
-        """Let every rotational motor stand; linear ones hold their position, and what waits for them is dropped."""
+        """Set every rotational motor to 0. Linear motors keep their position: values that wait for them are dropped."""
         if self._dialect is Dialect.DEPLOYED:
             for device in self._table.motors(LINEAR):
                 self._connected().outbox.clear(_slot(device))
             for device in self._table.motors(ROTATIONAL):
-                self._stand(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+                self._set_motor(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"a Webots robot cannot be asked for its {topic.path}")
@@ -271,7 +197,7 @@ class Wc2EcRobot(Robot):
         for name, velocity in velocities.items():
             device = self._table.named(name)
             assert device is not None
-            self._stand(device, velocity, now)
+            self._set_motor(device, velocity, now)
         left_out = [name for name in ("left",) if command.left and self.options.differential is not None]
         left_out += ["light"] if command.light is not None else []
         return Outcome(left_out=f"{' and '.join(left_out)}: this robot has none" if left_out else None)
@@ -280,22 +206,15 @@ class Wc2EcRobot(Robot):
         """Give the velocity of every driven motor, rad/s."""
         wheels = self.options.differential
         if wheels is not None:
-            if command.left and not (command.forward or command.turn):
-                raise Unsupported("left: a robot with two sides of wheels does not move sideways")
-            along = command.forward * wheels.speed_full_m_s
-            across = command.turn * wheels.turn_full_rad_s * wheels.track_m / 2
-            left, right = (along - across) / wheels.wheel_radius_m, (along + across) / wheels.wheel_radius_m
+            left, right = (side_m_s / wheels.wheel_radius_m for side_m_s in wheels.sides_m_s(command))
             return {**dict.fromkeys(wheels.left, left), **dict.fromkeys(wheels.right, right)}
         if not self.options.factors:
             raise Unsupported("no kinematics in the configuration (differential or factors)")
-        return {
-            name: command.forward * factor.forward + command.left * factor.left + command.turn * factor.turn
-            for name, factor in self.options.factors.items()
-        }
+        return {name: factors.value(command) for name, factors in self.options.factors.items()}
 
-    def _stand(
+    def _set_motor(
         self,
-        device: Device,
+        device: WebotsDevice,
         value: float,
         now: float,
         *,
@@ -303,20 +222,20 @@ class Wc2EcRobot(Robot):
         until: float = math.inf,
         urgent: bool = False,
     ) -> None:
-        """Let a value stand for a motor: the newest wins, whoever gave it."""
+        """Set a motor to a value; a newer value of the same motor replaces one that still waits."""
         if self._dialect is not Dialect.DEPLOYED:
             raise Unsupported("the draft dialect has no motors")
         if not math.isfinite(value):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
         session = self._connected()
         frame = session.encode(SetValue(device.type, device.number, value))
-        session.outbox.stand(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
+        session.outbox.set(_slot(device), (frame,), now, period_s=period_s, until=until, urgent=urgent)
 
     def _motor(self, name: str, value: float, now: float) -> None:
         device = self._table.named(name)
         if device is None or not device.motor:
             raise Unsupported(f"no motor is registered as {name!r}")
-        self._stand(device, value, now)
+        self._set_motor(device, value, now)
 
     def _configure(self, name: str, setting: SensorSetting) -> None:
         device = self._table.named(name)
@@ -354,46 +273,9 @@ class Wc2EcRobot(Robot):
         return self._session
 
 
-def _slot(device: Device) -> str:
-    """Name the place in the outbox where the newest value of a motor waits."""
+def _slot(device: WebotsDevice) -> str:
+    """Name the slot of a motor in the outbox."""
     return f"motor {device.number}"
-
-
-class Ring:
-    """Distance sensors with bearings, as one scan: a point a degree where they are not evenly spread."""
-
-    def __init__(self, options: Options) -> None:
-        self._range = options.scan_range_m
-        bearings = sorted(options.bearings_deg.values())
-        steps = {round(high - low, 6) for low, high in pairwise(bearings)}
-        self._first_deg = bearings[0]
-        self._step_deg = steps.pop() if len(steps) == 1 and min(steps) > 0 else 1.0
-        count = round((bearings[-1] - bearings[0]) / self._step_deg) + 1
-        self._ranges = np.full(count, np.nan, np.float32)
-        self._places = {
-            name: round((bearing - self._first_deg) / self._step_deg) for name, bearing in options.bearings_deg.items()
-        }
-        self._fresh: set[str] = set()
-
-    def take(self, name: str, value_m: float, stamp_ns: int) -> Scan | None:
-        """Take one reading; give the scan when every sensor has a new one."""
-        place = self._places.get(name)
-        if place is None:
-            return None
-        low, high = self._range
-        self._ranges[place] = value_m if low <= value_m <= high else np.nan
-        self._fresh.add(name)
-        if len(self._fresh) < len(self._places):
-            return None
-        self._fresh.clear()
-        return Scan(
-            math.radians(self._first_deg),
-            math.radians(self._step_deg),
-            low,
-            high,
-            self._ranges.copy(),
-            stamp_ns=stamp_ns,
-        )
 
 
 _TELEMETRY: dict[type[Wc2EcMessage], Callable[[Wc2EcRobot, Any, int], tuple[Telemetry, ...]]] = {

@@ -42,7 +42,7 @@ class Machine(Robot):
         self.unstoppable: str | None = None
         self.left_out: str | None = None
 
-    def session(self, link: int, peer: str) -> Any:
+    def session(self, link: str, peer: str) -> Any:
         raise NotImplementedError
 
     @property

@@ -526,7 +526,7 @@ PAIRS: list[tuple[type, type]] = [
     (Driver, blocking.Driver),
     (zbridge.client.StateFeed, blocking.StateFeed),
 ]
-INSIDE = {"keep", "look", "remember", "release"}
+INSIDE = {"acquire", "look", "release"}
 """What the driver's own context uses."""
 
 

@@ -19,7 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.control.audit_log import COUNTS, COUNTS_HZ, KINDS, MOST, WAITING, Audit, AuditFile
-from zbridge.control.authority import Authority, Event, EventKind
+from zbridge.control.authority import Authority
+from zbridge.control.events import Event, EventKind
 from zbridge.errors import ConfigError
 from zbridge.fleet.messages import Acquire
 from zbridge.metrics import Metrics

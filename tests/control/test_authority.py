@@ -11,7 +11,12 @@ import msgspec
 import pytest
 
 from tests.proofs import numbered, proof, shown
-from zbridge.control.authority import ENDED, LEAST_S, REFUSALS, Authority, Event, EventKind
+from tests.tables import documented, executed
+from zbridge.control.authority import Authority
+from zbridge.control.events import Event, EventKind
+from zbridge.control.proof import ENDED
+from zbridge.control.refusal_counts import REFUSALS
+from zbridge.control.wishes import LEAST_S
 from zbridge.errors import Code, Held, LeaseLost, Malformed, NotReady, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
 
@@ -1060,3 +1065,10 @@ def test_an_authority_prints_its_state_and_no_token() -> None:
     assert printed["new"] == "<Authority free>"
     assert printed["moving"] == "<Authority held by ann>"
     assert printed["stopped"] == "<Authority stopped>"
+
+
+# The table
+
+
+def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
+    assert documented("control.md", "input") == executed(Authority.TABLE)

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from tests.proofs import proof, shown
-from zbridge.control.authority import Authority, EventKind
+from zbridge.control.authority import Authority
+from zbridge.control.events import EventKind
 from zbridge.errors import Refused
 from zbridge.fleet.messages import Acquire, Authorization, Lease
 

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from tests.tables import documented, executed
 from zbridge.errors import Refused
 from zbridge.hq.intent import EARLY_S, LEASE_S, TOGETHER_S, Action, Intent
 
@@ -538,3 +539,10 @@ def test_motion_lives_as_long_as_no_gap_reaches_the_deadman(gaps: list[float], s
         assert intent.motion(now) is Action.SEND
     with pytest.raises(Refused, match="deadman"):
         intent.motion(now + silence)
+
+
+# The table
+
+
+def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
+    assert documented("control.md", "the program, or its lease") == executed(Intent.TABLE)

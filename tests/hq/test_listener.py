@@ -131,7 +131,7 @@ class ToySide(HqSide):
 
         def send(session: ToySession, now: float) -> None:
             if isinstance(message, Pose) or session.scans:
-                session.outbox.stand(topic.path, (frame,), now)
+                session.outbox.set(topic.path, (frame,), now)
 
         return send
 

@@ -1,4 +1,4 @@
-"""One HQ program's hand on the robot, against a gateway that keeps the lease as real ones do. Times are made up."""
+"""An operator for one HQ program, against a gateway that keeps the lease as real ones do. Times are made up."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import msgspec
 import pytest
 
 from tests.proofs import numbered
+from zbridge.bus import Answer
 from zbridge.bus.fake import FakeBus, FakeQuestion
 from zbridge.bus.interface import Handle, Question, Sample
 from zbridge.control.authority import Authority
-from zbridge.control.proof import Signer, read
+from zbridge.control.proof import read
 from zbridge.errors import BusError, Code, NotReady, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -34,8 +35,10 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import KeySpace
 from zbridge.fleet.view import RobotView
+from zbridge.hq.bridge import PUBLISHERS, Bridge
+from zbridge.hq.command_queue import WAITING
 from zbridge.hq.intent import LEASE_S, Intent
-from zbridge.hq.operator import PUBLISHERS, REPEAT_S, WAITING, Bridge, Operator
+from zbridge.hq.operator import REPEAT_S, Operator
 
 KEYS = KeySpace("fleet", "r1")
 DEADMAN_S = 1.25
@@ -286,7 +289,7 @@ async def test_without_a_gateway_the_answer_is_no() -> None:
     [
         (lambda question: question.refuse(NotReady("not now")), "not now"),
         (lambda question: question.answer(b"\xc1"), "Lease: "),
-        (lambda question: question.answer(payloads.pack({"ok": True})), "refused"),
+        (lambda question: question.answer(payloads.pack({"ok": True})), "Lease: granted without an id"),
         (lambda question: None, "no gateway answers"),
     ],
 )
@@ -774,21 +777,35 @@ async def test_news_older_than_the_lease_does_not_end_it() -> None:
     assert scene.told == []
 
 
-async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one() -> None:
+async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
     helm = scene.helm(needs_mode=True, modes="toy")
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
+    ask, renewals = scene.bus.ask, list[Any]()
+    held_anew = asyncio.Event()
+
+    async def late(key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        answers = await ask(key_expr, payload, timeout_s=timeout_s)
+        if key_expr == KEYS.key(topics.RPC_RENEW.path):
+            renewals.extend(answers)
+            await held_anew.wait()
+        return answers
+
+    monkeypatch.setattr(scene.bus, "ask", late)
     helm.look(Control(state="free"))
     helm.command(topics.CMD_MODE, Mode(mode="none"))
     scene.gateway.authority.stop("stop")
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    lease = scene.gateway.authority.acquire(Acquire(who="hq.toy.1", alive="hq.toy.1"), scene.now)
-    helm.intent.granted(LEASE_S)
-    helm._signer = Signer(lease)
+    helm.command(topics.CMD_DRIVE, GO)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert helm.intent.held
+    held_anew.set()
     await scene.settle()
+    assert [payloads.decode(Lease, answer.payload).ok for answer in renewals] == [False]
     assert helm.intent.held
     assert scene.told == []
 
@@ -879,11 +896,13 @@ async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monk
     helm = scene.helm()
     helm.command(topics.CMD_DRIVE, STAND)
 
-    async def ask_in_vain(request: Acquire) -> Lease:
-        await Bridge.acquire(scene.bridge, request)
-        return Lease(ok=False, reason="no gateway answers")
+    ask = scene.bus.ask
 
-    monkeypatch.setattr(scene.bridge, "acquire", ask_in_vain)
+    async def ask_in_vain(key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        await ask(key_expr, payload, timeout_s=timeout_s)
+        return []
+
+    monkeypatch.setattr(scene.bus, "ask", ask_in_vain)
     helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: no gateway answers"]

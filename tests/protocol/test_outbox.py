@@ -90,21 +90,21 @@ def test_the_default_limit_is_stated() -> None:
 
 def test_a_standing_frame_without_period_is_sent_once() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"d",), 1.0)
+    outbox.set("motion", (b"d",), 1.0)
     assert drained(outbox, 1.0, 100.0) == [(1.0, b"d")]
     assert outbox.deadline() is None
 
 
 def test_a_standing_frame_is_repeated_every_period_without_end() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"d",), 1.0, period_s=0.25)
+    outbox.set("motion", (b"d",), 1.0, period_s=0.25)
     assert drained(outbox, 1.0, 2.1) == [(1.0, b"d"), (1.25, b"d"), (1.5, b"d"), (1.75, b"d"), (2.0, b"d")]
     assert outbox.deadline() == 2.25
 
 
 def test_a_standing_frame_is_repeated_until_its_end_and_then_forgotten() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"s",), 1.0, period_s=0.25, until=2.0)
+    outbox.set("motion", (b"s",), 1.0, period_s=0.25, until=2.0)
     assert drained(outbox, 1.0, 9.0) == [(1.0, b"s"), (1.25, b"s"), (1.5, b"s"), (1.75, b"s"), (2.0, b"s")]
     assert outbox.deadline() is None
 
@@ -113,37 +113,37 @@ def test_a_newer_standing_frame_replaces_the_one_that_waits() -> None:
     outbox = Outbox(0.01)
     outbox.put(b"text")
     assert outbox.take(0.0) == b"text"
-    outbox.stand("motion", (b"old",), 0.001)
-    outbox.stand("motion", (b"new",), 0.002)
+    outbox.set("motion", (b"old",), 0.001)
+    outbox.set("motion", (b"new",), 0.002)
     assert drained(outbox, 0.002, 1.0) == [(0.01, b"new")]
 
 
 def test_replacing_a_repeated_frame_ends_its_repetition() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"drive",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"drive",), 0.0, period_s=0.25)
     assert outbox.take(0.0) == b"drive"
-    outbox.stand("motion", (b"stop",), 0.125, period_s=0.125, until=0.375)
+    outbox.set("motion", (b"stop",), 0.125, period_s=0.125, until=0.375)
     assert frames(drained(outbox, 0.125, 9.0)) == [b"stop", b"stop", b"stop"]
 
 
 def test_a_new_command_is_sent_at_once_although_its_predecessor_was_just_repeated() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"one",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"one",), 0.0, period_s=0.25)
     assert outbox.take(0.0) == b"one"
-    outbox.stand("motion", (b"two",), 0.05, period_s=0.25)
+    outbox.set("motion", (b"two",), 0.05, period_s=0.25)
     assert outbox.take(0.05) == b"two"
 
 
 def test_slots_are_independent() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"m",), 0.0)
-    outbox.stand("light", (b"l",), 0.0)
+    outbox.set("motion", (b"m",), 0.0)
+    outbox.set("light", (b"l",), 0.0)
     assert sorted(frames(drained(outbox, 0.0, 1.0))) == [b"l", b"m"]
 
 
 def test_a_cleared_slot_is_forgotten_and_clearing_twice_does_no_harm() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"d",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"d",), 0.0, period_s=0.25)
     outbox.clear("motion")
     outbox.clear("motion")
     assert outbox.take(0.0) is None
@@ -152,7 +152,7 @@ def test_a_cleared_slot_is_forgotten_and_clearing_twice_does_no_harm() -> None:
 
 def test_a_group_is_sent_whole_with_the_gap_inside_and_then_repeated() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"move", b"turn"), 0.0, period_s=0.25)
+    outbox.set("motion", (b"move", b"turn"), 0.0, period_s=0.25)
     assert drained(outbox, 0.0, 0.3) == [(0.0, b"move"), (0.01, b"turn"), (0.26, b"move"), (0.27, b"turn")]
 
 
@@ -160,9 +160,9 @@ def test_an_urgent_frame_goes_before_everything_that_waits_but_keeps_the_gap() -
     outbox = Outbox(0.01)
     for frame in (b"a", b"b", b"c"):
         outbox.put(frame)
-    outbox.stand("motion", (b"drive",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"drive",), 0.0, period_s=0.25)
     first = outbox.take(0.0)
-    outbox.stand("motion", (b"stop",), 0.001, urgent=True)
+    outbox.set("motion", (b"stop",), 0.001, urgent=True)
     assert first in (b"a", b"drive")
     assert outbox.take(0.002) is None
     assert outbox.take(0.01) == b"stop"
@@ -170,26 +170,26 @@ def test_an_urgent_frame_goes_before_everything_that_waits_but_keeps_the_gap() -
 
 def test_an_urgent_frame_beats_the_due_frame_of_another_slot() -> None:
     outbox = Outbox(0.0)
-    outbox.stand("light", (b"l",), 0.0)
-    outbox.stand("motion", (b"stop",), 0.5, urgent=True)
+    outbox.set("light", (b"l",), 0.0)
+    outbox.set("motion", (b"stop",), 0.5, urgent=True)
     assert outbox.take(1.0) == b"stop"
     assert outbox.take(1.0) == b"l"
 
 
 def test_an_urgent_frame_leaves_once_before_whatever_replaces_it() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"drive",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"drive",), 0.0, period_s=0.25)
     assert outbox.take(0.0) == b"drive"
-    outbox.stand("motion", (b"stop",), 0.001, period_s=0.1, until=1.001, urgent=True)
-    outbox.stand("motion", (b"neutral",), 0.002)
-    outbox.stand("motion", (b"drive on",), 0.003)
+    outbox.set("motion", (b"stop",), 0.001, period_s=0.1, until=1.001, urgent=True)
+    outbox.set("motion", (b"neutral",), 0.002)
+    outbox.set("motion", (b"drive on",), 0.003)
     assert len(outbox) == 1
     assert drained(outbox, 0.003, 1.0) == [(0.01, b"stop"), (0.02, b"drive on")]
 
 
 def test_an_urgent_frame_leaves_although_its_slot_is_cleared() -> None:
     outbox = Outbox(0.0)
-    outbox.stand("motion", (b"stop",), 0.0, period_s=0.1, urgent=True)
+    outbox.set("motion", (b"stop",), 0.0, period_s=0.1, urgent=True)
     outbox.clear("motion")
     assert drained(outbox, 0.0, 1.0) == [(0.0, b"stop")]
 
@@ -199,21 +199,21 @@ def test_an_urgent_frame_that_waits_already_waits_once() -> None:
     outbox.put(b"a")
     assert outbox.take(0.0) == b"a"
     for _ in range(10):
-        outbox.stand("motion", (b"stop",), 0.001, urgent=True)
+        outbox.set("motion", (b"stop",), 0.001, urgent=True)
     assert frames(drained(outbox, 0.001, 1.0)) == [b"stop"]
 
 
 def test_urgent_frames_of_two_slots_both_leave_in_order() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"stop",), 0.0, urgent=True)
-    outbox.stand("arm", (b"hold",), 0.0, urgent=True)
-    outbox.stand("motion", (b"stop",), 0.0, urgent=True)
+    outbox.set("motion", (b"stop",), 0.0, urgent=True)
+    outbox.set("arm", (b"hold",), 0.0, urgent=True)
+    outbox.set("motion", (b"stop",), 0.0, urgent=True)
     assert frames(drained(outbox, 0.0, 1.0)) == [b"stop", b"hold"]
 
 
 def test_an_urgent_frame_is_the_first_of_its_repetitions() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"stop",), 1.0, period_s=0.25, until=2.0, urgent=True)
+    outbox.set("motion", (b"stop",), 1.0, period_s=0.25, until=2.0, urgent=True)
     assert [at for at, _ in drained(outbox, 1.0, 9.0)] == [1.0, 1.25, 1.5, 1.75, 2.0]
     assert outbox.deadline() is None
 
@@ -222,7 +222,7 @@ def test_an_urgent_frame_is_the_first_of_its_repetitions() -> None:
 def test_an_urgent_group_that_stands_until_now_is_sent_exactly_once(group: tuple[bytes, ...]) -> None:
     outbox = Outbox(0.01)
     for now in (1.0, 2.0):
-        outbox.stand("motion", group, now, period_s=0.1, until=now, urgent=True)
+        outbox.set("motion", group, now, period_s=0.1, until=now, urgent=True)
         assert drained(outbox, now, now + 0.9) == [(now + 0.01 * place, frame) for place, frame in enumerate(group)]
         assert outbox.idle
         assert outbox.deadline() is None
@@ -230,16 +230,16 @@ def test_an_urgent_group_that_stands_until_now_is_sent_exactly_once(group: tuple
 
 def test_an_urgent_group_ends_what_stood_in_its_slot() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"drive",), 0.0, period_s=0.25)
-    outbox.stand("motion", (b"none", b"stop"), 0.0, period_s=0.1, until=0.0, urgent=True)
+    outbox.set("motion", (b"drive",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"none", b"stop"), 0.0, period_s=0.1, until=0.0, urgent=True)
     assert frames(drained(outbox, 0.0, 9.0)) == [b"none", b"stop"]
 
 
 def test_an_urgent_group_keeps_its_order_whatever_waits_already() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"stop",), 0.0, urgent=True)
+    outbox.set("motion", (b"stop",), 0.0, urgent=True)
     for _ in range(10):
-        outbox.stand("motion", (b"none", b"stop"), 0.0, urgent=True)
+        outbox.set("motion", (b"none", b"stop"), 0.0, urgent=True)
     assert frames(drained(outbox, 0.0, 9.0)) == [b"stop", b"none", b"stop"]
 
 
@@ -249,7 +249,7 @@ def test_a_flood_of_urgent_groups_leaves_group_by_group() -> None:
     taken = []
     for step in range(1000):
         now = step / 1000
-        outbox.stand("motion", (b"none", b"stop"), now, period_s=0.1, until=now + 1.0, urgent=True)
+        outbox.set("motion", (b"none", b"stop"), now, period_s=0.1, until=now + 1.0, urgent=True)
         if (frame := outbox.take(now)) is not None:
             taken.append(frame)
         assert len(outbox) <= 4
@@ -259,7 +259,7 @@ def test_a_flood_of_urgent_groups_leaves_group_by_group() -> None:
 
 def test_a_repeated_group_is_whole_at_its_end() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"none", b"stop"), 1.0, period_s=0.1, until=1.25, urgent=True)
+    outbox.set("motion", (b"none", b"stop"), 1.0, period_s=0.1, until=1.25, urgent=True)
     assert frames(drained(outbox, 1.0, 9.0)) == [b"none", b"stop"] * 3
 
 
@@ -274,11 +274,11 @@ def test_a_frame_that_waits_can_be_withdrawn_and_one_that_does_not_is_no_error()
 
 def test_an_outbox_tells_whether_anything_stands_in_a_slot() -> None:
     outbox = Outbox(0.01)
-    assert not outbox.stands("again")
-    outbox.stand("again", (b"m",), 0.3)
-    assert outbox.stands("again")
+    assert not outbox.is_set("again")
+    outbox.set("again", (b"m",), 0.3)
+    assert outbox.is_set("again")
     assert drained(outbox, 0.0, 1.0) == [(0.3, b"m")]
-    assert not outbox.stands("again")
+    assert not outbox.is_set("again")
 
 
 def test_every_place_of_a_group_has_its_turn_although_the_group_is_renewed_all_the_time() -> None:
@@ -286,16 +286,16 @@ def test_every_place_of_a_group_has_its_turn_although_the_group_is_renewed_all_t
     taken = []
     for step in range(6):
         group = (b"move %d" % step, b"turn %d" % step)
-        outbox.stand("motion", group, 0.01 * step, period_s=0.25)
+        outbox.set("motion", group, 0.01 * step, period_s=0.25)
         taken.append(outbox.take(0.01 * step))
     assert taken == [b"move 0", b"turn 1", b"move 2", b"turn 3", b"move 4", b"turn 5"]
 
 
 def test_a_group_of_another_length_begins_at_its_beginning() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"move", b"turn"), 0.0, period_s=0.25)
+    outbox.set("motion", (b"move", b"turn"), 0.0, period_s=0.25)
     assert outbox.take(0.0) == b"move"
-    outbox.stand("motion", (b"stop",), 0.005)
+    outbox.set("motion", (b"stop",), 0.005)
     assert drained(outbox, 0.005, 1.0) == [(0.01, b"stop")]
 
 
@@ -305,7 +305,7 @@ def test_motion_that_is_always_due_does_not_starve_the_queue() -> None:
         outbox.put(b"text")
     taken = []
     for now in range(10):
-        outbox.stand("motion", (b"drive",), now)
+        outbox.set("motion", (b"drive",), now)
         taken.append(outbox.take(now))
     assert taken.count(b"text") == 5
     assert taken.count(b"drive") == 5
@@ -316,13 +316,13 @@ def test_a_full_queue_does_not_delay_motion_by_more_than_one_frame() -> None:
     for _ in range(LIMIT):
         outbox.put(b"text")
     assert outbox.take(0.0) == b"text"
-    outbox.stand("motion", (b"drive",), 0.005)
+    outbox.set("motion", (b"drive",), 0.005)
     assert b"drive" in (outbox.take(0.01), outbox.take(0.02))
 
 
 def test_the_deadline_of_a_waiting_frame_is_the_end_of_the_gap() -> None:
     outbox = Outbox(0.5)
-    outbox.stand("motion", (b"d",), 1.0, period_s=0.1)
+    outbox.set("motion", (b"d",), 1.0, period_s=0.1)
     assert outbox.deadline() == 1.0
     outbox.take(1.0)
     assert outbox.deadline() == 1.5, "due at 1.1, but the gap has not passed"
@@ -330,14 +330,14 @@ def test_the_deadline_of_a_waiting_frame_is_the_end_of_the_gap() -> None:
 
 def test_the_deadline_is_that_of_the_slot_that_is_due_first() -> None:
     outbox = Outbox(0.0)
-    outbox.stand("late", (b"l",), 9.0)
-    outbox.stand("early", (b"e",), 3.0)
+    outbox.set("late", (b"l",), 9.0)
+    outbox.set("early", (b"e",), 3.0)
     assert outbox.deadline() == 3.0
 
 
 def test_a_queued_frame_is_due_although_motion_stands_for_later() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"d",), 0.0, period_s=0.25)
+    outbox.set("motion", (b"d",), 0.0, period_s=0.25)
     outbox.take(0.0)
     outbox.put(b"text")
     assert outbox.deadline() == 0.01
@@ -346,14 +346,14 @@ def test_a_queued_frame_is_due_although_motion_stands_for_later() -> None:
 
 def test_a_standing_frame_is_not_sent_before_it_is_due() -> None:
     outbox = Outbox(0.0)
-    outbox.stand("motion", (b"d",), 5.0)
+    outbox.set("motion", (b"d",), 5.0)
     assert outbox.take(4.9) is None
     assert outbox.take(5.0) == b"d"
 
 
 def test_a_late_driver_does_not_cause_a_burst_of_repetitions() -> None:
     outbox = Outbox(0.01)
-    outbox.stand("motion", (b"d",), 0.0, period_s=0.25, until=math.inf)
+    outbox.set("motion", (b"d",), 0.0, period_s=0.25, until=math.inf)
     assert outbox.take(0.0) == b"d"
     assert outbox.take(10.0) == b"d"
     assert outbox.take(10.01) is None
@@ -397,5 +397,5 @@ def test_the_two_queues_are_bounded_each_for_itself() -> None:
 def test_an_outbox_prints_what_waits() -> None:
     outbox = Outbox(0.0)
     outbox.put(b"a")
-    outbox.stand("motion", (b"d",), 0.0)
-    assert repr(outbox) == "<Outbox 1 waiting, standing ['motion']>"
+    outbox.set("motion", (b"d",), 0.0)
+    assert repr(outbox) == "<Outbox 1 waiting, slots ['motion']>"

@@ -1,5 +1,6 @@
 """How protocols are found, and what every robot has by default."""
 
+import importlib.metadata
 import re
 from importlib.metadata import EntryPoint, EntryPoints
 from typing import Any
@@ -12,8 +13,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Protocol, Robot, find_protocol, protocol_names
-from zbridge.protocol.plugin import plugin as protocol
+from zbridge.protocol.plugin import GROUP, Outcome, Protocol, Robot, find_protocol, protocol_names
 
 
 class ToyRobot(Robot):
@@ -22,7 +22,7 @@ class ToyRobot(Robot):
     def __init__(self) -> None:
         self.current: Toy | None = None
 
-    def session(self, link: int, peer: str) -> Toy:
+    def session(self, link: str, peer: str) -> Toy:
         self.current = Toy(LIMITS)
         return self.current
 
@@ -46,7 +46,7 @@ class ToyRobot(Robot):
 def test_a_robot_is_ready_while_its_driving_session_is_established() -> None:
     robot = ToyRobot()
     assert not robot.ready
-    session = robot.session(0, "")
+    session = robot.session("robot", "")
     assert not robot.ready
     session.open(0.0)
     assert not robot.ready
@@ -77,7 +77,7 @@ def test_every_protocol_says_what_it_is_and_makes_robots_with_its_default_option
     found = find_protocol(name)
     assert found.name == name
     assert found.summary
-    assert "{name}" in found.template
+    assert f'protocol = "{name}"' in found.template
     robot = found.robot(found.options(), found.links, Metrics())
     assert len(robot.link_names) == found.links
     assert robot.driving is None
@@ -89,13 +89,13 @@ def test_an_unknown_protocol_is_an_error_that_names_those_there_are() -> None:
 
 
 def test_an_entry_that_is_no_protocol_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("odd", "math:pi", protocol.GROUP)
-    monkeypatch.setattr(protocol, "entry_points", lambda **_: EntryPoints([point]))
+    point = EntryPoint("odd", "math:pi", GROUP)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints([point]))
     with pytest.raises(ConfigError, match="math:pi is no zbridge protocol"):
         find_protocol("odd")
 
 
 def test_without_any_protocol_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(protocol, "entry_points", lambda **_: EntryPoints([]))
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints([]))
     with pytest.raises(ConfigError, match="none installed"):
         find_protocol("tcpudp")

@@ -194,7 +194,7 @@ def test_a_closing_session_waits_for_the_gap_before_its_last_frame(established: 
 def test_a_closing_session_writes_an_urgent_frame_that_waits_for_the_gap(established: Toy) -> None:
     established.send(b"one")
     assert established.outgoing(1.0) == b"\x03one"
-    established.outbox.stand("motion", (b"stop",), 1.001, urgent=True)
+    established.outbox.set("motion", (b"stop",), 1.001, urgent=True)
     established.close("enough", 1.001)
     assert established.outgoing(1.001) is None
     assert established.state is State.CLOSING
@@ -305,6 +305,7 @@ def test_the_snapshot_does_not_change_with_the_session(established: Toy) -> None
         "foreign": 0,
         "dropped": 0,
         "refused": 0,
+        "unanswered": 0,
     }
     assert shown.left_out == {"wings (7)": 2}
 

@@ -10,6 +10,7 @@ import msgpack
 import pytest
 
 from tests.clock import jumping
+from tests.tables import documented, executed
 from zbridge.bus import Answer, Handle, Lane, Question
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
@@ -418,3 +419,7 @@ async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hun
             take.cancel()
         await asyncio.gather(*takes, return_exceptions=True)
     assert settled == [1] * 100
+
+
+def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
+    assert documented("control.md", "found") == executed(Ownership.TABLE)

@@ -81,7 +81,7 @@ async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_l
     conversation.attached(link)
     conversation.received(WELCOME)
     clock_s[0] = 1.0
-    session.outbox.stand("drive", (b"motion",), clock_s[0], period_s=0.25)
+    session.outbox.set("drive", (b"motion",), clock_s[0], period_s=0.25)
     conversation.pump()
     link.written.clear()
     clock_s[0], freezes = 1.1, [2.0]

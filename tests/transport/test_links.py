@@ -9,81 +9,17 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
+from tests.transport.recorder import SOON_S, Recorder
 from zbridge.address import Address
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
 from zbridge.transport import tcp, udp
 from zbridge.transport.fake import FakeLink
-from zbridge.transport.link import STALLED_S, Link, Receiver
+from zbridge.transport.link import STALLED_S, Link
 from zbridge.transport.tcp import TcpLink, connect, listen
 from zbridge.transport.udp import DatagramHub
 
-SOON_S = 5.0
 LOCAL = Address("127.0.0.1", 0)
-
-
-class Recorder(Receiver):
-    """A receiver that keeps what a link brings, and claims datagrams that begin with ``mark``, until it is rivalled."""
-
-    def __init__(self, mark: bytes = b"") -> None:
-        self.link: Link | None = None
-        self.mark = mark
-        self.data = bytearray()
-        self.datagrams: list[bytes] = []
-        self.asked: list[int] = []
-        """The ports of what it was asked whether it claims it."""
-        self.stray: list[bytes] = []
-        self.foreign = 0
-        self.reason: str | None = None
-        self.calls: list[str] = []
-        self._changed = asyncio.Event()
-
-    def attached(self, link: Link) -> None:
-        self.link = link
-        self._note("attached")
-
-    def received(self, data: bytes) -> None:
-        assert type(data) is bytes
-        self.data += data
-        self._note("received")
-
-    def received_datagram(self, datagram: bytes) -> None:
-        assert type(datagram) is bytes
-        self.datagrams.append(datagram)
-        self._note("datagram")
-
-    def claims(self, datagram: bytes, port: int) -> bool:
-        self.asked.append(port)
-        return bool(self.mark) and datagram.startswith(self.mark)
-
-    def rivalled(self) -> None:
-        self.mark = b""
-        self._note("rivalled")
-
-    def stray_datagram(self, datagram: bytes) -> None:
-        self.stray.append(datagram)
-        self._note("stray")
-
-    def foreign_datagram(self) -> None:
-        self.foreign += 1
-        self._note("foreign")
-
-    def lost(self, reason: str) -> None:
-        self.reason = reason
-        self._note("lost")
-
-    def writable(self) -> None:
-        self._note("writable")
-
-    def _note(self, call: str) -> None:
-        self.calls.append(call)
-        self._changed.set()
-
-    async def until(self, call: str, *, received: int = 0, datagrams: int = 0) -> None:
-        async with asyncio.timeout(SOON_S):
-            while call not in self.calls or len(self.data) < received or len(self.datagrams) < datagrams:
-                self._changed.clear()
-                await self._changed.wait()
 
 
 class Pair:
@@ -110,42 +46,6 @@ async def connected() -> AsyncIterator[Pair]:
         pair.there.abort()
         await near.until("lost")
         await far.until("lost")
-
-
-@pytest.mark.parametrize(
-    ("text", "host", "port", "shown"),
-    [
-        ("tcp://127.0.0.1:11001", "127.0.0.1", 11001, "tcp://127.0.0.1:11001"),
-        ("tcp://robot.test:1", "robot.test", 1, "tcp://robot.test:1"),
-        ("tcp://[::1]:7447", "::1", 7447, "tcp://[::1]:7447"),
-    ],
-)
-def test_an_address_is_read_and_written(text: str, host: str, port: int, shown: str) -> None:
-    address = Address.parse(text)
-    assert address == Address(host, port)
-    assert str(address) == shown
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "robot",
-        "127.0.0.1:11001",
-        "udp://a:1",
-        "tcp://a",
-        "tcp://:1",
-        "tcp://a:x",
-        "tcp://a:65536",
-        "tcp://a:1/b",
-        "tcp://[a:1",
-        "tcp://a:1?b",
-    ],
-)
-def test_what_is_no_address_is_an_error_that_says_what_was_expected(text: str) -> None:
-    with pytest.raises(LinkError, match="expected tcp://host:port") as caught:
-        Address.parse(text)
-    assert repr(text) in str(caught.value)
 
 
 async def test_both_ends_are_attached_first_and_know_their_peer() -> None:
@@ -781,7 +681,7 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(
         raise OSError("Inappropriate ioctl for device")
 
     monkeypatch.setattr(tcp.fcntl, "ioctl", unknown)
-    monkeypatch.setattr(tcp, "_unwatched_said", False)
+    monkeypatch.setattr(tcp, "_unwatched_warned", False)
     for _ in range(2):
         async with connected() as pair:
             pair.there.pause()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.wire import F32, F64, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
+from zbridge.wire import F32, F64, I16, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 
 class Fixed(Message, frozen=True):
@@ -227,3 +227,24 @@ def test_random_bytes_give_a_message_or_a_protocol_error(data: bytes, start: int
 @given(st.builds(Mixed, st.integers(0, 255), st.text(st.characters(max_codepoint=127)), st.binary()))
 def test_what_is_encoded_is_decoded_to_the_same(message: Mixed) -> None:
     assert MIXED.decode(MIXED.encode(message), 0) == message
+
+
+class BigEndian(Message, frozen=True):
+    byte_order = ">"
+    velocity: I16
+    radius: I16
+
+
+def test_a_message_of_fixed_width_can_be_big_endian() -> None:
+    codec = BinaryCodec(BigEndian)
+    assert codec.encode(BigEndian(-200, 500)) == bytes.fromhex("ff38 01f4")
+    assert codec.decode(bytes.fromhex("ff38 01f4"), 0) == BigEndian(-200, 500)
+
+
+def test_a_big_endian_message_of_variable_length_is_refused() -> None:
+    class Mixed(Message, frozen=True):
+        byte_order = ">"
+        text: Text
+
+    with pytest.raises(TypeError, match="fixed width"):
+        BinaryCodec(Mixed)

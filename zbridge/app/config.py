@@ -1,7 +1,7 @@
 """The configuration of one process: a TOML file, checked whole before anything starts.
 
-Unknown keys are errors; ``${VAR}`` in a string is taken from the environment. Knows no protocol: the
-``options`` tables are checked against what the named protocol declares.
+Unknown keys are errors. ``${VAR}`` in a string is replaced from the environment. Knows no protocol: ``options`` tables
+are checked against the declaration of the named protocol.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from zbridge.address import Address
+from zbridge.address import Address, DeviceAddress, parse_device_address
 from zbridge.bus import BusSettings
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
@@ -106,7 +106,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
 def _device(settings: DeviceSettings) -> DevicePlan:
     protocol = _protocol("device.", settings.protocol)
     options = _convert(settings.options, protocol.options, "device.options.")
-    addresses = tuple(_address("device.connect", text) for text in settings.connect)
+    addresses = tuple(_device_address("device.connect", text) for text in settings.connect)
     if len(addresses) > protocol.links:
         raise ConfigError(
             f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
@@ -143,6 +143,13 @@ def _network(key: str, text: str) -> Network:
 def _address(key: str, text: str) -> Address:
     try:
         return Address.parse(text)
+    except LinkError as error:
+        raise ConfigError(f"{key} = {error}") from error
+
+
+def _device_address(key: str, text: str) -> DeviceAddress:
+    try:
+        return parse_device_address(text)
     except LinkError as error:
         raise ConfigError(f"{key} = {error}") from error
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from zbridge.address import Address
+from zbridge.address import Address, parse_device_address
 from zbridge.app.config import load
 from zbridge.app.gateway import until_signal
 from zbridge.app.templates import listener_template, robot_template
@@ -118,7 +118,7 @@ def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
 @app.command()
 def probe(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
-    address: Annotated[str, typer.Argument(help="tcp://host:port", show_default=False)],
+    address: Annotated[str, typer.Argument(help="tcp://host:port or serial:///path?baud=N", show_default=False)],
     yes: Annotated[bool, typer.Option("--yes", help="talk to it although that may use up its connection")] = False,
     connect: Connect = [],
     realm: Realm = "fleet",
@@ -127,7 +127,7 @@ def probe(
     from zbridge.cli.probe import probe as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
-    found, at = find_protocol(protocol), Address.parse(address)
+    found, at = find_protocol(protocol), parse_device_address(address)
     code = run_loop(ask(bus_settings(connect), found, at, realm=realm, sure=yes))
     if code:
         raise typer.Exit(code)

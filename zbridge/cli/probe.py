@@ -8,7 +8,7 @@ import json
 
 import msgspec
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import console, errors, joined
 from zbridge.errors import BusError, LinkError, PayloadError
@@ -19,8 +19,8 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
 from zbridge.text import shown
+from zbridge.transport.connect import connect
 from zbridge.transport.conversation import Conversation
-from zbridge.transport.tcp import connect
 
 PROBE_S = 15.0
 """Longest time a handshake may take."""
@@ -30,7 +30,7 @@ WARNING = (
 )
 
 
-async def probe(settings: BusSettings, protocol: Protocol, address: Address, *, realm: str, sure: bool) -> int:
+async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddress, *, realm: str, sure: bool) -> int:
     """Print what the device is; give the exit code: 0 known, 1 it did not answer, 2 not asked without ``sure``."""
     served = await _served(settings, address, realm)
     if served is not None:
@@ -44,7 +44,7 @@ async def probe(settings: BusSettings, protocol: Protocol, address: Address, *, 
     return await _talk(protocol, address)
 
 
-async def _served(settings: BusSettings, address: Address, realm: str) -> tuple[str, Status] | None:
+async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> tuple[str, Status] | None:
     """Look on the bus for a gateway that is connected to the address."""
     with contextlib.suppress(BusError):
         async with joined(settings) as bus:
@@ -58,11 +58,11 @@ async def _served(settings: BusSettings, address: Address, realm: str) -> tuple[
     return None
 
 
-async def _talk(protocol: Protocol, address: Address) -> int:
+async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
     """Shake hands with the device, say what was agreed, and leave."""
     loop = asyncio.get_running_loop()
     robot = protocol.robot(protocol.options(), 1, Metrics())
-    session = robot.session(0, str(address))
+    session = robot.session(robot.link_names[0], str(address))
     settled = asyncio.Event()
 
     def changed() -> None:

@@ -27,7 +27,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.authority import Event, EventKind
+from zbridge.control.events import Event, EventKind
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 from zbridge.text import as_json

@@ -1,373 +1,339 @@
-"""Control authority: who may move the robot, and when it must be stopped. Sans-IO, time is an argument.
+"""Control authority: who may move one robot, and when the robot must be stopped. Sans-IO: time is an argument.
 
-One lease per robot. What calls decide comes back at once (a lease, or Refused); what follows from them, and
-from time going by, is in :meth:`Authority.events`: what to write down, and where an event ``stops``, the
-robot is to be sent its stop. The transition table is in ``docs/control.md``.
+Theory of operation. The machine is :attr:`Authority.TABLE`, ``{state: {input: (action, next state)}}``, at the foot of
+the class; ``docs/control.md`` shows the same table, and a test compares both. A pair that the table lacks changes
+nothing. An action that raises Refused has changed nothing, and the state stays.
+
+States. FREE and STOPPED: nobody has the lease (they differ in what people are shown). HELD: a program has the lease
+and no motion is commanded. MOVING: the last command for at least one part of the robot was motion; the deadman runs.
+HELD_BACK: a program has the lease and must send neutral before motion.
+
+Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
+:meth:`vanished` for lost liveliness tokens, :meth:`stop`, and :meth:`expire` at :meth:`deadline`. The command handler
+calls :meth:`admit` for every command that needs the lease, :meth:`require_motion` if the command is motion, and
+:meth:`applied` after the robot was sent it. The device calls :meth:`hold_back`. After each call the caller takes
+:meth:`events`: each is to be written down, and one that ``stops`` demands that the robot is sent its stop at once.
+The gate reads :attr:`verifier` and :attr:`moving` from the bus's threads; all else is for the event loop's thread.
+
+Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
+deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is
+decided by its proof first and its number second: knowing a lease's public id allows nothing.
 """
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable
-from enum import Enum
+from typing import ClassVar, TypeAlias
 
-import msgspec
+from zbridge.control.events import Event, EventKind, Input, State
+from zbridge.control.proof import Holder, Holders, Verifier
+from zbridge.control.refusal_counts import RefusalCounts
+from zbridge.control.wishes import capped, name_of
+from zbridge.errors import Held, NeutralFirst, Refused
+from zbridge.fleet.messages import Acquire, Authorization, Control, Lease
 
-from zbridge.control.proof import LEASE_BYTES, TOKEN_BYTES, Verifier, read
-from zbridge.errors import Code, Held, LeaseLost, Malformed, NeutralFirst, Refused
-from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
-
-REFUSALS = 16
-"""Different refusals that ``control`` shows; the oldest makes room."""
-ENDED = 16
-"""Ended leases whose holders can still be told why, and whose ids are not given again."""
-LEAST_S = 0.01
-"""The shortest lease or deadman that can be asked for, seconds."""
-NAMED, _EXPLAINED = 64, 200
-"""Characters of a name and of a reason that are kept."""
-
-
-class EventKind(Enum):
-    """What happened to the right to drive."""
-
-    ACQUIRED = "acquired"
-    TAKEN_OVER = "taken over"
-    RELEASED = "released"
-    REFUSED = "refused"
-    STOPPED = "stopped"
-    ENDED = "ended"
-
-
-class Event(msgspec.Struct, frozen=True):
-    """Something to write down; where it ``stops``, the robot is to be sent its stop."""
-
-    what: EventKind
-    who: str | None = None
-    reason: str | None = None
-    priority: int | None = None
-    command: str | None = None
-    code: Code | None = None
-    stops: bool = False
-
-    def __str__(self) -> str:
-        who = f" {self.who}" if self.who else ""
-        command = f" {self.command}" if self.command else ""
-        return f"{self.what.value}{who}{command}{f' ({self.reason})' if self.reason else ''}"
-
-
-class _Holder(msgspec.Struct):
-    who: str
-    priority: int
-    verifier: Verifier
-    lease_s: float
-    deadman_s: float
-    alive: str | None
-    expires_at: float
-    numbers: dict[str, int] = msgspec.field(default_factory=dict)
-    """The last number that was used, of its commands and of its questions."""
-    ended: str | None = None
-    """Why the lease has ended."""
-
-    @property
-    def described(self) -> str:
-        return f"{self.who} (priority {self.priority})"
+Row: TypeAlias = dict[Input, tuple[Callable[..., Lease | None], State | None]]
 
 
 class Authority:
-    """The lease of one robot, and the watch over its motion.
+    """The lease of one robot, and the deadman of its motion.
 
-    lease_s, deadman_s: the most a holder may ask for, and what it gets without asking, in seconds.
-    random: gives so many bytes that nobody can guess.
+    lease_s, deadman_s: the most a holder may ask for, and the default, in seconds.
+    random: returns as many unguessable bytes as it is asked for.
     """
 
     def __init__(self, lease_s: float, deadman_s: float, random: Callable[[int], bytes]) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
         self.on_its_own = False
-        """Whether the robot may have moved by itself since its last stop: no deadman, but every other stop."""
-        self._autonomous = False
-        """Whether its mode is autonomous, since its last stop or neutral."""
+        """Whether the robot may have moved by itself since its last stop: without a deadman, but every stop ends it."""
         self.verifier: Verifier | None = None
-        """Of the lease that is held; other threads use it to sort what comes in."""
-        self._random = random
-        self._holder: _Holder | None = None
-        self._stopped = False
-        self._held_back: str | None = None
+        """Verifies proofs of the current lease; None while there is none. Read by other threads."""
+        self._state = State.FREE
+        self._holders = Holders(random)
+        self._autonomous = False
+        """Whether the mode is autonomous; a stop and neutral end it."""
         self._moving: set[str] = set()
+        """The parts of the robot whose last command was motion."""
+        self._deadman_s = deadman_s
+        """The deadman of the current holder."""
         self._stop_at = math.inf
-        self._ended: OrderedDict[bytes, _Holder] = OrderedDict()
-        self._refusals: OrderedDict[tuple[str | None, str, Code, str, str | None], int] = OrderedDict()
+        self._held_back: str | None = None
+        self._refusals = RefusalCounts()
         self._events: list[Event] = []
 
     def __repr__(self) -> str:
-        return f"<Authority {self.state}{f' by {self._holder.who}' if self._holder else ''}>"
+        return f"<Authority {self.state}{f' by {self._holders.current.who}' if self._holders.current else ''}>"
 
     @property
     def state(self) -> str:
-        """``free``, ``held`` or ``stopped``."""
-        return "held" if self._holder else "stopped" if self._stopped else "free"
+        """``free``, ``held`` or ``stopped``, as ``control`` shows it."""
+        return _SHOWN.get(self._state, self._state.value)
 
     @property
     def moving(self) -> bool:
-        """Whether the robot was told to move, or to move on its own, and not yet to stop."""
+        """Whether the robot was told to move, or to move by itself, and has not been stopped since."""
         return bool(self._moving) or self.on_its_own
 
     @property
     def driven(self) -> bool:
-        """Whether somebody drives the robot, or lets it drive: else it is to be at rest."""
+        """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be at rest."""
         return bool(self._moving) or self._autonomous
 
-    # The lease
+    # Questions about the lease
 
     def acquire(self, request: Acquire, now: float) -> Lease:
-        """Give the lease of a robot that is free or stopped, or held with a lower priority."""
+        """Grant the lease of a robot that is free or stopped, or held with a lower priority."""
         self.expire(now)
-        holder = self._holder
-        if holder is not None and request.priority <= holder.priority:
-            held = Held(f"held by {holder.described}", holder=holder.who)
-            self.refuse("acquire", held, request.who)
-            return self._denied(held, now)
-        return self._grant(request, EventKind.ACQUIRED, now)
+        outranks = self._holders.current is not None and request.priority > self._holders.current.priority
+        asked = Input.OUTRANK if outranks else Input.ACQUIRE
+        return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now)
 
     def takeover(self, request: Acquire, now: float) -> Lease:
-        """Give the lease to whoever asks; the one that had it has lost it, and the robot is stopped."""
+        """Grant the lease whoever has it; the previous holder loses it, and a moving robot is stopped."""
         self.expire(now)
-        return self._grant(request, EventKind.TAKEN_OVER, now)
+        return self._reply("takeover", request.who, now, Input.TAKEOVER, request, EventKind.TAKEN_OVER, now)
 
     def renew(self, shown: Authorization, key: str, now: float) -> Lease:
-        """Put the end of a lease off. key: the one that was asked."""
+        """Postpone the end of the lease by its full length. key: the key that was queried."""
         self.expire(now)
-        try:
-            holder = self._sender("questions", shown, key)
-        except Refused as refusal:
-            self.refuse("renew", refusal, refusal.who)
-            return self._denied(refusal, now)
-        holder.expires_at = now + holder.lease_s
-        return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
+        return self._reply("renew", None, now, Input.RENEW, shown, key, now)
 
     def release(self, shown: Authorization, key: str, now: float) -> Lease:
-        """Give a lease back; a robot that moves is stopped. key: the one that was asked."""
+        """End the lease at its holder's wish; a moving robot is stopped. key: the key that was queried."""
         self.expire(now)
-        try:
-            self._sender("questions", shown, key)
-        except Refused as refusal:
-            self.refuse("release", refusal, refusal.who)
-            return self._denied(refusal, now)
-        self._end("released", EventKind.RELEASED, stops=self.moving)
-        self._stopped = False
-        return Lease(ok=True)
+        return self._reply("release", None, now, Input.RELEASE, shown, key)
 
     # Commands
 
     def admit(self, attachment: bytes | None, key: str, payload: bytes, now: float) -> str:
-        """Give the holder whose command this is, and use its number up; raise Refused where it is nobody's.
+        """Return the holder who sent a command, use its number up and renew the lease; raise Refused for other senders.
 
-        key: the one the command came on, without wildcards.
+        key: the key that the command came on, without wildcards.
         """
-        self.expire(now)
-        if attachment is None:
-            raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
-        noted = self.verifier.noted(attachment, key, payload) if self.verifier is not None else None
-        holder = self._sender("commands", noted or read(attachment), key, payload, proven=noted is not None)
+        holders = self._holders
+        if now >= self._stop_at or (holders.current is not None and now >= holders.current.expires_at):
+            self.expire(now)
+        holder = holders.of_command(attachment, key, payload)
         holder.expires_at = now + holder.lease_s
         return holder.who
 
     def require_motion(self) -> None:
-        """Raise Refused where the holder must send neutral before the robot moves."""
+        """Raise Refused if the holder must send neutral before the robot moves."""
         if self._held_back is not None:
             raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
 
     def applied(self, part: str, now: float, *, moving: bool) -> None:
-        """Take note that the holder's command for one part of the robot was carried out."""
-        if moving:
-            self._moving.add(part)
-        else:
-            self._moving.discard(part)
-            if not self._moving:  # neutral takes the robot out of its mode too
-                self._autonomous = False
-            self._held_back = None
-        deadman_s = self._holder.deadman_s if self._holder else self.deadman_s
-        self._stop_at = now + deadman_s if self._moving else math.inf
+        """Record that the holder's command for one part of the robot was carried out."""
+        parts = self._moving
+        if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
+            self._stop_at = now + self._deadman_s
+            return
+        if not moving and not parts and self._held_back is None:  # nor is repeated neutral
+            self._autonomous = False
+            return
+        (parts.add if moving else parts.discard)(part)
+        self._handle(Input.MOTION if parts else Input.NEUTRAL, now)
 
     def mode_chosen(self, *, autonomous: bool) -> None:
-        """Take note that the holder's choice of who moves the robot was carried out."""
+        """Record that the robot was told the holder's choice of its mode."""
         self._autonomous = autonomous
         self.on_its_own = self.on_its_own or autonomous
 
     def sent_opaque(self) -> None:
-        """Take note that the holder had the robot sent what nobody here can read: it may move by it."""
+        """Record that the robot was sent a raw message of the holder's: the robot may move because of it."""
         self.on_its_own = True
 
     def refuse(
         self, command: str, refusal: Refused, who: str | None = None, *, by: str | None = None, count: int = 1
     ) -> None:
-        """Count a refusal; it shows on ``control``. by: the listener that refused it, and tells of it."""
-        who, command, reason = who and who[:NAMED], command[:NAMED], str(refusal)[:_EXPLAINED]
-        key = (who, command, refusal.code, reason, by)
-        self._refusals[key] = self._refusals.pop(key, 0) + count
-        if len(self._refusals) > REFUSALS:
-            self._refusals.popitem(last=False)
-        self._events.append(Event(EventKind.REFUSED, who, reason, command=command, code=refusal.code))
+        """Count a refusal; ``control`` shows it. by: the listener that refused and reported it."""
+        shown = self._refusals.add(command, refusal, who, by, count)
+        self._events.append(Event(EventKind.REFUSED, shown.who, shown.reason, command=shown.command, code=refusal.code))
 
     # Stops
 
     def stop(self, reason: str) -> None:
         """Stop the robot and end the lease, whoever asks: nobody drives before acquiring anew."""
-        self._end(reason, EventKind.STOPPED, stops=True)
-        self._stopped = True
+        self._handle(Input.STOP, reason, EventKind.STOPPED)
 
     def hold_back(self, reason: str, *, stops: bool = True) -> None:
-        """Stop the robot, or know that it stands; the lease stays, motion needs a neutral drive."""
-        if stops or self.moving or self._held_back != reason:
-            self._events.append(
-                Event(EventKind.STOPPED, self._holder.who if self._holder else None, reason, stops=stops)
-            )
-        self._still()
-        self._held_back = reason
+        """Stop the robot, or (``stops=False``) record that it is at rest; motion needs a neutral first."""
+        self._handle(Input.HOLD_BACK, reason, stops=stops)
 
     def vanished(self, alive: str) -> None:
-        """Take note that a liveliness token is gone: if the holder named it, the lease ends."""
-        if self._holder is not None and self._holder.alive == alive:
-            self._lose("holder lost")
+        """Record that a liveliness token is gone; if the holder named it, the lease ends."""
+        if self._holders.current is not None and self._holders.current.alive == alive:
+            self._handle(Input.HOLDER_LOST, "holder lost", EventKind.ENDED)
 
     def bus_lost(self) -> None:
-        """Take note that nobody can be heard any more: the lease ends."""
-        if self._holder is not None:
-            self._lose("bus lost")
+        """Record that no program can reach the gateway any more; the lease ends."""
+        self._handle(Input.BUS_LOST, "bus lost", EventKind.ENDED)
 
     # Time
 
     def deadline(self) -> float | None:
-        """Tell when :meth:`expire` has something to do."""
-        expires_at = self._holder.expires_at if self._holder else math.inf
+        """Return when :meth:`expire` is next due; None: never."""
+        expires_at = self._holders.current.expires_at if self._holders.current else math.inf
         earliest = min(self._stop_at, expires_at)
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
-        """Do what is due: end a lease that was not renewed, stop motion that was not."""
-        if self._holder is not None and now >= self._holder.expires_at:
-            self._lose("lease expired")
+        """Do what is due: end a lease that was not renewed, stop motion that was not repeated."""
+        if self._holders.current is not None and now >= self._holders.current.expires_at:
+            self._handle(Input.EXPIRED, "lease expired", EventKind.ENDED)
         elif now >= self._stop_at:
-            self.hold_back("deadman")
+            self._handle(Input.DEADMAN, "deadman")
+
+    # What happened
 
     @property
     def eventful(self) -> bool:
-        """Whether :meth:`events` has any."""
+        """Whether :meth:`events` returns any."""
         return bool(self._events)
 
     def events(self) -> list[Event]:
-        """Give what happened since the last call, in order."""
+        """Return what happened since the last call, in order."""
         events, self._events = self._events, []
         return events
 
     def report(self, now: float) -> Control:
-        """Say who drives and what was refused."""
-        holder = self._holder
+        """Return what ``control`` shows: who drives, and what was refused."""
+        holder = self._holders.current
         return Control(
             state=self.state,  # type: ignore[arg-type]
             holder=holder.who if holder else None,
             lease=holder.verifier.lease if holder else None,
             priority=holder.priority if holder else None,
-            expires_in_s=max(0.0, holder.expires_at - now) if holder else None,
-            refusals=tuple(
-                Refusal(who=who, command=command, code=code, reason=reason, count=count, by=by)
-                for (who, command, code, reason, by), count in self._refusals.items()
-            ),
+            expires_in_s=self._expires_in_s(now),
+            refusals=self._refusals.shown(),
         )
 
-    def _sender(
-        self, what: str, shown: Authorization, key: str, payload: bytes = b"", *, proven: bool = False
-    ) -> _Holder:
-        """Give the holder who sent this, and use its number up; raise Refused where it is nobody's.
+    # The machine
 
-        The proof comes before the number: who knows the lease's id alone uses up none, and learns of none.
-        """
-        holder = self._known(shown.lease)
-        if not proven and not holder.verifier.proves(shown, key, payload):
-            raise Malformed("wrong proof")
-        fresh = shown.seq > holder.numbers.get(what, -1)
-        if fresh:
-            holder.numbers[what] = shown.seq
-        if holder.ended is not None:  # repeated, anybody who overheard it may have sent it
-            raise LeaseLost(f"the lease has ended ({holder.ended})", who=holder.who if fresh else None)
-        if not fresh:
-            raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)
-        return holder
+    def _handle(self, said: Input, *arguments: object, **options: object) -> Lease | None:
+        """Carry out the table: the action, then the next state. Ignore an input that the state has no entry for."""
+        entry = self.TABLE[self._state].get(said)
+        if entry is None:
+            return None
+        action, after = entry
+        reply = action(self, *arguments, **options)
+        self._state = after or self._state
+        return reply
 
-    def _known(self, lease: bytes) -> _Holder:
-        """Give the holder of a lease, of one that has ended too; raise Refused where there was none of this id."""
-        holder = self._holder
-        if holder is not None and holder.verifier.lease == lease:
-            return holder
-        if lease in self._ended:
-            return self._ended[lease]
-        if holder is not None:
-            raise Held(f"held by {holder.described}", holder=holder.who)
-        raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
-
-    def _grant(self, request: Acquire, what: EventKind, now: float) -> Lease:
+    def _reply(self, command: str, who: str | None, now: float, asked: Input, *arguments: object) -> Lease:
+        """Answer a question about the lease; count it if it is refused."""
         try:
-            if not request.who or not request.who.isprintable():
-                raise Malformed(f"who = {request.who[:NAMED]!r}: expected a name that others are shown")
-            lease_s = _wish("lease_s", request.lease_s, self.lease_s)
-            deadman_s = _wish("deadman_s", request.deadman_s, self.deadman_s)
+            return self._handle(asked, *arguments) or Lease(ok=True)
         except Refused as refusal:
-            self.refuse("takeover" if what is EventKind.TAKEN_OVER else "acquire", refusal, request.who)
-            return self._denied(refusal, now)
-        who = request.who[:NAMED]
-        if self._holder is not None:
-            self._end(f"taken over by {who}", EventKind.ENDED, stops=self.moving)
-        lease, token = self._new_lease(), self._random(TOKEN_BYTES)
-        self.verifier = Verifier(lease, token)
-        self._holder = _Holder(who, request.priority, self.verifier, lease_s, deadman_s, request.alive, now + lease_s)
-        self._stopped, self._held_back = False, None
-        self._events.append(Event(what, who, priority=request.priority))
+            self.refuse(command, refusal, who if who is not None else refusal.who)
+            holder = self._holders.current.who if self._holders.current else None
+            expires_in_s = self._expires_in_s(now)
+            return Lease(ok=False, expires_in_s=expires_in_s, holder=holder, reason=str(refusal), code=refusal.code)
+
+    def _expires_in_s(self, now: float) -> float | None:
+        return max(0.0, self._holders.current.expires_at - now) if self._holders.current else None
+
+    # Actions
+
+    def _grant(self, request: Acquire, kind: EventKind, now: float) -> Lease:
+        """End the current lease, if there is one, and give a new one; raise Malformed, and change nothing."""
+        who, lease_s = name_of(request), capped("lease_s", request.lease_s, self.lease_s)
+        deadman_s = capped("deadman_s", request.deadman_s, self.deadman_s)
+        if self._holders.current is not None:
+            self._end(f"taken over by {who}", EventKind.ENDED)
+        lease, token = self._holders.new_lease()
+        self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
+        self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, now + lease_s)
+        self._held_back = None
+        self._events.append(Event(kind, who, priority=request.priority))
         return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who)
 
-    def _new_lease(self) -> bytes:
-        """Give an id that none of the last leases had."""
-        lease = self._random(LEASE_BYTES)
-        while lease in self._ended:
-            lease = ((int.from_bytes(lease, "big") + 1) % 256**LEASE_BYTES).to_bytes(LEASE_BYTES, "big")
-        return lease
+    def _deny(self, request: Acquire, kind: EventKind, now: float) -> Lease:
+        """Refuse the lease and name its holder."""
+        assert self._holders.current is not None
+        raise Held(f"held by {self._holders.current.described}", holder=self._holders.current.who)
 
-    def _denied(self, refusal: Refused, now: float) -> Lease:
-        holder = self._holder
-        expires_in_s = max(0.0, holder.expires_at - now) if holder else None
-        return Lease(
-            ok=False,
-            expires_in_s=expires_in_s,
-            holder=holder.who if holder else None,
-            reason=str(refusal),
-            code=refusal.code,
-        )
+    def _extend(self, shown: Authorization, key: str, now: float) -> Lease:
+        """Renew the lease if its holder asks; raise Refused for other senders."""
+        holder = self._holders.of_question(shown, key)
+        holder.expires_at = now + holder.lease_s
+        return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
 
-    def _lose(self, reason: str) -> None:
-        self._end(reason, EventKind.ENDED, stops=self.moving)
-        self._stopped = True
+    def _give_back(self, shown: Authorization, key: str) -> None:
+        """End the lease if its holder asks; raise Refused for other senders."""
+        self._holders.of_question(shown, key)
+        self._end("released", EventKind.RELEASED)
 
-    def _end(self, reason: str, what: EventKind, *, stops: bool) -> None:
-        holder, self._holder, self.verifier = self._holder, None, None
+    def _explain(self, shown: Authorization, key: str, now: float = 0.0) -> None:
+        """Refuse what only a holder may ask, and say why its lease ended if it had one."""
+        self._holders.of_question(shown, key)
+
+    def _move(self, now: float) -> None:
+        """Start the deadman."""
+        self._stop_at = now + self._deadman_s
+
+    def _rest(self, now: float) -> None:
+        """Stop the deadman; neutral also takes the robot out of its mode, and allows motion again."""
+        self._autonomous = False
+        self._held_back = None
+        self._stop_at = math.inf
+
+    def _hold_back(self, reason: str, *, stops: bool = True) -> None:
+        """Require neutral before motion; tell of it once for each reason, and always with a stop."""
+        if stops or self.moving or self._held_back != reason:
+            who = self._holders.current.who if self._holders.current else None
+            self._events.append(Event(EventKind.STOPPED, who, reason, stops=stops))
+        self._still()
+        self._held_back = reason
+
+    def _end(self, reason: str, kind: EventKind) -> None:
+        """End the lease, if there is one, and stop the robot: if it moves, or if that was asked for."""
+        stops = kind is EventKind.STOPPED or self.moving
+        holder, self.verifier = self._holders.end(reason), None
         self._still()
         self._held_back = None
-        if holder is not None:
-            holder.ended = reason
-            self._ended[holder.verifier.lease] = holder
-            if len(self._ended) > ENDED:
-                self._ended.popitem(last=False)
-        self._events.append(Event(what, holder.who if holder else None, reason, stops=stops))
+        self._deadman_s = self.deadman_s
+        self._events.append(Event(kind, holder.who if holder else None, reason, stops=stops))
 
     def _still(self) -> None:
         self._moving.clear()
         self.on_its_own = self._autonomous = False
         self._stop_at = math.inf
 
+    _NOBODY: ClassVar[Row] = {
+        Input.ACQUIRE: (_grant, State.HELD),
+        Input.TAKEOVER: (_grant, State.HELD),
+        Input.RENEW: (_explain, None),
+        Input.RELEASE: (_explain, None),
+        Input.MOTION: (_move, None),
+        Input.NEUTRAL: (_rest, None),
+        Input.DEADMAN: (_hold_back, None),
+        Input.HOLD_BACK: (_hold_back, None),
+        Input.STOP: (_end, State.STOPPED),
+    }
+    _HOLDER: ClassVar[Row] = {
+        Input.ACQUIRE: (_deny, None),
+        Input.OUTRANK: (_grant, State.HELD),
+        Input.TAKEOVER: (_grant, State.HELD),
+        Input.RENEW: (_extend, None),
+        Input.RELEASE: (_give_back, State.FREE),
+        Input.NEUTRAL: (_rest, State.HELD),
+        Input.HOLD_BACK: (_hold_back, State.HELD_BACK),
+        Input.STOP: (_end, State.STOPPED),
+        Input.EXPIRED: (_end, State.STOPPED),
+        Input.HOLDER_LOST: (_end, State.STOPPED),
+        Input.BUS_LOST: (_end, State.STOPPED),
+    }
+    TABLE: ClassVar[dict[State, Row]] = {
+        State.FREE: _NOBODY,
+        State.STOPPED: _NOBODY,
+        State.HELD: _HOLDER | {Input.MOTION: (_move, State.MOVING)},
+        State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, State.HELD_BACK)},
+        State.HELD_BACK: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, None)},
+    }
+    """What to do with an input, and the state after it; None: the state stays."""
 
-def _wish(name: str, wish_s: float | None, most_s: float) -> float:
-    """Cap what was asked for; raise Refused where it is no time."""
-    if wish_s is None:
-        return most_s
-    if not wish_s >= LEAST_S:
-        raise Malformed(f"{name} = {wish_s:g}: expected at least {LEAST_S:g}")
-    return min(wish_s, most_s)
+
+_SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}

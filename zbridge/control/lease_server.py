@@ -8,7 +8,8 @@ from collections.abc import Callable
 
 from zbridge.bus import Bus, Handle, Question
 from zbridge.control.audit_log import Audit
-from zbridge.control.authority import Authority, EventKind
+from zbridge.control.authority import Authority
+from zbridge.control.events import EventKind
 from zbridge.control.gate import CommandGate, NameGate, QuestionGate
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.proof import read

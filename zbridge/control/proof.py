@@ -14,10 +14,12 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+from collections import OrderedDict
+from collections.abc import Callable
 
 import msgspec
 
-from zbridge.errors import Malformed, PayloadError
+from zbridge.errors import Code, Held, LeaseLost, Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
 
 LEASE_BYTES = 8
@@ -25,6 +27,8 @@ TOKEN_BYTES = 32
 PROOF_BYTES = 16
 NOTES = 1024
 """Proven commands that may wait for the event loop; where there are more, their proofs are reckoned again."""
+ENDED = 16
+"""Ended leases that are remembered: their holders are told why, and their ids are not given again."""
 LEAST_BYTES, MOST_BYTES = 46, 128
 """Bytes of an authorization: as short as MessagePack can write it, and with room for those who write it longer."""
 
@@ -91,6 +95,87 @@ class Verifier:
         return note[0] if note is not None and note[1:] == (key, payload) else None
 
 
+class Holder(msgspec.Struct):
+    """A program that has the lease, or had it. ``ended``: why its lease ended."""
+
+    who: str
+    priority: int
+    verifier: Verifier
+    lease_s: float
+    alive: str | None
+    expires_at: float
+    numbers: dict[str, int] = msgspec.field(default_factory=dict)
+    """The highest number used, of commands and of questions."""
+    ended: str | None = None
+
+    @property
+    def described(self) -> str:
+        return f"{self.who} (priority {self.priority})"
+
+
+class Holders:
+    """The holder of the lease and the last ones before it: finds out which one sent a command or a question.
+
+    The proof is checked before the number, so that knowing a lease's id alone uses up and reveals no number.
+    random: returns as many unguessable bytes as it is asked for.
+    """
+
+    def __init__(self, random: Callable[[int], bytes]) -> None:
+        self.current: Holder | None = None
+        self._random = random
+        self._ended: OrderedDict[bytes, Holder] = OrderedDict()
+
+    def __repr__(self) -> str:
+        return f"<Holders {self.current.who if self.current else 'none'}, {len(self._ended)} before>"
+
+    def new_lease(self) -> tuple[bytes, bytes]:
+        """Return an id that no remembered lease has, and a token."""
+        lease = self._random(LEASE_BYTES)
+        while lease in self._ended:
+            lease = ((int.from_bytes(lease, "big") + 1) % 256**LEASE_BYTES).to_bytes(LEASE_BYTES, "big")
+        return lease, self._random(TOKEN_BYTES)
+
+    def end(self, reason: str) -> Holder | None:
+        """End the current lease and return its holder, if there is one."""
+        holder, self.current = self.current, None
+        if holder is not None:
+            holder.ended = reason
+            self._ended[holder.verifier.lease] = holder
+            if len(self._ended) > ENDED:
+                self._ended.popitem(last=False)
+        return holder
+
+    def of_command(self, attachment: bytes | None, key: str, payload: bytes) -> Holder:
+        """Return the holder who sent a command and use its number up; raise Refused for other senders."""
+        if attachment is None:
+            raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
+        holder = self.current
+        if holder is not None and (noted := holder.verifier.noted(attachment, key, payload)) is not None:
+            return _use_up("commands", noted.seq, holder)
+        return self._sender("commands", read(attachment), key, payload)
+
+    def of_question(self, shown: Authorization, key: str) -> Holder:
+        """Return the holder who asked to renew or release, use its number up; raise Refused for other senders."""
+        return self._sender("questions", shown, key, b"")
+
+    def _sender(self, kind: str, shown: Authorization, key: str, payload: bytes) -> Holder:
+        holder = self._known(shown.lease)
+        if not holder.verifier.proves(shown, key, payload):
+            raise Malformed("wrong proof")
+        return _use_up(kind, shown.seq, holder)
+
+    def _known(self, lease: bytes) -> Holder:
+        """Return the holder of a current or remembered lease; raise Refused for any other id."""
+        holder = self.current
+        if holder is not None and holder.verifier.lease == lease:
+            return holder
+        if lease in self._ended:
+            return self._ended[lease]
+        if holder is not None:
+            raise Held(f"held by {holder.described}", holder=holder.who)
+        raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
+
+
 def read(shown: bytes | None) -> Authorization:
     """Read an authorization; raise Malformed."""
     try:
@@ -99,6 +184,18 @@ def read(shown: bytes | None) -> Authorization:
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:
         raise Malformed(_EXPECTED) from error
     raise Malformed(_EXPECTED)
+
+
+def _use_up(kind: str, seq: int, holder: Holder) -> Holder:
+    """Use a proven number up and return its holder; raise Refused if it was used or passed, or the lease has ended."""
+    fresh = seq > holder.numbers.get(kind, -1)
+    if fresh:
+        holder.numbers[kind] = seq
+    if holder.ended is not None:  # who is None if repeated: anybody who overheard it may have sent it
+        raise LeaseLost(f"the lease has ended ({holder.ended})", who=holder.who if fresh else None)
+    if not fresh:
+        raise Malformed("repeated or out of order", Code.OUT_OF_ORDER)
+    return holder
 
 
 def _prepare(token: bytes) -> hmac.HMAC:

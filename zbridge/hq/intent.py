@@ -1,50 +1,91 @@
-"""What an old HQ program means, which knows of no lease: when it acquires the robot, and gives it back. Sans-IO.
+"""The intent of an old HQ program, which knows no lease: when to acquire the robot for it and when to release. Sans-IO.
 
-Such a program says what its stick says, again and again. After it connected, and after a stop, a refusal or an
-expiry, nothing moves before it has once said neutral: a stick that was left pushed moves no robot.
+Theory of operation. Such a program repeats what its stick says. The machine is :attr:`Intent.TABLE`,
+``{state: {input: (action, next state)}}``; ``docs/control.md`` shows the same table, and a test compares both. Six
+states: the program is idle, or the lease is being asked for, or held; and in each it may owe neutral. A program owes
+neutral after it connected, and after a stop, a refusal or an expiry: before it says neutral once, none of its motion
+is carried out, so that a stick that was left pushed moves no robot.
+
+The listener's operator calls :meth:`motion`, :meth:`neutral` and :meth:`choose` for what the program says and must
+carry out the :class:`Action` they return. It calls :meth:`granted`, :meth:`lost`, :meth:`released` and :meth:`refused`
+for what became of the lease and of motion. Motion that is not repeated within ``deadman_s`` has ended; the robot's
+gateway has stopped the robot by then. The control mode stands: it is kept when the lease is not.
 Source: the design's "Old HQ programs".
 """
 
 from __future__ import annotations
 
 import math
-from enum import Enum
+from enum import Enum, StrEnum
+from typing import ClassVar
 
 from zbridge.errors import Code, LeaseLost, NeutralFirst
 
 LEASE_S = 3.0
-"""Seconds of neutral or silence after which a robot is given back, until a lease says otherwise."""
+"""Seconds of neutral or silence after which a robot is released, until a lease says otherwise."""
 EARLY_S = 0.3
-"""Seconds by which a robot is given back before its lease expires: an expiry would count as a loss."""
+"""Seconds by which a robot is released before its lease expires: an expiry would count as a loss."""
 TOGETHER_S = 0.1
-"""Seconds within which a mode and motion were sent one after the other, by stream and by datagram, in whatever order
-they came."""
+"""A mode and motion sent this close together, by stream and by datagram, may arrive in either order; seconds."""
 _MODE_NONE = "control mode is none"
 
 
 class Action(Enum):
-    """What is to be done with what a program said."""
+    """What the caller must do with what a program said. REFUSE is raised as NeutralFirst, not returned."""
 
     NOTHING = "nothing"
     ACQUIRE = "acquire"
     WAIT = "wait"
     SEND = "send"
     RELEASE = "release"
+    REFUSE = "refuse"
+
+
+class State(StrEnum):
+    """What a program has, and whether it owes neutral."""
+
+    IDLE = "idle"
+    ASKING = "asking"
+    HOLDING = "holding"
+    IDLE_OWES = "idle owing neutral"
+    ASKING_OWES = "asking owing neutral"
+    HOLDING_OWES = "holding owing neutral"
+
+
+class Input(StrEnum):
+    """What a program said, or what became of its lease or motion."""
+
+    MOTION = "motion"
+    NEUTRAL = "neutral"
+    PART_NEUTRAL = "neutral of a part"
+    AUTONOMOUS = "mode autonomous"
+    MANUAL = "mode manual"
+    NONE = "mode none"
+    LATE_MODE = "mode just after motion"
+    GRANTED = "granted"
+    LOST = "lost"
+    RELEASED = "released"
+    REFUSED = "refused"
+    DEADMAN = "deadman"
+
+
+Row = dict[Input, tuple[Action, State]]
 
 
 class Intent:
-    """One program. deadman_s: silence after which its motion has ended. modes: it must say first that it will drive."""
+    """The intent of one program.
+
+    deadman_s: silence after which its motion has ended, seconds. modes: whether it must choose a control mode before
+    motion.
+    """
 
     def __init__(self, deadman_s: float, *, modes: bool = False) -> None:
         self.mode = "none" if modes else "manual"
-        self.held = False
-        """Whether it holds the robot."""
-        self.asking = False
-        """Whether it was asked for the robot, and there is no answer yet."""
         self.held_back: str | None = "connected"
-        """Why neutral must come before motion; None where it need not."""
+        """Why the program owes neutral; None while it does not."""
         self.lease_s = LEASE_S
         self.deadman_s = deadman_s
+        self._state = State.IDLE_OWES
         self._moving = False
         self._moved_at = -math.inf
         self._used_at = -math.inf
@@ -55,100 +96,176 @@ class Intent:
         return f"<Intent {self.mode} {'held' if self.held else 'asking' if self.asking else 'idle'} {self.held_back}>"
 
     @property
+    def held(self) -> bool:
+        """Whether the lease is held."""
+        return self._state in (State.HOLDING, State.HOLDING_OWES)
+
+    @property
+    def asking(self) -> bool:
+        """Whether the lease was asked for and the answer is awaited."""
+        return self._state in (State.ASKING, State.ASKING_OWES)
+
+    @property
     def may_steer(self) -> bool:
-        """Whether wheels may be set: the robot is held, and nothing need be said first."""
-        return self.held and self.held_back is None
+        """Whether wheels may be set: the lease is held and no neutral is owed."""
+        return self._state is State.HOLDING
 
     # What the program says
 
     def heard(self, now: float) -> None:
-        """Take note that anything at all came."""
+        """Record that the program sent anything at all."""
         self._heard_at = now
 
     def motion(self, now: float, *, lasts: bool = True) -> Action:
-        """Take motion; raise Refused where the program may not move the robot now.
+        """Take motion; raise Refused if the program may not move the robot now.
 
-        Motion that ``lasts`` is to be said again within the deadman.
+        lasts: whether the program repeats this motion within the deadman.
         """
         self.expire(now)
-        if self.held_back is not None:
-            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
-        if self.mode == "none":
-            self.held_back, self._modeless_at = _MODE_NONE, now
+        if self.mode == "none" and self.held_back is None:
+            self.refused(_MODE_NONE)
+            self._modeless_at = now
             raise LeaseLost(_MODE_NONE, Code.NO_LEASE)
+        action = self._handle(Input.MOTION)
         self._used_at = now
         if lasts:
             self._moved_at, self._moving = now, True
-        return self._act()
+        return action
 
     def neutral(self, now: float, *, whole: bool = True) -> Action:
-        """Take neutral; of a part only, where the program still says motion of another: that ends nothing.
+        """Take neutral. whole=False: of one part while the program still moves another, so that no motion has ended.
 
         Programs say neutral all the time while nobody touches the stick: it is no stop for a robot that drives itself.
         """
         self.expire(now)
-        if self.mode == "autonomous" and whole and self.held_back is None and not self._moving:
+        if not whole:
+            return self._handle(Input.PART_NEUTRAL)
+        if self.mode == "autonomous" and self.held_back is None and not self._moving:
             return Action.NOTHING
-        if whole:
-            self.held_back, self._moving = None, False
-        return Action.SEND if self.held else Action.WAIT if self.asking else Action.NOTHING
+        self.held_back, self._moving = None, False
+        return self._handle(Input.NEUTRAL)
 
     def choose(self, mode: str, now: float) -> Action:
-        """Take a control mode, which stands; autonomous is motion, none gives the robot back."""
+        """Take a control mode; ``autonomous`` counts as motion, ``none`` releases the robot."""
         self.expire(now)
         if mode != "none" and self.held_back == _MODE_NONE and now - self._modeless_at < TOGETHER_S:
-            self.held_back = None  # the motion was sent after this, and came first
-        if mode == "autonomous" and self.held_back is not None:
-            self.mode = mode  # it stands all the same: programs say it once
-            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
-        if "autonomous" in (mode, self.mode):  # a robot that moved by itself was in use until now
+            self.held_back = None  # the motion was sent after this, and arrived first
+            self._handle(Input.LATE_MODE)
+        former, self.mode = self.mode, mode  # it stands even if it is refused: programs say it once
+        action = self._handle(_CHOSEN[mode])
+        if "autonomous" in (mode, former):  # a robot that moved by itself was in use until now
             self._used_at = now
-        self.mode = mode
-        if mode == "none":
-            self._moving = False
-            return Action.RELEASE if self.held or self.asking else Action.NOTHING
-        if mode == "autonomous":
-            return self._act()
-        return Action.SEND if self.held else Action.WAIT if self.asking else Action.NOTHING
+        self._moving = self._moving and mode != "none"
+        return action
 
-    def _act(self) -> Action:
-        if self.held:
-            return Action.SEND
-        if self.asking:
-            return Action.WAIT
-        self.asking = True
-        return Action.ACQUIRE
-
-    # What becomes of the lease
+    # What becomes of the lease and of motion
 
     def granted(self, lease_s: float) -> None:
-        """Take note that the robot is ours."""
-        self.asking, self.held, self.lease_s = False, True, lease_s
+        """Record that the lease was granted. lease_s: its length, seconds."""
+        self.lease_s = lease_s
+        self._handle(Input.GRANTED)
 
     def lost(self, why: str) -> None:
-        """Take note that it is not, or not any more."""
-        self.asking = self.held = self._moving = False
-        self.held_back = why
+        """Record that the lease was refused or has ended; the program owes neutral."""
+        self.held_back, self._moving = why, False
+        self._handle(Input.LOST)
 
     def released(self) -> None:
-        """Take note that it was given back."""
-        self.asking = self.held = self._moving = False
+        """Record that the robot was given back."""
+        self._moving = False
+        self._handle(Input.RELEASED)
 
     def refused(self, why: str) -> None:
-        """Take note that motion was not carried out, and neutral must come."""
+        """Record that motion was not carried out; the program owes neutral."""
         self.held_back, self._moving = why, False
+        self._handle(Input.REFUSED)
 
     # Time
 
     def expire(self, now: float) -> None:
-        """Let motion end that was not said again in time: the robot's gateway has stopped it."""
+        """End motion that was not repeated in time: the robot's gateway has stopped it."""
         if self._moving and now - self._moved_at >= self.deadman_s:
-            self.refused("deadman")
+            self.held_back, self._moving = "deadman", False
+            self._handle(Input.DEADMAN)
 
     def wants_release(self, now: float) -> bool:
-        """Tell whether the robot has not been used for so long that it is to be given back.
+        """Return whether the robot has been unused for so long that it must be released.
 
-        A robot that moves by itself is used as long as anything at all is heard.
+        A robot that moves by itself is in use as long as the program sends anything at all.
         """
         used_at = max(self._used_at, self._heard_at) if self.mode == "autonomous" else self._used_at
         return self.held and now - used_at >= self.lease_s - min(EARLY_S, self.lease_s / 4)
+
+    def _handle(self, said: Input) -> Action:
+        """Carry out the table; raise NeutralFirst if its action is to refuse. A missing pair changes nothing."""
+        action, self._state = self.TABLE[self._state].get(said, (Action.NOTHING, self._state))
+        if action is Action.REFUSE:
+            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
+        return action
+
+    TABLE: ClassVar[dict[State, Row]] = {
+        State.IDLE: {
+            Input.MOTION: (Action.ACQUIRE, State.ASKING),
+            Input.AUTONOMOUS: (Action.ACQUIRE, State.ASKING),
+            Input.LOST: (Action.NOTHING, State.IDLE_OWES),
+            Input.REFUSED: (Action.NOTHING, State.IDLE_OWES),
+            Input.DEADMAN: (Action.NOTHING, State.IDLE_OWES),
+        },
+        State.ASKING: {
+            Input.MOTION: (Action.WAIT, State.ASKING),
+            Input.NEUTRAL: (Action.WAIT, State.ASKING),
+            Input.PART_NEUTRAL: (Action.WAIT, State.ASKING),
+            Input.AUTONOMOUS: (Action.WAIT, State.ASKING),
+            Input.MANUAL: (Action.WAIT, State.ASKING),
+            Input.NONE: (Action.RELEASE, State.ASKING),
+            Input.GRANTED: (Action.NOTHING, State.HOLDING),
+            Input.LOST: (Action.NOTHING, State.IDLE_OWES),
+            Input.RELEASED: (Action.NOTHING, State.IDLE),
+            Input.REFUSED: (Action.NOTHING, State.ASKING_OWES),
+            Input.DEADMAN: (Action.NOTHING, State.ASKING_OWES),
+        },
+        State.HOLDING: {
+            Input.MOTION: (Action.SEND, State.HOLDING),
+            Input.NEUTRAL: (Action.SEND, State.HOLDING),
+            Input.PART_NEUTRAL: (Action.SEND, State.HOLDING),
+            Input.AUTONOMOUS: (Action.SEND, State.HOLDING),
+            Input.MANUAL: (Action.SEND, State.HOLDING),
+            Input.NONE: (Action.RELEASE, State.HOLDING),
+            Input.LOST: (Action.NOTHING, State.IDLE_OWES),
+            Input.RELEASED: (Action.NOTHING, State.IDLE),
+            Input.REFUSED: (Action.NOTHING, State.HOLDING_OWES),
+            Input.DEADMAN: (Action.NOTHING, State.HOLDING_OWES),
+        },
+        State.IDLE_OWES: {
+            Input.MOTION: (Action.REFUSE, State.IDLE_OWES),
+            Input.NEUTRAL: (Action.NOTHING, State.IDLE),
+            Input.AUTONOMOUS: (Action.REFUSE, State.IDLE_OWES),
+            Input.LATE_MODE: (Action.NOTHING, State.IDLE),
+        },
+        State.ASKING_OWES: {
+            Input.MOTION: (Action.REFUSE, State.ASKING_OWES),
+            Input.NEUTRAL: (Action.WAIT, State.ASKING),
+            Input.PART_NEUTRAL: (Action.WAIT, State.ASKING_OWES),
+            Input.AUTONOMOUS: (Action.REFUSE, State.ASKING_OWES),
+            Input.MANUAL: (Action.WAIT, State.ASKING_OWES),
+            Input.NONE: (Action.RELEASE, State.ASKING_OWES),
+            Input.LATE_MODE: (Action.NOTHING, State.ASKING),
+            Input.GRANTED: (Action.NOTHING, State.HOLDING_OWES),
+            Input.LOST: (Action.NOTHING, State.IDLE_OWES),
+            Input.RELEASED: (Action.NOTHING, State.IDLE_OWES),
+        },
+        State.HOLDING_OWES: {
+            Input.MOTION: (Action.REFUSE, State.HOLDING_OWES),
+            Input.NEUTRAL: (Action.SEND, State.HOLDING),
+            Input.PART_NEUTRAL: (Action.SEND, State.HOLDING_OWES),
+            Input.AUTONOMOUS: (Action.REFUSE, State.HOLDING_OWES),
+            Input.MANUAL: (Action.SEND, State.HOLDING_OWES),
+            Input.NONE: (Action.RELEASE, State.HOLDING_OWES),
+            Input.LATE_MODE: (Action.NOTHING, State.HOLDING),
+            Input.LOST: (Action.NOTHING, State.IDLE_OWES),
+            Input.RELEASED: (Action.NOTHING, State.IDLE_OWES),
+        },
+    }
+
+
+_CHOSEN = {"none": Input.NONE, "manual": Input.MANUAL, "autonomous": Input.AUTONOMOUS}

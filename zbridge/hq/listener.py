@@ -20,8 +20,9 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.hq.arrivals import Arrivals, Folding
+from zbridge.hq.bridge import Bridge
 from zbridge.hq.intent import Intent
-from zbridge.hq.operator import REPEAT_S, Bridge, Operator
+from zbridge.hq.operator import REPEAT_S, Operator
 from zbridge.hq.refusals import Teller
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan

@@ -1,102 +1,44 @@
-"""One HQ program's hand on the robot: carries out on the bus what its intent decides. Knows no protocol and no link."""
+"""Carries out on the bus what the intent of one HQ program decides: holds the lease for it, forwards its commands.
+
+Knows no protocol and no link. :class:`Intent` decides what is said to the robot; :class:`LeaseHolder` gets and keeps
+the lease; :class:`CommandQueue` keeps commands in order; the operator connects the three, and tells the program's
+people what was refused. The listener calls :meth:`Operator.command`, :meth:`Operator.tick` every :data:`REPEAT_S`
+while :attr:`Operator.active`, and :meth:`Operator.look` for news from ``control``.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
 import math
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections.abc import Callable
 
-import msgspec
-
-from zbridge.bus import Bus, Handle, Publisher
-from zbridge.control.proof import Signer
-from zbridge.errors import BusError, Code, NotReady, PayloadError, Refused, TooFast, Unsupported
-from zbridge.fleet import payload as payloads
+from zbridge.control.lease_client import LeaseClient
+from zbridge.control.lease_holder import LeaseHolder
+from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
+from zbridge.errors import Code, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Lease, Mode, Motor, Raw, Refusal
-from zbridge.fleet.topics import KeySpace, Topic
-from zbridge.fleet.view import RobotView
+from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
+from zbridge.fleet.topics import Topic
+from zbridge.hq.bridge import Bridge
+from zbridge.hq.command_queue import CommandQueue
 from zbridge.hq.intent import Action, Intent
 from zbridge.protocol.rate_limit import RateLimit
 
 log = logging.getLogger("zbridge.hq")
 
-ASK_S = 1.0
-"""Longest time a question about the lease waits for its answer."""
 REPEAT_S = 0.1
 """Seconds between repetitions of what a client set once."""
-WAITING = 64
-"""Commands of one client that may wait for the bus besides motion; one more is refused."""
 OPEN_HZ = 50.0
-"""Commands a second of one client that need no lease: they share the robot's queue with everybody's."""
-PUBLISHERS = 512
-"""Keys that the clients of a listener command at a time; the oldest makes room."""
+"""Commands a second of one client that need no lease: they share the robot's queue with those of all programs."""
 OURS_S = 1.0
-"""Seconds within which a refusal that bears no name is taken for that of a client's command."""
-
-
-class Bridge:
-    """What the clients of a listener share: publishers, questions, and tasks. ``spawn`` starts a task."""
-
-    def __init__(
-        self, bus: Bus, keys: KeySpace, view: RobotView, spawn: Callable[[Coroutine[Any, Any, None]], object]
-    ) -> None:
-        self.bus = bus
-        self.keys = keys
-        self.view = view
-        self.spawn = spawn
-        self._publishers: dict[str, Publisher] = {}
-
-    def __repr__(self) -> str:
-        return f"<Bridge to {self.keys.robot}>"
-
-    def put(self, topic: Topic, message: FleetMessage, signer: Signer | None = None) -> None:
-        """Put a command on the bus; one that needs the lease is signed."""
-        publisher = self._publishers.get(topic.path)
-        if publisher is None:
-            if len(self._publishers) >= PUBLISHERS:
-                self._publishers.pop(next(iter(self._publishers))).close()
-            publisher = self._publishers[topic.path] = self.bus.publisher(self.keys.key(topic.path), topic)
-        payload = payloads.encode(message)
-        publisher.put(payload, signer.command(publisher.key, payload) if signer is not None else None)
-
-    async def acquire(self, request: Acquire) -> Lease:
-        """Ask for the lease, in the name of the listener."""
-        name = request.who.rpartition(".")[0]
-        return await self._ask_lease(self.keys.key(topics.RPC_ACQUIRE(name).path), payloads.encode(request))
-
-    async def ask_lease(self, topic: Topic, signer: Signer) -> Lease:
-        """Renew or release a lease."""
-        key = self.keys.key(topic.path)
-        return await self._ask_lease(key, signer.question(key))
-
-    async def _ask_lease(self, key: str, payload: bytes) -> Lease:
-        """Ask one thing about the lease; where there is no answer, the answer is no, and says so."""
-        why, code = "no gateway answers", None
-        try:
-            for answer in await self.bus.ask(key, payload, timeout_s=ASK_S):
-                if answer.error is None:
-                    return payloads.decode(Lease, answer.payload)
-                if isinstance(answer.error, Refused):
-                    why, code = str(answer.error), answer.error.code
-        except (BusError, PayloadError) as error:
-            why = str(error)
-        return Lease(ok=False, reason=why, code=code)
-
-    def close(self) -> None:
-        """Give the keys up."""
-        for publisher in self._publishers.values():
-            publisher.close()
+"""Seconds within which a refusal without a name is taken for that of a client's command."""
 
 
 class Operator:
-    """What one client commands. ``tell`` says something to its people; who: its name on the bus, and its token's.
+    """The commands of one client, and its lease. ``tell`` shows a text to its people.
 
-    modes: the protocol whose robots are told the control mode. steers, hold: see
-    :class:`zbridge.protocol.plugin.HqSide`.
+    who: the client's name on the bus and its liveliness token. modes: the protocol whose robots are told the control
+    mode. steers, hold: see :class:`zbridge.protocol.plugin.HqSide`. clock: seconds.
     """
 
     def __init__(
@@ -119,28 +61,19 @@ class Operator:
         self._hold = hold
         self._tell = tell
         self._clock = clock
-        self._signer: Signer | None = None
-        self._light = False
+        request = Acquire(who=who, deadman_s=intent.deadman_s, alive=who)
+        client = LeaseClient(bridge.keys, request, who.rpartition(".")[0], concerns=self._concerns)
+        self._lease = LeaseHolder(bridge.bus, client, spawn=bridge.spawn, on_event=self._on_lease, clock=clock)
+        self._queue = CommandQueue(bridge, client, who=who, late=self._late)
         self._set: dict[str, tuple[Topic, FleetMessage]] = {}
         """What is in motion, by path."""
         self._pushed: dict[str, float] = {}
-        """When motion was last said of each path, whether it was carried out or not; neutral takes it out."""
-        self._queue: list[tuple[Topic, FleetMessage]] = []
-        self._writing = False
-        self._doubting = False
-        self._returning = 0
-        """Questions under way that give the robot back."""
-        self._returned = asyncio.Event()
-        self._returned.set()
-        self._closed = False
-        self._due = 0.0
-        self._seen: dict[tuple[str | None, str, str, str], int] = {}
+        """When motion of each path was last said, whether it was carried out or not; neutral removes the path."""
         self._allowance = RateLimit(OPEN_HZ)
         self._open: dict[str, float] = {}
-        """When commands were last given that need no lease, and so bear no name."""
-        self._handle: Handle | None = None
-        if bridge.view.control is not None:  # what was refused to a client of our name before us
-            self._new_refusals(bridge.view.control)
+        """When commands that need no lease were last sent; their refusals bear no name."""
+        if bridge.view.control is not None:  # what was refused to an earlier client of this name is no news
+            client.news.take(bridge.view.control)
 
     def __repr__(self) -> str:
         return f"<Operator {self.who} {self.intent!r}>"
@@ -181,64 +114,44 @@ class Operator:
         elif self._hold:
             for topic, message in tuple(self._set.values()):
                 intent.motion(now)
-                self._send(topic, message)
+                self._queue.send(topic, message)
         if intent.wants_release(now):
             self._release("unused")
-        elif intent.mode == "autonomous" and now >= self._due:
-            self._due = now + intent.lease_s / 3
-            self._doubt()
+            return
+        self._lease.client.renews = intent.mode == "autonomous"  # else motion and neutral renew it
+        self._lease.expire()
 
     def let_go(self, why: str) -> None:
-        """Give the robot back: whether the client still means what it said, nobody can tell."""
+        """Release the robot: the client may not mean any more what it said last."""
         if self.intent.held:
             self._release(why)
             self.intent.lost(why)
 
     def close(self) -> None:
-        """Give the robot back: the client is gone; idempotent."""
-        if not self._closed:
-            self._closed = True
-            if self.intent.held:
-                self._release("disconnected")
-            elif not self.intent.asking and not self._returning:
-                self._forget_token()
+        """Release the robot: the client is gone; idempotent."""
+        if self.intent.held:
+            self._release("disconnected")
+        self._lease.close()
 
     # What the robot's gateway says
 
     def look(self, control: Control) -> None:
-        """Take news from ``control``: whether the robot is still ours, and what was refused."""
-        if self._signer is not None and control.lease != self._signer.lease:
-            self._doubt()
-        elif control.holder == self.who and not (self.active or self._returning):
-            self._forget_token()  # the answer that granted it was lost; so ends that lease
-        for refusal in self._new_refusals(control):
-            self._refused(refusal)
+        """Take news from ``control``: whether the lease is still held, and what was refused."""
+        now = self._clock()
+        for refusal in self._lease.look(control):
+            lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
+            if refusal.command != "acquire" and (refusal.who is not None or lately):
+                if refusal.code == Code.NEUTRAL_FIRST:
+                    self.intent.refused("motion was refused")
+                self._tell(f"{refusal.command}: {refusal.reason}")
 
     def gateway_lost(self) -> None:
-        """Take note that the robot's gateway is gone, and every lease with it."""
+        """Record that the robot's gateway is gone, and every lease with it."""
         if self.active:
-            self._lose("the robot's gateway is gone")
+            self._lease.gateway_lost()
 
-    def _new_refusals(self, control: Control) -> list[Refusal]:
-        news, seen, now = [], {}, self._clock()
-        for refusal in control.refusals:
-            lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
-            if refusal.by is None and (refusal.who == self.who or refusal.who is None):
-                key = (refusal.who, refusal.command, refusal.code, refusal.reason)
-                if refusal.count != self._seen.get(key, 0) and (refusal.who is not None or lately):
-                    news.append(refusal)
-                seen[key] = refusal.count
-        self._seen = seen
-        return news
-
-    def _refused(self, refusal: Refusal) -> None:
-        if refusal.code == Code.LEASE_ENDED:
-            if self.intent.held:
-                self._doubt()
-        elif refusal.command != "acquire":
-            if refusal.code == Code.NEUTRAL_FIRST:
-                self.intent.refused("motion was refused")
-            self._tell(f"{refusal.command}: {refusal.reason}")
+    def _concerns(self, refusal: Refusal) -> bool:
+        return refusal.who is None or refusal.who == self.who
 
     # Motion
 
@@ -264,15 +177,6 @@ class Operator:
         self._set[topic.path] = (topic, message)
         self._follow(do, topic, message)
 
-    def _lit(self, message: Drive) -> Drive:
-        """Say how the light should be only where that is new: programs repeat it with every command."""
-        if message.light is None:
-            return message
-        if message.light == self._light:
-            return msgspec.structs.replace(message, light=None)
-        self._light = message.light
-        return message
-
     def _choose(self, message: Mode, now: float) -> None:
         if message.mode == "autonomous":
             self._require_robot()
@@ -281,22 +185,22 @@ class Operator:
                 raise Unsupported("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
         if do is Action.RELEASE:
-            self._tell_mode(self._put)  # what waits is given up, so it overtakes nothing
+            self._tell_mode(self._queue.put)  # what waits is dropped, so it overtakes nothing
             self._release("control mode none")
         elif do is Action.ACQUIRE:
-            self._bridge.spawn(self._acquire())
+            self._lease.want()
         elif do is Action.SEND:
-            self._tell_mode(self._send)
+            self._tell_mode(self._queue.send)
 
     def _follow(self, do: Action, topic: Topic, message: FleetMessage) -> None:
         match do:
             case Action.SEND:
-                self._send(topic, message)
+                self._queue.send(topic, message)
             case Action.WAIT:
-                self._wait(topic, message)
+                self._queue.wait(topic, message)
             case Action.ACQUIRE:
-                self._wait(topic, message)
-                self._bridge.spawn(self._acquire())
+                self._queue.wait(topic, message)
+                self._lease.want()
 
     def _require_robot(self) -> None:
         missing = self._bridge.view.missing
@@ -311,123 +215,35 @@ class Operator:
 
     # The lease
 
-    async def _acquire(self) -> None:
-        bridge = self._bridge
-        await self._returned.wait()  # or the robot would be held by ourselves
-        if self._handle is None:
-            self._handle = bridge.bus.announce(bridge.keys.alive(self.who))
-        request = Acquire(who=self.who, deadman_s=self.intent.deadman_s, alive=self.who)
-        lease = await bridge.acquire(request)
-        if not lease.ok or lease.lease is None or lease.token is None:
-            if self.intent.asking:
-                self._lose(lease.reason or "refused")
-        elif self._closed or not self.intent.asking:
-            await bridge.ask_lease(topics.RPC_RELEASE, Signer(lease))
+    def _on_lease(self, event: LeaseEvent) -> None:
+        if event.kind is LeaseEventKind.GRANTED:
+            self._begin(event.expires_in_s)
         else:
-            self._begin(Signer(lease), lease.expires_in_s)
-        if self._closed:
-            self._forget_token()
+            why = str(event.error)
+            self._drop(why)
+            self.intent.lost(why)
+            self._tell(f"not driving: {why}")
 
-    def _begin(self, signer: Signer, lease_s: float | None) -> None:
-        intent, now = self.intent, self._clock()
-        self._signer, self._light = signer, False
+    def _begin(self, lease_s: float | None) -> None:
+        intent = self.intent
         intent.granted(lease_s or intent.lease_s)
-        intent.expire(now)
-        waiting, self._queue = self._queue, []
-        self._tell_mode(self._send)
-        for topic, message in waiting:
-            if not self._overdue(message):
-                self._send(topic, message)
+        waiting = self._queue.begin()
+        self._tell_mode(self._queue.send)
+        self._queue.resume(waiting)
         log.info("%s drives %s", self.who, self._bridge.keys.robot)
 
-    def _doubt(self) -> None:
-        """Ask whether the lease is still ours, which also renews it."""
-        if not self._doubting and self._signer is not None:
-            self._doubting = True
-            self._bridge.spawn(self._verify(self._signer))
-
-    async def _verify(self, signer: Signer) -> None:
-        lease = await self._bridge.ask_lease(topics.RPC_RENEW, signer)
-        self._doubting = False
-        lost = not lease.ok and lease.code != Code.OUT_OF_ORDER  # somebody repeated the question, and came first
-        if lost and signer is self._signer:
-            self._lose(lease.reason or "the lease has ended")
-
-    def _lose(self, why: str) -> None:
-        self._drop(why)
-        self.intent.lost(why)
-        self._tell(f"not driving: {why}")
-
     def _release(self, why: str) -> None:
-        signer = self._signer
         self._drop(why)
         self.intent.released()
-        if signer is not None:
-            self._returning += 1
-            self._returned.clear()
-            self._bridge.spawn(self._give_back(signer))
-
-    async def _give_back(self, signer: Signer) -> None:
-        with contextlib.suppress(BusError):  # what was commanded before, goes before
-            await self._bridge.bus.flush()
-        await self._bridge.ask_lease(topics.RPC_RELEASE, signer)
-        self._returning -= 1
-        if not self._returning:
-            self._returned.set()
-        if self._closed:
-            self._forget_token()
+        self._lease.drop()
 
     def _drop(self, why: str) -> None:
         level = logging.INFO if self.intent.held else logging.DEBUG
         log.log(level, "%s does not drive %s: %s", self.who, self._bridge.keys.robot, why)
-        self._signer = None
         self._queue.clear()
         self._set.clear()
 
-    def _forget_token(self) -> None:
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            handle.close()
-
-    # The bus
-
-    def _send(self, topic: Topic, message: FleetMessage) -> None:
-        """Put a command on the bus, after those before it: they are numbered, and must not overtake each other."""
-        if self._writing or self._signer is None:
-            self._wait(topic, message)
-        else:
-            self._put(topic, message)
-
-    def _put(self, topic: Topic, message: FleetMessage) -> None:
-        assert self._signer is not None
-        if isinstance(message, Drive):
-            message = self._lit(message)
-        self._bridge.put(topic, message, self._signer)
-        if topic is not topics.CMD_DRIVE:  # goes by way of a thread
-            self._writing = True
-            self._bridge.spawn(self._written())
-
-    def _wait(self, topic: Topic, message: FleetMessage) -> None:
-        """Let a command wait; of motion the newest wins."""
-        if isinstance(message, Drive | Motor):
-            self._queue = [entry for entry in self._queue if entry[0].path != topic.path]
-        elif len(self._queue) >= WAITING:
-            raise NotReady(f"{WAITING} commands wait for the bus", Code.BUSY)
-        self._queue.append((topic, message))
-
-    async def _written(self) -> None:
-        try:
-            await self._bridge.bus.flush()
-        except BusError as error:
-            log.warning("%s: %s", self.who, error)
-        self._writing = False
+    def _late(self) -> bool:
+        """Return whether neutral must come before motion."""
         self.intent.expire(self._clock())
-        while self._queue and not self._writing and self._signer is not None:
-            topic, message = self._queue.pop(0)
-            if not self._overdue(message):
-                self._send(topic, message)
-
-    def _overdue(self, message: FleetMessage) -> bool:
-        """Tell whether this is motion that waited until neutral had to come first."""
-        neutral = isinstance(message, Drive | Motor) and not message.moving
-        return self.intent.held_back is not None and not neutral and not isinstance(message, Mode)
+        return self.intent.held_back is not None

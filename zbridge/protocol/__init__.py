@@ -1,4 +1,111 @@
-"""What the author of a protocol reads: plugin, session, outbox, negotiation, timers and limits. Sans-IO.
+"""What the author of a protocol imports, beside :mod:`zbridge.wire` (messages as bytes) and :mod:`zbridge.fleet`
+(messages on the bus). Sans-IO: knows no event loop, socket, clock, bus, and no robot in particular.
 
-Knows no transport, no bus and no robot in particular: bytes, messages and the time come in as arguments.
+=============== ===================================================================================================
+plugin          :class:`Protocol`: what an entry point names. :class:`Robot` and :class:`HqSide`: its two sides, with
+                :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`.
+                :class:`Simulation`, :class:`HqSimulation`: how its simulators are started.
+session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
+                with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP.
+session_table   :class:`ClientIds`: the ids that a robot gives its clients.
+outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait.
+negotiation     :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
+udp_probe       :class:`Probe`, :class:`Verdict`: whether datagrams get through.
+device_clock    :class:`DeviceClock`: when a device measured, by its own millisecond counter.
+rate_limit      :class:`RateLimit`: how often something may happen.
+exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
+codec           :class:`Codec`: the messages, for the conformance kit.
+kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
+odometry        :class:`Odometry`: from what the wheels have turned to a pose.
+bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
+errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message
+                can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
+                :class:`NotReady` or :class:`Malformed`, each with a :class:`Code`.
+address         :class:`Address`: where simulators listen.
+metrics         :class:`Metrics`, :class:`Count`: counters.
+=============== ===================================================================================================
 """
+
+from zbridge.address import Address
+from zbridge.errors import (
+    Code,
+    ConfigError,
+    EncodeError,
+    Malformed,
+    NotReady,
+    ProtocolError,
+    Refused,
+    Unsupported,
+)
+from zbridge.metrics import Count, Metrics
+from zbridge.protocol.bearings import BearingScan, Sectors
+from zbridge.protocol.codec import Codec
+from zbridge.protocol.device_clock import DeviceClock
+from zbridge.protocol.exchange import Exchange, ExchangeSession
+from zbridge.protocol.kinematics import Differential, Factors, Positive
+from zbridge.protocol.negotiation import agree, newest, parse_versions
+from zbridge.protocol.odometry import Odometry
+from zbridge.protocol.outbox import LIMIT, Outbox
+from zbridge.protocol.plugin import (
+    HqSide,
+    HqSimulation,
+    Outcome,
+    Protocol,
+    Robot,
+    Send,
+    Simulation,
+    Telemetry,
+    Translate,
+)
+from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
+from zbridge.protocol.session_table import ClientIds
+from zbridge.protocol.udp_probe import Probe, Verdict
+
+__all__ = [
+    "LIMIT",
+    "Address",
+    "BearingScan",
+    "ClientIds",
+    "Code",
+    "Codec",
+    "ConfigError",
+    "Count",
+    "Datagram",
+    "DeviceClock",
+    "Differential",
+    "EncodeError",
+    "Exchange",
+    "ExchangeSession",
+    "Factors",
+    "HqSide",
+    "HqSimulation",
+    "Limits",
+    "Malformed",
+    "Metrics",
+    "NotReady",
+    "Odometry",
+    "Outbox",
+    "Outcome",
+    "Positive",
+    "Probe",
+    "Protocol",
+    "ProtocolError",
+    "RateLimit",
+    "Refused",
+    "Robot",
+    "Role",
+    "Sectors",
+    "Send",
+    "Session",
+    "Simulation",
+    "State",
+    "Telemetry",
+    "Traffic",
+    "Translate",
+    "Unsupported",
+    "Verdict",
+    "agree",
+    "newest",
+    "parse_versions",
+]

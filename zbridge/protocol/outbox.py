@@ -1,9 +1,26 @@
-"""What a session still has to write: one frame at a time, spaced, the newest motion first. Sans-IO.
+"""What a session still has to write: one frame at a time, with a gap between two writes. Sans-IO.
 
-Fragile peers take one read as one packet, so a frame is handed out only when ``gap_s`` has passed since
-the one before. Frames that come once wait in a bounded queue. Frames that stand (a drive command that is
-repeated while the robot moves, a stop that is repeated for a second) have a named slot each, and a newer
-one replaces what stands there.
+Theory of operation
+-------------------
+A session puts frames in. The driver takes one with ``take(now)``, writes it, reports the write with ``written(now)``
+and comes back at ``deadline()``. Fragile peers take one read as one packet, so ``take`` gives nothing for ``gap_s``
+after a write.
+
+Four places for frames. ``take`` looks at them in this order:
+
+    exempt   queue of the handshake (``put_exempt``). The only one that is served during a silence (``quiet``).
+    urgent   queue of the stop (``set`` with ``urgent``). Each group leaves whole and in its order, whatever replaces
+             its slot meanwhile. The same group is not queued twice.
+    slots    one named group of frames each (``set``): the newest motion, the newest scan. A new group replaces the one
+             before it, sent or not. Sent when due; with a period, again after each period, until ``until``.
+    queue    frames that are sent once (``put``).
+
+Fairness: the slot that has been due longest goes first; slots and queue take turns frame by frame, so that neither
+a stream of motion nor a full queue starves the other. A group that replaces one of the same length goes on at the
+position of the old one: if a group of motors is replaced faster than it is written, each motor still has its turn.
+
+Bounds: queue and exempt refuse a frame beyond ``limit``; urgent keeps the newest ``URGENT`` frames; a slot holds one
+group, and a protocol names a fixed number of slots.
 """
 
 from __future__ import annotations
@@ -14,13 +31,13 @@ from collections import deque
 from zbridge.errors import Code, NotReady
 
 URGENT = 256
-"""Frames of a stop that may wait: one for each motor there can be."""
+"""Frames of stops that may wait: one for each motor that a robot can have."""
 LIMIT = 64
 """Frames that may wait; one more is refused."""
 
 
-class _Standing:
-    """The frames of one slot: sent as a group, then again every ``period_s`` until ``until``."""
+class _Group:
+    """The frames of one slot: sent one after the other, then again every ``period_s`` until ``until``."""
 
     __slots__ = ("due", "frames", "period_s", "position", "until")
 
@@ -32,6 +49,7 @@ class _Standing:
         self.until = until
 
     def step(self, now: float) -> bytes:
+        """Give the next frame of the group."""
         frame = self.frames[self.position]
         self.position += 1
         if self.position == len(self.frames):
@@ -41,6 +59,7 @@ class _Standing:
 
     @property
     def over(self) -> bool:
+        """Whether the group is sent whole and not due again."""
         return self.position == 0 and (self.due > self.until or self.due == math.inf)
 
 
@@ -52,47 +71,47 @@ class Outbox:
         self._limit = limit
         self._queue: deque[bytes] = deque()
         self._urgent: deque[bytes] = deque(maxlen=URGENT)
-        self._standing: dict[str, _Standing] = {}
+        self._slots: dict[str, _Group] = {}
         self._free_at = -math.inf
         self._turn_of_queue = False
         self._exempt: deque[bytes] = deque()
         self._quiet_until = -math.inf
 
     def __repr__(self) -> str:
-        return f"<Outbox {len(self._queue)} waiting, standing {sorted(self._standing)}>"
+        return f"<Outbox {len(self._queue)} waiting, slots {sorted(self._slots)}>"
 
     def __len__(self) -> int:
         return len(self._exempt) + len(self._urgent) + len(self._queue)
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits and nothing stands."""
-        return not (self._standing or self._queue or self._urgent or self._exempt)
+        """Whether all queues and slots are empty."""
+        return not (self._slots or self._queue or self._urgent or self._exempt)
 
     def put(self, frame: bytes) -> None:
-        """Queue a frame that is sent once; raise Refused when too many wait."""
+        """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
         if len(self._queue) >= self._limit:
             raise NotReady(f"{self._limit} packets wait for the robot", Code.BUSY)
         self._queue.append(frame)
 
     def quiet(self, until: float) -> None:
-        """Give nothing out before ``until`` but what :meth:`put_exempt` was given."""
+        """Begin a silence: before ``until`` only exempt frames leave."""
         self._quiet_until = until
 
     def put_exempt(self, frame: bytes) -> None:
-        """Queue a frame that goes first, and through a silence; raise Refused when too many wait."""
+        """Queue a frame that leaves first, and during a silence; raise Refused when ``limit`` of them wait."""
         if len(self._exempt) >= self._limit:
             raise NotReady(f"{self._limit} packets of the handshake wait", Code.BUSY)
         self._exempt.append(frame)
 
     def withdraw(self, frame: bytes) -> bool:
-        """Take back a frame that :meth:`put_exempt` was given; False where it was given out already."""
+        """Take back an exempt frame (this object); False if it has left."""
         waiting = [kept for kept in self._exempt if kept is not frame]
         found = len(waiting) < len(self._exempt)
         self._exempt = deque(waiting)
         return found
 
-    def stand(
+    def set(
         self,
         slot: str,
         frames: tuple[bytes, ...],
@@ -102,38 +121,38 @@ class Outbox:
         until: float = math.inf,
         urgent: bool = False,
     ) -> None:
-        """Let ``frames`` stand in ``slot``: sent as soon as may be, then every ``period_s`` until ``until``.
+        """Put a group of frames into ``slot``, in place of the one there.
 
-        What stood there is forgotten, sent or not; of two groups of the same length the newer goes on where
-        the older was, so that every place of the group has its turn. An urgent group goes before all others, whole and
-        in its order, and once whatever replaces it; with ``until`` not after ``now`` it goes just once.
+        The group is due at ``now``, then every ``period_s`` until ``until``; without a period it is sent once.
+        ``urgent``: queue it before all slots, to leave whole; the slot holds its repetitions, none if ``until`` is not
+        after ``now``.
         """
-        old = self._standing.get(slot)
-        new = self._standing[slot] = _Standing(frames, now, period_s, until)
+        old = self._slots.get(slot)
+        new = self._slots[slot] = _Group(frames, now, period_s, until)
         if urgent:
             if not self._hurries(frames):
                 self._urgent.extend(frames)
             new.due = now + period_s
             if new.over:
-                del self._standing[slot]
+                del self._slots[slot]
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
 
     def clear(self, slot: str) -> None:
-        """Forget what stands in ``slot``."""
-        self._standing.pop(slot, None)
+        """Empty ``slot``."""
+        self._slots.pop(slot, None)
 
     def unqueue(self, frame: bytes) -> None:
-        """Forget a frame that was to be sent once, as far as it still waits."""
+        """Remove a frame from the queue, as often as it is there."""
         while frame in self._queue:
             self._queue.remove(frame)
 
-    def stands(self, slot: str) -> bool:
-        """Tell whether anything stands in ``slot``."""
-        return slot in self._standing
+    def is_set(self, slot: str) -> bool:
+        """Tell whether ``slot`` holds a group."""
+        return slot in self._slots
 
     def take(self, now: float) -> bytes | None:
-        """Take the frame to write now, None when there is none or the gap has not passed."""
+        """Take the frame to write now; None: there is none, or the gap has not passed."""
         if now < self._free_at:
             return None
         if self._exempt:
@@ -147,7 +166,7 @@ class Outbox:
         return frame
 
     def written(self, now: float) -> None:
-        """Take note that the frame taken last was written only now: the gap begins here."""
+        """Start the gap now: the frame taken last is written."""
         self._free_at = max(self._free_at, now + self.gap_s)
 
     def _next(self, now: float) -> bytes | None:
@@ -155,15 +174,15 @@ class Outbox:
         if slot is None:
             self._turn_of_queue = False
             return self._queue.popleft() if self._queue else None
-        standing = self._standing[slot]
-        frame = standing.step(now)
-        if standing.over:
-            del self._standing[slot]
+        group = self._slots[slot]
+        frame = group.step(now)
+        if group.over:
+            del self._slots[slot]
         self._turn_of_queue = True
         return frame
 
     def deadline(self) -> float | None:
-        """Tell when :meth:`take` will have something, None when nothing waits or stands."""
+        """Give the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
         if self.idle:
             return None
         if self._exempt:
@@ -171,23 +190,23 @@ class Outbox:
         free_at = max(self._free_at, self._quiet_until)
         if self._urgent or self._queue:
             return free_at
-        return max(free_at, min(standing.due for standing in self._standing.values()))
+        return max(free_at, min(group.due for group in self._slots.values()))
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
-        """Tell whether an urgent group still waits, whole and in its order."""
+        """Tell whether a group still waits among the urgent frames, whole and in its order."""
         if len(group) == 1:
             return group[0] in self._urgent
         urgent = tuple(self._urgent)
         return any(urgent[start : start + len(group)] == group for start in range(len(urgent) - len(group) + 1))
 
     def _due_slot(self, now: float) -> str | None:
-        """Pick a due slot; slots take turns with the queue."""
-        if not self._standing:
+        """Choose the slot that has been due longest; None: none is due, or it is the queue's turn."""
+        if not self._slots:
             return None
-        if len(self._standing) == 1 and not self._queue:  # of a robot that is shown to many, nearly always
-            slot, standing = next(iter(self._standing.items()))
-            return slot if standing.due <= now else None
-        due = [slot for slot, standing in self._standing.items() if standing.due <= now]
+        if len(self._slots) == 1 and not self._queue:  # nearly always, for an HQ program that is shown a robot
+            slot, group = next(iter(self._slots.items()))
+            return slot if group.due <= now else None
+        due = [slot for slot, group in self._slots.items() if group.due <= now]
         if not due or (self._queue and self._turn_of_queue):
             return None
-        return due[0] if len(due) == 1 else min(due, key=lambda slot: self._standing[slot].due)
+        return due[0] if len(due) == 1 else min(due, key=lambda slot: self._slots[slot].due)

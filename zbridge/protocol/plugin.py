@@ -1,6 +1,6 @@
-"""What a protocol contributes to put its robots on the bus, and how the installed protocols are found.
+"""What a protocol contributes, and how the installed protocols are found. Sans-IO.
 
-A package adds one by an entry point in the group ``zbridge.protocols`` that names its :class:`Protocol`.
+A package adds a protocol by an entry point in the group ``zbridge.protocols`` that names its :class:`Protocol`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from importlib.metadata import entry_points
 from typing import Any, ClassVar
 
 import msgspec
@@ -19,76 +18,77 @@ from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
 
 GROUP = "zbridge.protocols"
 
 Telemetry = tuple[Topic, FleetMessage]
 Translate = Callable[[Any, int], Iterable[Telemetry]]
-"""``translate(message, stamp_ns)``; raises ProtocolError where a message has no meaning."""
+"""``translate(message, stamp_ns)``: one message to telemetry; raises ProtocolError for a message without meaning."""
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What became of a command: telemetry it gives rise to, and what of it the robot cannot do."""
+    """What a command led to: telemetry to publish, and what of the command the robot cannot do, in words."""
 
     telemetry: tuple[Telemetry, ...] = ()
     left_out: str | None = None
 
 
 class Robot(ABC):
-    """One robot as its protocol sees it: sessions of its links, and translation both ways. Sans-IO.
+    """One robot as its protocol sees it: makes the sessions of its links, and translates both ways. Sans-IO.
 
-    Commands go to the sessions this object made; it is told the time and never asks for it.
+    Commands are put into the outbox of the sessions that this object made. The time is an argument.
     """
 
     dialect: ClassVar[str | None] = None
     link_names: tuple[str, ...]
-    """One name for each configured address; the first link is the one that drives."""
+    """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 
     @abstractmethod
-    def session(self, link: int, peer: str) -> Session[Any]:
-        """Make the session for a new connection of one link."""
+    def session(self, link: str, peer: str) -> Session[Any]:
+        """Make the session for a new connection of the link of this name; ``peer``: its address, for logs."""
 
     @property
     @abstractmethod
     def driving(self) -> Session[Any] | None:
-        """The session that takes drive commands, None before the first connection."""
+        """The session that takes drive commands; None before the first connection."""
 
     @abstractmethod
     def translator(self, kind: type) -> Translate:
-        """Give the function that translates what the robot sends in messages of one class."""
+        """Give the function that translates messages of one class; asked once for each class."""
 
     def telemetry(self, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
-        """Translate what the robot sent; raise ProtocolError where it has no meaning."""
+        """Translate one message of the robot; raise ProtocolError if it has no meaning."""
         return self.translator(type(message))(message, stamp_ns)
 
     @abstractmethod
     def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
-        """Send a command to the robot; raise Refused with the reason where it cannot take it."""
+        """Send a command to the robot; raise Refused with the reason if the robot cannot take it."""
 
     @abstractmethod
     def stop(self, now: float, until: float) -> None:
-        """Send the robot its stop before anything else, and repeat it until ``until``; once if that is ``now``."""
+        """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
     @abstractmethod
     def ask(self, topic: Topic) -> None:
-        """Ask the robot for what it publishes on ``topic``; raise Refused where it cannot be asked."""
+        """Ask the robot for what it publishes on ``topic``; raise Refused if it cannot be asked."""
 
     def known(self, topic: Topic) -> FleetMessage | None:
-        """Give what is answered at once to who asks for ``topic``; None where the robot is to be asked."""
+        """Give the answer to a query for ``topic`` that is known already; None: :meth:`ask` the robot."""
         return None
 
     @property
     def on_demand(self) -> tuple[Topic, ...]:
-        """What the robot publishes only while somebody listens; :meth:`listened` is told."""
+        """Topics that the robot measures only while somebody listens; :meth:`listened` is told when."""
         return ()
 
     def listened(self, topic: Topic, on: bool) -> None:
-        """Take note that the first listener of an on-demand topic came, or the last one went; raise Refused."""
+        """Switch an on-demand topic: the first listener came (``on``), or the last one went. Raise Refused."""
         raise Unsupported(f"{topic.path} needs no listener")
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Begin with a connection that was just established; give what there is to show at once."""
+        """Start with a connection that was just established; give the telemetry that is known at once."""
         return ()
 
     @property
@@ -99,78 +99,78 @@ class Robot(ABC):
 
 
 Send = Callable[[Any, float], object]
-"""``send(session, now)``: puts what was encoded into the outbox of one client's session; raises Refused."""
+"""``send(session, now)``: puts encoded frames into the outbox of one client's session; raises Refused."""
 
 
 class HqSide(ABC):
-    """What one listener shows its HQ programs of a robot, and how it understands them. Sans-IO.
+    """Shows a robot to the HQ programs (clients) of one listener, and translates what they send. Sans-IO.
 
-    Made with the listener's options and the :class:`RobotView` that all listeners of a process share. What goes to
-    many clients is encoded once: :meth:`show` does it, or does it when the first client needs it.
+    Made with the listener's options and the :class:`RobotView` that all listeners of a process share. :meth:`show`
+    encodes once what goes to many clients.
     """
 
     name: ClassVar[str]
-    """The protocol's name: a robot of the same one is passed on whole."""
+    """The protocol's name. Clients get the raw messages of a robot of the same protocol too."""
     deadman_s: ClassVar[float]
-    """Seconds after which motion of a silent client ends."""
+    """Seconds after which the motion of a silent client ends."""
     modes: ClassVar[bool] = False
-    """Whether a client says first that it wants to drive (:class:`Mode`), and motion before that is refused."""
+    """Whether a client must announce by :class:`Mode` that it drives; motion before that is refused."""
     steers: ClassVar[bool] = False
-    """Whether a turn without motion only sets wheels, and so is neutral."""
+    """Whether a turn with ``forward`` 0 only sets the wheels, and so is neutral."""
     hold: bool = False
-    """Whether what a client set once is repeated while its link lives."""
+    """Whether the last command of a client is repeated while its link lives."""
     datagrams: bool = False
-    """Whether clients are heard by datagrams too."""
+    """Whether clients send datagrams too."""
     numbers: range = range(1, 1_000_000)
-    """The numbers that clients are given."""
+    """The ids of clients."""
     quiet_s: float = 0.0
-    """Seconds before a number is given again."""
+    """Seconds before a released id is given again."""
     follows: tuple[str, ...]
-    """The paths (``pose``, ``sensor/*``) whose messages :meth:`show` is given."""
+    """Paths (``pose``, ``sensor/*``) whose messages :meth:`show` gets."""
 
     @abstractmethod
     def session(self, number: int, bounds: Limits) -> Session[Any]:
-        """Make the session of a new client; of ``bounds`` the protocol sets what is its own."""
+        """Make the session of a new client; replace in ``bounds`` what the protocol itself fixes."""
 
     @abstractmethod
     def begin(self, session: Any, now: float) -> None:
-        """Send a client whose session was just established what it is to know first."""
+        """Send a client its first messages: its session was just established."""
 
     @abstractmethod
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
-        """Translate what is new of the robot; None where no client is to be told."""
+        """Translate what is new of the robot; None: no client is told."""
 
     @abstractmethod
     def take(self, session: Any, message: Any) -> Iterable[Telemetry]:
-        """Translate what a client sent to commands and queries; raise ProtocolError where it has no meaning."""
+        """Translate a client's message to commands and queries; raise ProtocolError if it has no meaning."""
 
     def answer(self, session: Any, topic: Topic, message: FleetMessage | None, now: float) -> None:
-        """Answer a client's question; None where the robot gave no answer. Raises Refused, EncodeError."""
+        """Answer a client's query; ``message`` None: the robot gave no answer. Raise Refused, EncodeError."""
         raise Unsupported(f"nothing can be asked for {topic.path}")
 
     def tell(self, session: Any, text: str, now: float) -> None:
-        """Say something to the people at a client, where the protocol can."""
+        """Show a text to the people at a client, if the protocol can."""
         return
 
     def presence(self, there: bool) -> Send | None:
-        """Show that the robot is there again, or is lost; None where clients are shown nothing of that."""
+        """Show that the robot is there, or is lost; None: no client is told."""
         return None
 
     def deadline(self, session: Any) -> float:
-        """Tell when :meth:`expire` wants to be called because of what a client said; ``inf`` for never."""
+        """Give the time of the next :meth:`expire` for a client; ``inf``: never."""
         return math.inf
 
     def expire(self, session: Any, now: float) -> Iterable[Telemetry]:
-        """Translate what a client said and what waited for more of it."""
+        """Translate what a client sent earlier and what waited for a deadline."""
         return ()
 
     def wanted(self) -> tuple[Topic, ...]:
-        """List what clients want besides ``follows``, only now and then."""
+        """List the topics that clients want now besides ``follows``."""
         return ()
 
 
 class HqSimulation(msgspec.Struct, frozen=True):
-    """How a simulated HQ program is started: where it connects, and what it is. It is as fragile as deployed ones."""
+    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects."""
 
     address: Address
     version: str | None = None
@@ -179,10 +179,10 @@ class HqSimulation(msgspec.Struct, frozen=True):
 
 
 class Simulation(msgspec.Struct, frozen=True):
-    """How a simulated robot is started: one address for each of its links.
+    """How a simulated robot is started. ``addresses``: where it listens, one for each link, in the links' order.
 
-    ``ready`` is called with the addresses it listens on. What a protocol does not have (versions, dialects,
-    datagrams) it refuses with ConfigError.
+    ``ready`` is called with the addresses that are bound. A protocol raises ConfigError for what it does not have
+    (versions, dialects, datagrams, a second link).
     """
 
     addresses: tuple[Address, ...]
@@ -199,37 +199,45 @@ class _NoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Protocol(msgspec.Struct, frozen=True):
-    """A protocol: its name, what it can be told in a configuration, and what it makes."""
+    """A protocol: its name, its options, and how its sides and simulators are made."""
 
     name: str
     summary: str
     options: type[msgspec.Struct]
+    """``[device.options]``."""
     links: int
+    """Most links of a robot."""
     robot: Callable[[Any, int, Metrics], Robot]
-    """``robot(options, links, metrics)``: the device side for a robot with so many links."""
+    """``robot(options, links, metrics)``: the device side of a robot with so many links (1 to ``Protocol.links``)."""
     simulate: Callable[[Simulation], Coroutine[Any, Any, None]]
-    """Be a robot of this protocol until cancelled."""
+    """Run a simulated robot until cancelled."""
     simulated: dict[str, Any] = {}
-    """The options that fit the simulated robot, where the default ones do not."""
+    """Options that fit the simulated robot; empty: the defaults do."""
     hq: Callable[[Any, RobotView, Metrics], HqSide] | None = None
-    """``hq(options, view, metrics)``: what a listener shows HQ programs; None: the protocol has no listeners."""
+    """``hq(options, view, metrics)``: the HQ side; None: the protocol has no listeners."""
     hq_options: type[msgspec.Struct] = _NoOptions
-    """What a listener can be told in a configuration."""
+    """``[hq.options]``."""
     simulate_hq: Callable[[HqSimulation], Coroutine[Any, Any, None]] | None = None
-    """Be an HQ program of this protocol until cancelled, or until it dies."""
+    """Run a simulated HQ program until cancelled, or until it gives up."""
     template: str = ""
-    """The commented ``[device]`` table of a configuration, ``[device.options]`` with it."""
+    """The commented ``[device]`` and ``[device.options]`` tables of a configuration."""
+    codecs: tuple[Codec, ...] = ()
+    """The messages, for the conformance kit."""
     hq_template: str = ""
-    """What a commented ``[[hq]]`` table says of this protocol: ``protocol``, ``listen`` and ``[hq.options]``."""
+    """The lines of a commented ``[[hq]]`` table: ``protocol``, ``listen`` and ``[hq.options]``."""
 
 
 def protocol_names() -> tuple[str, ...]:
     """List the installed protocols."""
+    from importlib.metadata import entry_points  # here: it loads sockets and threads
+
     return tuple(sorted(point.name for point in entry_points(group=GROUP)))
 
 
 def find_protocol(name: str) -> Protocol:
-    """Find an installed protocol; raise ConfigError naming the ones there are."""
+    """Find an installed protocol; raise ConfigError that lists the installed ones."""
+    from importlib.metadata import entry_points
+
     for point in entry_points(group=GROUP, name=name):
         protocol = point.load()
         if isinstance(protocol, Protocol):

@@ -1,9 +1,18 @@
 """One conversation with a peer, in either role: bytes in, messages out, frames to write, timers. Sans-IO.
 
-A driver (:mod:`zbridge.robot.device`, a simulator, a test) calls ``open`` when the transport is up, ``receive``
-with what was read, ``lost`` when the transport is gone; after each call it writes ``outgoing(now)`` until that
-is None, and calls ``expire(now)`` at ``deadline()``. A protocol contributes the framing function, the
-decoding of a frame, the encoding of a message, and its handshake.
+Theory of operation
+-------------------
+The state of a session is an entry of the table in :mod:`zbridge.protocol.session_states`; ``_on`` executes it.
+
+A driver (a conversation over a link, a simulator, a test) calls ``open`` when the transport is up, ``receive`` with the
+bytes that were read and ``lost`` when the transport is gone. After each call it writes ``outgoing(now)`` until that is
+None, and calls ``expire(now)`` at ``deadline()``.
+
+A protocol contributes the framing function, ``decode``, ``encode`` and the steps of its handshake: ``opened`` takes the
+first one, ``accept`` those that answer the peer, ``establish`` ends it.
+
+``receive`` guarantees: whatever the bytes, it raises nothing; a frame with a malformed body is counted and skipped; a
+frame that cannot be one, too many frames, or an answer that cannot be sent end the session.
 """
 
 from __future__ import annotations
@@ -13,7 +22,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from enum import Enum
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
@@ -21,6 +30,11 @@ from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.messages import SessionEntry
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
+from zbridge.protocol.session_states import State as State
+from zbridge.protocol.traffic import Datagram as Datagram
+from zbridge.protocol.traffic import Limits as Limits
+from zbridge.protocol.traffic import Traffic as Traffic
 from zbridge.wire.frames import FrameBuffer, FrameEnd
 
 M = TypeVar("M")
@@ -29,73 +43,31 @@ Tap = Callable[[str, bytes], None]
 """``tap("in" or "out", frame)``: is shown every frame while it is set."""
 
 LINGER_S = 0.5
-"""Longest time a closing session waits for its last frames to be written."""
+"""Seconds that a closing session waits for its last frames to be written."""
 DOUBTS = 2
-"""Doubts about a connection with which its peer is not set in motion."""
+"""So many doubts about a connection forbid motion; one alone may be an accident."""
 
 
 class Role(Enum):
-    """Which side of a legacy protocol we play."""
+    """The side of a legacy protocol that we play."""
 
     HQ = "hq"
     ROBOT = "robot"
 
 
-class State(Enum):
-    """Where a session stands; it only ever moves down this list."""
-
-    CONNECTING = "connecting"
-    HANDSHAKING = "handshaking"
-    ESTABLISHED = "established"
-    CLOSING = "closing"
-    CLOSED = "closed"
-
-
-_CLOSING, _CLOSED = State.CLOSING, State.CLOSED
-"""As plain names: every message asks several times, and looking a member up in its class is slow in Python 3.11."""
-
-
-class Limits(msgspec.Struct, frozen=True):
-    """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes.
-
-    rate_hz: frames a second that the peer may send, a second's worth at once; one more ends the session.
-    """
-
-    frame_bytes: int
-    handshake_s: float
-    gap_s: float = 0.0
-    rate_hz: float = math.inf
-
-
-class Datagram(bytes):
-    """A frame that goes by datagram; every other frame goes by the stream."""
-
-
-class Traffic(msgspec.Struct):
-    """What one session has carried, and what of it was not usable."""
-
-    frames_in: int = 0
-    frames_out: int = 0
-    bytes_in: int = 0
-    bytes_out: int = 0
-    malformed: int = 0
-    foreign: int = 0
-    """Datagrams that came from elsewhere."""
-    dropped: int = 0
-    """Frames that found no place in the queue."""
-    refused: int = 0
-    """Commands of the peer that were not carried out."""
+_ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
+"""Every message is compared with these; a lookup in the class is slow in Python 3.11."""
 
 
 class Session(ABC, Generic[M]):
-    """The part of a conversation that all protocols share."""
+    """One conversation; a protocol subclasses it once for each role it plays."""
 
     role: Role
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
-    """The message classes a session keeps for itself after the handshake too."""
+    """Message classes that go to ``accept`` after the handshake too."""
     drops_source = False
-    """Set by a protocol where what datagrams came from turns out not to be the peer; the driver obeys and clears it."""
+    """Set by a protocol when the source of datagrams is not the peer; the driver forgets the source and clears it."""
 
     def __init__(self, limits: Limits, *, name: str = "", peer: str = "") -> None:
         self.limits = limits
@@ -104,9 +76,9 @@ class Session(ABC, Generic[M]):
         self.state = State.CONNECTING
         self.reason: str | None = None
         self.busy: str | None = None
-        """Why the peer takes no commands for now, although the session is established."""
+        """Why the peer takes no commands now although the session is established; None: it takes them."""
         self.doubts: tuple[str, ...] = ()
-        """Signs that the connection does not carry what is said on it."""
+        """Signs that the connection loses or alters what is sent on it."""
         self.version: str | None = None
         self.features: tuple[str, ...] = ()
         self.transport = "tcp"
@@ -138,50 +110,42 @@ class Session(ABC, Generic[M]):
 
     @abstractmethod
     def accept(self, message: M, now: float) -> bool:
-        """Take a message of the handshake, or of a class in ``handled``; False keeps it for the session itself."""
+        """Handle a message of the handshake, or of a class in ``handled``; True hands it on to the translator."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is no peer's source yet is this session's."""
+        """True: this datagram is from the peer. Asked for a port of the peer's host that is nobody's source yet."""
         return False
 
     def rivalled(self, now: float) -> None:
-        """Take note that another source, or session, claims what this one does: its peer has no source any more."""
+        """React to a second source, or session, with the same claim; the peer has no source of datagrams any more."""
 
     def stray(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed; raise Refused with what the peer is to be told."""
+        """Look at a datagram of the peer's host that nobody claimed; raise Refused to tell the peer why."""
 
     def timers(self) -> float:
-        """Tell when :meth:`on_timer` wants to be called next; ``inf`` for never."""
+        """Give the time of the next :meth:`on_timer`; ``inf``: never."""
         return math.inf
 
     def on_timer(self, now: float) -> None:
-        """Let a protocol's own timers that are due take effect."""
+        """Run the protocol's own timers that are due."""
 
     def overdue(self) -> str:
-        """Say why a handshake that was never finished probably was not."""
+        """Give the reason for a handshake that was not finished in time."""
         return f"no handshake within {self.limits.handshake_s:g} s"
 
     # What a driver calls
 
     def open(self, now: float) -> None:
-        """Begin: the transport is up. A session that was ended before stays so."""
-        if self.state is not State.CONNECTING:
-            return
-        self.state = State.HANDSHAKING
-        self._limit_at = now + self.limits.handshake_s
-        self.opened(now)
+        """Begin: the transport is up. A session that has ended stays so."""
+        self._on(SessionEvent.OPEN, now=now)
 
     def receive(self, data: bytes, now: float) -> list[M]:
-        """Take bytes in any cut; return the messages for the translator.
-
-        A frame whose body is malformed is counted and skipped: the stream is still in step. A frame that
-        cannot be one ends the session, after the messages before it.
-        """
+        """Take bytes in any cut; give the messages for the translator, also those before a broken frame."""
         messages: list[M] = []
         if self.over:
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
-        open_to_all = self.state is State.ESTABLISHED
+        established = self.state is _ESTABLISHED
         traffic.bytes_in += len(data)
         frames, allowed = 0, self._allowance.fill(now)
         try:
@@ -194,19 +158,18 @@ class Session(ABC, Generic[M]):
                     tap("in", frame)
                 try:
                     message = decode(frame)
-                    if open_to_all and type(message) not in handled:
+                    if established and type(message) not in handled:
                         messages.append(message)
                         continue
                     if self.accept(message, now):
                         messages.append(message)
-                    if self.over:
-                        break
-                    open_to_all = self.state is State.ESTABLISHED
                 except ProtocolError as error:
                     self.malformed(str(error))
                 except (EncodeError, Refused) as error:
                     self.fail(f"no answer possible: {error}")
+                if self.over:
                     break
+                established = self.state is _ESTABLISHED
         except ProtocolError as error:
             self.malformed(str(error))
             self.fail(f"broken stream: {error}")
@@ -215,10 +178,7 @@ class Session(ABC, Generic[M]):
         return messages
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[M]:
-        """Take one datagram, which is one frame; return its message for the translator.
-
-        A datagram that is no frame is counted and changes nothing else.
-        """
+        """Take one datagram, which is one frame; give its message for the translator."""
         if self.over:
             return []
         if not self._allowance.take(now):
@@ -242,14 +202,14 @@ class Session(ABC, Generic[M]):
         return []
 
     def accept_datagram(self, message: M, now: float) -> bool:
-        """Take a message that came by datagram; False keeps it for the session itself."""
+        """Handle a message that came by datagram; True hands it on to the translator."""
         return self.accept(message, now)
 
     def _flooded(self) -> None:
         self.fail(f"flood: more than {self.limits.rate_hz:g} messages a second")
 
     def malformed(self, what: str) -> None:
-        """Count one message of the peer that could not be used."""
+        """Count a message of the peer that is malformed; ``what`` says how."""
         self.traffic.malformed += 1
         self.last_malformed = what
 
@@ -264,13 +224,13 @@ class Session(ABC, Generic[M]):
             if self.tap is not None:
                 self.tap("out", frame)
         elif self.state is _CLOSING and not self.outbox:
-            self.state = _CLOSED
+            self._on(SessionEvent.WRITTEN)
         return frame
 
     def deadline(self, *, writing: bool = True) -> float | None:
-        """Tell when :meth:`expire` and :meth:`outgoing` want to be called next.
+        """Give the time of the next :meth:`expire` and :meth:`outgoing`; None: never.
 
-        ``writing`` False leaves out what only waits to be written: the link takes nothing now.
+        ``writing`` False leaves out the frames that wait: the link takes nothing now.
         """
         if self.state is _CLOSED:
             return None
@@ -280,60 +240,57 @@ class Session(ABC, Generic[M]):
         return None if earliest == math.inf else earliest
 
     def expire(self, now: float) -> None:
-        """Let the timers that are due take effect."""
+        """Run the timers that are due."""
         if not self.over and now >= self.timers():
             self.on_timer(now)
-        if now < self._limit_at:
-            return
-        self._limit_at = math.inf
-        if self.state is State.HANDSHAKING:
-            self.fail(self.overdue())
-        elif self.state is State.CLOSING:
-            self.state = State.CLOSED
+        if now >= self._limit_at:
+            self._limit_at = math.inf
+            self._on(SessionEvent.OVERDUE, self.overdue())
 
     def close(self, reason: str, now: float) -> None:
         """End the conversation from our side once the frames that wait are written."""
-        if not self.over:
-            self.state, self.reason, self.busy, self.doubts = State.CLOSING, reason, None, ()
-            self._limit_at = now + LINGER_S
+        self._on(SessionEvent.CLOSE, reason, now)
 
     def lost(self, reason: str) -> None:
-        """Take note that the transport is gone; the first reason stands."""
+        """End the conversation: the transport is gone. The first reason is kept."""
         self.fail(reason)
 
     def fail(self, reason: str) -> None:
         """End the conversation at once."""
-        if self.state is not State.CLOSED:
-            self.reason = self.reason or reason
-            self.state, self.busy, self.doubts = State.CLOSED, None, ()
+        self._on(SessionEvent.LOST, reason)
 
     # What a protocol's own code calls
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to be expected of this session."""
+        """Whether the session is closing or closed."""
         return self.state is _CLOSED or self.state is _CLOSING
 
     @property
     def doubtful(self) -> str | None:
-        """Why the peer is not to be set in motion on this connection; one doubt alone is no reason."""
+        """Why the peer must not be moved by this connection: ``DOUBTS`` doubts or more; else None."""
         return f"connection in doubt: {'; '.join(self.doubts)}" if len(self.doubts) >= DOUBTS else None
 
     def establish(self, version: str, features: tuple[str, ...]) -> None:
         """End the handshake with what was agreed."""
-        self.state, self.version, self.features = State.ESTABLISHED, version, features
+        if not self.over:
+            self.version, self.features = version, features
+            self._on(SessionEvent.AGREED)
+
+    def lift_limit(self) -> None:
+        """Let the handshake take longer than its time limit: the protocol's own timers watch it from here."""
         self._limit_at = math.inf
 
     def send(self, message: M) -> None:
-        """Queue a message that is sent once; raises Refused when too many wait, EncodeError."""
+        """Queue a message that is sent once; raise Refused when too many wait, EncodeError."""
         self.outbox.put(self.encode(message))
 
     def send_first(self, message: M) -> None:
-        """Queue a message of the handshake: nothing goes before it, and a silence does not hold it."""
+        """Queue a message of the handshake: it goes before all others, and through a silence of the outbox."""
         self.outbox.put_exempt(self.encode(message))
 
     def snapshot(self) -> SessionEntry:
-        """Show the session as it is now."""
+        """Show the session as it is now, for the session table."""
         return SessionEntry(
             name=self.name,
             peer=self.peer,
@@ -346,3 +303,37 @@ class Session(ABC, Generic[M]):
             counters=msgspec.structs.asdict(self.traffic),
             left_out=dict(self.left_out),
         )
+
+    # The table, executed
+
+    def _on(self, event: SessionEvent, reason: str = "", now: float = math.inf) -> None:
+        step = TRANSITIONS[self.state].get(event)
+        if step is not None:
+            action, self.state = step
+            _ACTIONS[action](self, reason, now)
+
+
+def _begin(session: Session[Any], reason: str, now: float) -> None:
+    session._limit_at = now + session.limits.handshake_s
+    session.opened(now)
+
+
+def _settle(session: Session[Any], reason: str, now: float) -> None:
+    session._limit_at = math.inf
+
+
+def _leave(session: Session[Any], reason: str, now: float) -> None:
+    session.reason, session.busy, session.doubts = reason, None, ()
+    session._limit_at = now + LINGER_S
+
+
+def _end(session: Session[Any], reason: str, now: float) -> None:
+    session.reason, session.busy, session.doubts = session.reason or reason, None, ()
+
+
+_ACTIONS: dict[SessionAction, Callable[[Session[Any], str, float], None]] = {
+    SessionAction.BEGIN: _begin,
+    SessionAction.SETTLE: _settle,
+    SessionAction.LEAVE: _leave,
+    SessionAction.END: _end,
+}

@@ -1,4 +1,4 @@
-"""Keeps the sessions of one process: their table, and when to try a lost peer again. Sans-IO."""
+"""The sessions of one process, the ids of a robot's clients, and the delays between connection attempts. Sans-IO."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from zbridge.fleet.messages import SessionEntry
 from zbridge.protocol.session import Session
 
 REMEMBERED = 32
-"""Ended sessions that the table still shows."""
+"""Ended sessions that the table shows."""
 
 
 class Backoff:
-    """Delays between attempts: doubling from ``first_s`` to ``most_s``, each with +-25 % jitter, for ever."""
+    """Delays between attempts, seconds: doubling from ``first_s`` to ``most_s``, each with 25 % jitter either way."""
 
     def __init__(self, first_s: float = 0.5, most_s: float = 10.0, rng: random.Random | None = None) -> None:
         self._first_s = first_s
@@ -26,17 +26,17 @@ class Backoff:
         return f"<Backoff next {self._next_s:g} s>"
 
     def delay_s(self) -> float:
-        """Give the next delay in seconds."""
+        """Give the next delay, seconds."""
         delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
         return delay_s * self._rng.uniform(0.75, 1.25)
 
     def reset(self) -> None:
-        """Begin anew: the last attempt worked."""
+        """Start again from ``first_s``: an attempt succeeded."""
         self._next_s = self._first_s
 
 
 class ClientIds:
-    """The ids a robot gives its clients: the lowest free one, and none again within ``quiet_s`` of its release."""
+    """The ids that a robot gives its clients: the lowest free one; a released id is not given again for ``quiet_s``."""
 
     def __init__(self, ids: range, quiet_s: float) -> None:
         self._quiet_s = quiet_s
@@ -47,7 +47,7 @@ class ClientIds:
         return f"<ClientIds {taken} of {len(self._free_at)} taken>"
 
     def take(self, now: float) -> int | None:
-        """Give an id that is free now; None where there is none."""
+        """Give the lowest id that is free now; None: all are taken."""
         for client_id, free_at in self._free_at.items():
             if free_at <= now:
                 self._free_at[client_id] = math.inf
@@ -55,7 +55,7 @@ class ClientIds:
         return None
 
     def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
-        """Take an id back; one that was never used need not rest."""
+        """Take an id back. ``rests`` False: the client never used it, so it is free at once."""
         self._free_at[client_id] = now + self._quiet_s if rests else -math.inf
 
 
@@ -74,7 +74,7 @@ class SessionTable:
         self._live[session] = None
 
     def remove(self, session: Session[Any]) -> None:
-        """Move an ended session to the remembered ones."""
+        """Move an ended session to the :data:`REMEMBERED` ones; idempotent."""
         if session in self._live:
             del self._live[session]
             self._ended = [*self._ended, session.snapshot()][-REMEMBERED:]

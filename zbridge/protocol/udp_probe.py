@@ -1,7 +1,7 @@
-"""Whether datagrams get through, found out once per session. Sans-IO.
+"""Finds out once per session whether datagrams get through. Sans-IO.
 
-Both ends use it: the one that waits for the first datagram, and the one that waits for the answer to it. Each
-has a deadline of its own, and whichever passes first, datagrams are not used.
+Both ends use a probe: one awaits the first datagram, the other its answer. Each has a deadline; when one passes,
+datagrams are not used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Verdict(Enum):
 
 
 class Probe:
-    """One probe. ``within_s``: seconds the other end has."""
+    """One probe. ``within_s``: seconds that the other end has."""
 
     def __init__(self, within_s: float) -> None:
         self.verdict = Verdict.UNKNOWN
@@ -31,20 +31,20 @@ class Probe:
         return f"<Probe {self.verdict.value}>"
 
     def begin(self, now: float) -> None:
-        """Wait for the other end from now on."""
+        """Start to wait for the other end."""
         self.verdict, self.deadline = Verdict.WAITING, now + self._within_s
 
     def settle(self, *, works: bool) -> bool:
-        """Take the answer; False when it comes too late to count, or was not waited for."""
+        """Take the answer; False: it is too late, or no answer was awaited."""
         if self.verdict is not Verdict.WAITING:
             return False
         self.verdict, self.deadline = (Verdict.WORKS if works else Verdict.FAILED), math.inf
         return True
 
     def fail(self) -> None:
-        """Use no datagrams, whatever was found out before."""
+        """Use no datagrams, whatever the verdict was."""
         self.verdict, self.deadline = Verdict.FAILED, math.inf
 
     def expire(self, now: float) -> bool:
-        """Tell whether the other end has just used up its time."""
+        """End the wait if its time is up; True: it has just ended."""
         return now >= self.deadline and self.settle(works=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.errors import LinkError
 from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
@@ -19,7 +19,7 @@ from zbridge.transport.conversation import Conversation
 
 log = logging.getLogger("zbridge.link")
 
-Connect = Callable[[Address, Conversation], Any]
+Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError where there is no connection to be had."""
 
 _LOGGED = 64
@@ -53,7 +53,7 @@ class Hooks(msgspec.Struct, frozen=True):
 class Connection:
     """One configured address, the conversation there when there is one, and who watches its frames."""
 
-    def __init__(self, name: str, label: str, address: Address, hooks: Hooks) -> None:
+    def __init__(self, name: str, label: str, address: DeviceAddress, hooks: Hooks) -> None:
         self.name = name
         self._label = label
         self.address = address

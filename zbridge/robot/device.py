@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.bus import Bus, Handle, Publisher, Question
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
@@ -34,7 +34,7 @@ from zbridge.robot.commands import LINK_BLOCKED, Commands
 from zbridge.robot.connection import Connect, Connection, Hooks
 from zbridge.robot.names import NAMES, NameBudget
 from zbridge.robot.pending_queries import PendingQueries
-from zbridge.transport.tcp import connect
+from zbridge.transport.connect import connect
 
 log = logging.getLogger("zbridge.robot.device")
 
@@ -56,7 +56,7 @@ class Device:
     def __init__(
         self,
         robot: Robot,
-        addresses: tuple[Address, ...],
+        addresses: tuple[DeviceAddress, ...],
         *,
         protocol: str,
         keys: KeySpace,
@@ -123,7 +123,7 @@ class Device:
                 f"{keys.robot} {name}",
                 address,
                 Hooks(
-                    session=partial(self._session, index, str(address)),
+                    session=partial(self._session, name, str(address)),
                     deliver=self._deliver,
                     session_changed=self._on_session,
                     state_changed=self._publish_status,
@@ -136,7 +136,7 @@ class Device:
                     stalled=partial(self._on_stall, name),
                 ),
             )
-            for index, (name, address) in enumerate(zip(robot.link_names, addresses, strict=True))
+            for name, address in zip(robot.link_names, addresses, strict=True)
         ]
 
     def __repr__(self) -> str:
@@ -198,12 +198,12 @@ class Device:
 
     # Links
 
-    def _session(self, index: int, address: str) -> Session[Any]:
+    def _session(self, link: str, address: str) -> Session[Any]:
         """Make the session of a new connection; the names of the one before it are given up."""
-        if not index:
+        if link == self._robot.link_names[0]:
             for path in [path for path in self._publishers if _is_named(path)]:
                 self._publishers.pop(path).close()
-        return self._robot.session(index, address)
+        return self._robot.session(link, address)
 
     def _on_session(self, session: Session[Any]) -> None:
         if session is not self._robot.driving:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from zbridge.address import Address
+from zbridge.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
 
 
@@ -23,4 +23,4 @@ class DevicePlan(msgspec.Struct, frozen=True):
 
     protocol: Protocol
     options: Any
-    addresses: tuple[Address, ...]
+    addresses: tuple[DeviceAddress, ...]

@@ -1,4 +1,1 @@
-"""Links to peers, and conversations: one session run over one link.
-
-Knows no protocol and no bus.
-"""
+"""Links to peers (tcp, udp, serial), and conversations: one session over one link. Knows no protocol and no bus."""

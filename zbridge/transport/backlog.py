@@ -1,7 +1,7 @@
-"""Since when a peer's machine has owed the acknowledgement of what was written to it. Sans-IO.
+"""Finds how long the oldest written byte has waited for its acknowledgement. Sans-IO.
 
-The transport tells how many bytes are outstanding, not for how long. So every write is entered with its time, and what
-is acknowledged is taken out again: the kernel acknowledges in order.
+A transport tells how many bytes are outstanding, not for how long. So each write is entered with its time, and removed
+when it is acknowledged; acknowledgements come in the order of the writes.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections import deque
 
 ENTRIES = 1024
-"""Writes whose times are kept apart; later ones count as written with the last of these."""
+"""Writes with a time of their own; a write beyond takes the time of the last one."""
 
 
 class Backlog:
-    """The bytes that were written and are not known to be acknowledged."""
+    """The writes that are not known to be acknowledged."""
 
     def __init__(self) -> None:
         self._entries: deque[tuple[int, float]] = deque()
-        """For each write, how many bytes were written up to its end, and when."""
+        """For each write: the bytes written up to its end, and when."""
         self._written = 0
 
     def __repr__(self) -> str:
@@ -31,12 +31,12 @@ class Backlog:
         self._entries.append((self._written, now))
 
     def settle(self, outstanding: int) -> None:
-        """Take out what is acknowledged: all but the last ``outstanding`` bytes."""
+        """Remove the acknowledged writes: all but the last ``outstanding`` bytes."""
         acknowledged = self._written - outstanding
         while self._entries and self._entries[0][0] <= acknowledged:
             self._entries.popleft()
 
     @property
     def since(self) -> float | None:
-        """When the oldest byte was written that is not known to be acknowledged; None where there is none."""
+        """When the oldest unacknowledged byte was written; None: all is acknowledged."""
         return self._entries[0][1] if self._entries else None

@@ -1,4 +1,8 @@
-"""Carries one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus."""
+"""Runs one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus.
+
+``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
+ends with it: bytes, a timer, a command of the device.
+"""
 
 from __future__ import annotations
 
@@ -17,19 +21,20 @@ log = logging.getLogger("zbridge.link")
 _ESTABLISHED = State.ESTABLISHED
 
 LOOK_S = 0.05
-"""Seconds between two looks at a link that takes nothing."""
+"""Seconds between two checks of a stalled link."""
 
 
 class Conversation:
-    """The receiver of a link. ``deliver`` takes messages, ``changed`` is called on every change of state.
+    """The receiver of a link, and the driver of a session.
 
-    Nothing is written to a link on which bytes have waited for their acknowledgement for longer than STALLED_S: a robot
-    would read what piles up as one packet, and lose it. ``stalled`` is told when that begins (True) and when all is
-    acknowledged (False), before anything else is written.
-    ``before`` is called before anything is written: it may have something that must be written first. ``refused`` is
-    told what was refused before it was a message: datagrams that bear the peer's name and do not come from it.
-    ``may_warn`` is asked before a warning of one kind about the peer is logged.
-    ``clock``: seconds on the loop's time line; by default the loop's own, which may be a millisecond behind.
+    ``deliver`` takes the messages of each read. ``changed`` is called on every change of the session's state.
+    ``before`` is called before each write: what must leave first may be given to the session there.
+    ``stalled(True)`` is called when bytes have waited for their acknowledgement for longer than STALLED_S. From then on
+    nothing is written: a robot would read what piles up as one packet, and lose it. ``stalled(False)`` is called when
+    all is acknowledged, before the next write.
+    ``refused`` is told which datagrams in the peer's name did not come from the peer.
+    ``may_warn(kind)`` says whether a warning of this kind may be logged now.
+    ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
     def __init__(
@@ -52,7 +57,7 @@ class Conversation:
         self._before = before
         self._on_stall = stalled
         self.blocked = False
-        """Whether nothing is written because the peer's machine acknowledges nothing."""
+        """Whether nothing is written because the link is stalled."""
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._clock = clock or loop.time
@@ -90,11 +95,11 @@ class Conversation:
         self._hand_on(self.session.receive_datagram(datagram, self._clock()))
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this session's."""
+        """Ask the session whether this datagram is from its peer."""
         return self.session.claims(datagram, port)
 
     def rivalled(self) -> None:
-        """Count that another source, or session, claims what this one does; its session decides what becomes of it."""
+        """Count a second source, or session, with the same claim, and tell the session."""
         self._rivals.value += 1
         self.session.rivalled(self._clock())
         if self._may_warn("with a rival source of datagrams"):
@@ -102,7 +107,7 @@ class Conversation:
         self.pump()
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed."""
+        """Show the session a datagram of the peer's host that nobody claimed."""
         try:
             self.session.stray(datagram)
         except Refused as refusal:
@@ -117,14 +122,14 @@ class Conversation:
         session = self.session
         if not session.over:
             self._notify()
-        if messages:  # what came before the end of a session is delivered before the end is told
+        if messages:  # the messages before the end of a session are delivered before the end is reported
             self._deliver(messages)
         if session.traffic.malformed != self._malformed_logged:
             self._report_malformed()
         self.pump()
 
     def lost(self, reason: str) -> None:
-        """Take note that the link is gone."""
+        """End: the link is gone."""
         self._link = None
         self.session.lost(reason)
         self.pump()
@@ -134,7 +139,7 @@ class Conversation:
         self.pump()
 
     def pump(self) -> None:
-        """Write what may be written now, and set the timer for what may not."""
+        """Write what may be written now, report a change of state, and set the timer for the rest."""
         session, link = self.session, self._link
         outbox = session.outbox
         if session.drops_source and link is not None:
@@ -142,7 +147,9 @@ class Conversation:
             link.drop_source()
         writing = link is not None and (session.over or self._takes(link))  # last words are written in any case
         while writing and link is not None and link.ready:
-            now = self._clock()  # before the look: what becomes due after it, as the process froze, waits for another
+            now = (
+                self._clock()
+            )  # read before ``before`` runs: what becomes due while the process is frozen waits for the next turn
             self._before()
             frame = session.outgoing(now)
             if frame is None:
@@ -168,23 +175,23 @@ class Conversation:
 
     @property
     def stalled(self) -> bool:
-        """Whether the peer does not take what was written."""
+        """Whether the kernel has not taken all that was written."""
         return self._link is not None and not self._link.ready
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has owed an answer."""
+        """Seconds for which the peer's machine has not answered."""
         return self._link.silent_s if self._link is not None else 0.0
 
     def cut(self, reason: str) -> None:
-        """End the conversation and its link at once, and say why; what was written is lost."""
+        """End the conversation and its link at once, with a reason; what was written may be lost."""
         self.session.lost(reason)
         if self._link is not None:
             self._link.abort()
         self.pump()
 
     def abandon(self) -> None:
-        """End the conversation and its link at once, whatever state they are in; idempotent."""
+        """End the conversation and its link at once, in any state; idempotent."""
         self.session.lost("abandoned")
         self._end()
 
@@ -204,7 +211,7 @@ class Conversation:
         self.pump()
 
     def _takes(self, link: Link) -> bool:
-        """Tell whether the peer's machine acknowledges what is written; once it does not, wait for the last byte."""
+        """True if the link is not stalled. A stall ends when the last byte is acknowledged."""
         waited_s = link.unacknowledged_s
         blocked = waited_s > (0.0 if self.blocked else STALLED_S)
         if blocked is not self.blocked:
@@ -213,7 +220,7 @@ class Conversation:
         return not blocked
 
     def _next(self, deadline: float | None, link: Link | None) -> float | None:
-        """Give the next time to do anything: the session's, or a look at what is not acknowledged."""
+        """Give the next time to act: the session's deadline, or the next check for a stall."""
         waited_s = link.unacknowledged_s if link is not None else 0.0
         if not waited_s and not self.blocked:
             return deadline
@@ -223,15 +230,15 @@ class Conversation:
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:
             if deadline is not None and self._timer_at is not None and self._timer_at <= deadline:
-                return  # it fires early, finds nothing due, and is set anew: cheaper than a new one for every frame
+                return  # an early wake-up is harmless, and cheaper than a new timer for every frame
             self._timer.cancel()
             self._timer = None
         if deadline is not None:
             self._timer = self._loop.call_at(deadline, self._tick)
-        self._timer_at = deadline  # uvloop's timers that are due at once do not tell when
+        self._timer_at = deadline  # a uvloop timer that is due at once has no time
 
     def _notify(self) -> None:
-        """Tell of a change of state, once."""
+        """Report a change of state, once."""
         now = (self.session.state, self.session.busy, self.session.doubts)
         if now != self._seen:
             self._seen = now
@@ -246,7 +253,7 @@ class Conversation:
             self.ended.set_result(None)
 
     def _report_malformed(self) -> None:
-        """Warn at the first, second, fourth ... malformed message: the log stays readable in a flood."""
+        """Warn at malformed messages 1, 2, 4, 8 ...: the log stays readable in a flood."""
         count = self.session.traffic.malformed
         self._malformed.value += count - self._malformed_logged
         due = count.bit_length() != self._malformed_logged.bit_length()
@@ -256,9 +263,9 @@ class Conversation:
 
 
 class Accepted(Receiver):
-    """The receiver of a link that was accepted: its conversation is made by ``admit``, which may refuse one.
+    """The receiver of an accepted link; ``admit`` makes its conversation, or refuses the peer with None.
 
-    ``level``: of the line of the log about the end of the link.
+    ``level``: log level of the line about the end of the link.
     """
 
     def __init__(self, admit: Callable[[Link], Conversation | None], level: int = logging.INFO) -> None:
@@ -270,7 +277,7 @@ class Accepted(Receiver):
         return f"<Accepted {self._conversation!r}>"
 
     def attached(self, link: Link) -> None:
-        """Begin a conversation, or close the link."""
+        """Begin the conversation, or close the link."""
         self._conversation = self._admit(link)
         if self._conversation is None:
             link.close()
@@ -283,7 +290,7 @@ class Accepted(Receiver):
             self._conversation.received(data)
 
     def lost(self, reason: str) -> None:
-        """Take note that the link is gone."""
+        """End: the link is gone."""
         if self._conversation is not None:
             log.log(self._level, "%s: %s", self._conversation.session.peer, reason)
             self._conversation.lost(reason)
@@ -294,16 +301,16 @@ class Accepted(Receiver):
             self._conversation.received_datagram(datagram)
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of the peer's host that is nobody's source yet is this conversation's."""
+        """Ask the session whether this datagram is from its peer."""
         return self._conversation is not None and self._conversation.claims(datagram, port)
 
     def rivalled(self) -> None:
-        """Take note that another source, or conversation, claims what this one does."""
+        """Tell the conversation of a second source, or conversation, with the same claim."""
         if self._conversation is not None:
             self._conversation.rivalled()
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Look at a datagram of the peer's host that nobody claimed."""
+        """Show the session a datagram of the peer's host that nobody claimed."""
         if self._conversation is not None:
             self._conversation.stray_datagram(datagram)
 

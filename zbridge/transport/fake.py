@@ -26,21 +26,21 @@ class FakeLink:
         self.datagrams.append(data)
 
     def drop_source(self) -> None:
-        """Take note."""
+        """Note the call."""
         self.sources_dropped += 1
 
     def pause(self) -> None:
-        """Take note."""
+        """Note the call."""
         self.paused = True
 
     def resume(self) -> None:
-        """Take note."""
+        """Note the call."""
         self.paused = False
 
     def close(self) -> None:
-        """Take note."""
+        """Note the call."""
         self.closed = True
 
     def abort(self) -> None:
-        """Take note."""
+        """Note the call."""
         self.closed = True

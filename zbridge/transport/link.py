@@ -1,6 +1,7 @@
-"""What a link is: one transport connection to a peer, and who takes what it brings. Opens nothing itself.
+"""The interfaces of a link (one transport connection to a peer) and of its receiver. Opens nothing itself.
 
-Implemented by :class:`~zbridge.transport.tcp.TcpLink` and, for tests, by :class:`~zbridge.transport.fake.FakeLink`.
+Links are :class:`~zbridge.transport.tcp.TcpLink`, :class:`~zbridge.transport.serial.SerialLink` and, for tests,
+:class:`~zbridge.transport.fake.FakeLink`.
 """
 
 from __future__ import annotations
@@ -8,38 +9,38 @@ from __future__ import annotations
 from typing import Protocol
 
 STALLED_S = 0.3
-"""Seconds without acknowledgement after which a robot's link takes nothing; healthy robots delay theirs up to 50 ms."""
+"""Seconds without acknowledgement after which a robot's link is stalled; healthy robots acknowledge within 50 ms."""
 
 
 class Receiver(Protocol):
-    """Who takes what a link brings; called on the event loop's thread."""
+    """Takes what a link reads. All methods run on the event loop's thread."""
 
     def attached(self, link: Link) -> None:
-        """Take note that the connection is there; called once, before everything else."""
+        """Start: the connection is up. Called once, before every other method."""
 
     def received(self, data: bytes) -> None:
-        """Take bytes as they were read."""
+        """Take bytes in any cut."""
 
     def received_datagram(self, datagram: bytes) -> None:
-        """Take a datagram of this peer."""
+        """Take a datagram from the peer."""
 
     def claims(self, datagram: bytes, port: int) -> bool:
-        """Tell whether a datagram from a port of this peer's host that is no peer's source yet is this peer's."""
+        """True: this datagram is from the peer. Asked for a port of the peer's host that is nobody's source yet."""
 
     def rivalled(self) -> None:
-        """Take note that another source or another peer claims to be this peer as well: it has no source any more."""
+        """React to a second source, or a second receiver, with the same claim: the peer has no source any more."""
 
     def stray_datagram(self, datagram: bytes) -> None:
-        """Take note of a datagram of this peer's host that nobody claimed, and that was dropped."""
+        """Look at a datagram of the peer's host that nobody claimed; the link has dropped it."""
 
     def foreign_datagram(self) -> None:
-        """Take note of a datagram that came from elsewhere and was dropped."""
+        """Count a datagram from elsewhere; the link has dropped it."""
 
     def lost(self, reason: str) -> None:
-        """Take note that the connection is gone; called once, nothing follows."""
+        """End: the connection is gone. Called once, after every other method."""
 
     def writable(self) -> None:
-        """Take note that a link that was not writable is so again."""
+        """Go on writing: ``ready`` is True again."""
 
 
 class Link(Protocol):
@@ -49,26 +50,26 @@ class Link(Protocol):
 
     @property
     def ready(self) -> bool:
-        """Whether the peer takes what is written."""
+        """Whether the link takes a write now; if not, :meth:`Receiver.writable` is called when it does."""
 
     def write(self, data: bytes) -> None:
         """Write ``data`` as one segment."""
 
     def write_datagram(self, data: bytes) -> None:
-        """Send ``data`` as one datagram to the peer; lost where the network takes none."""
+        """Send ``data`` as one datagram to the peer. It is lost if the network does not take it now."""
 
     def drop_source(self) -> None:
-        """Take no more datagrams from the source that was taken for an accepted peer's; idempotent."""
+        """Forget which source an accepted peer's datagrams come from; idempotent."""
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has owed an answer: it was unplugged, or its network is in trouble."""
+        """Seconds for which the peer's machine has not answered: it is unplugged, or its network fails. 0: unknown."""
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest byte written has waited for its acknowledgement, as far as it is known.
+        """Seconds for which the oldest written byte has waited for its acknowledgement.
 
-        What has waited for no longer than :data:`STALLED_S` may be acknowledged already; 0 where nobody watches.
+        Exact above :data:`STALLED_S`; below, the byte may be acknowledged already. 0 where the platform does not tell.
         """
 
     def pause(self) -> None:
@@ -78,7 +79,7 @@ class Link(Protocol):
         """Read again."""
 
     def close(self) -> None:
-        """Close the connection; idempotent."""
+        """Close the connection after what was written; idempotent."""
 
     def abort(self) -> None:
-        """Close the connection now, whatever was written; idempotent."""
+        """Close the connection now; what was written may be lost. Idempotent."""

@@ -1,6 +1,6 @@
-"""TCP links, connected or accepted: every write a segment of its own, unacknowledged bytes watched.
+"""TCP links, connected or accepted. Each write is a segment of its own; unacknowledged bytes are watched.
 
-Knows no frame, session or protocol. Datagrams of the same peer go by :mod:`zbridge.transport.udp`.
+Knows no frame, session or protocol. The peer's datagrams are in :mod:`zbridge.transport.udp`.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ log = logging.getLogger("zbridge.link")
 READ_BYTES = 64 * 1024
 """Most bytes taken from a robot's socket before the loop serves others."""
 CLIENT_READ_BYTES = 4096
-"""The same for a peer that connected to us: there may be hundreds."""
+"""The same for an accepted peer: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
-"""Bytes the kernel keeps for a peer that connected to us and reads slowly: what is older than that helps nobody."""
+"""Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
 KEEPALIVE_S = 1
-"""Seconds of silence after which a peer that connected to us is asked whether it is there."""
+"""Seconds of silence after which the kernel asks an accepted peer for a sign of life."""
 GIVE_UP_S = 60.0
-"""Seconds without acknowledgement after which a robot's connection is given up: a deployed robot gives only one."""
+"""Seconds without acknowledgement after which a robot's connection ends: long, for a deployed robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
-"""The same for a peer that connected to us."""
+"""The same for an accepted peer."""
 _RETRY_MOST_S = 1.0
-"""Longest time between two attempts of the kernel to send a robot what a broken link lost."""
+"""Longest time between two retransmissions of the kernel to a robot."""
 _TCP_RTO_MAX_MS = 44
-"""Linux 6.15 and newer; Python does not name it yet."""
+"""Linux 6.15 and newer; Python has no name for it yet."""
 _OUTSTANDING = struct.Struct("=i")
 _SIOCOUTQ = termios.TIOCOUTQ
-"""Asks a socket for the bytes that are not acknowledged, by its name for terminals."""
+"""The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
 _TCP_INFO = struct.Struct("=24xI28xI")
-"""Of Linux's tcp_info: segments not acknowledged, and milliseconds since the last acknowledgement."""
+"""Two fields of Linux's tcp_info: unacknowledged segments, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
-"""Seconds a peer is given to take what was written before its connection was closed."""
+"""Seconds that a closing connection waits for its last bytes to be taken."""
 CONNECT_S = 5.0
-"""Longest time a connection attempt may take."""
+"""Seconds that a connection attempt may take."""
 
 
 class TcpLink(asyncio.BufferedProtocol):
-    """A TCP connection: every write a segment of its own, a vanished peer noticed by keep-alive.
+    """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
-    ``buffer``: where reads go; what is read is copied at once, so the links of one loop may share it.
+    ``buffer``: where reads of an accepted peer go. Reads are copied at once, so all links of a loop may share it.
     """
 
     def __init__(self, receiver: Receiver, hub: DatagramHub | None = None, buffer: bytearray | None = None) -> None:
@@ -74,7 +74,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     @property
     def ready(self) -> bool:
-        """Whether the peer takes what is written."""
+        """Whether the kernel took all that was written."""
         return self._transport is not None and not self._held_back
 
     def write(self, data: bytes) -> None:
@@ -85,10 +85,10 @@ class TcpLink(asyncio.BufferedProtocol):
             self._transport.write(data)
 
     def write_datagram(self, data: bytes) -> None:
-        """Send ``data`` as one datagram to the peer; lost where the network takes none.
+        """Send ``data`` as one datagram to the peer. It is lost if the network does not take it now.
 
-        Towards a peer we connected to, the first one opens a socket of our own, that hears nobody but the
-        peer's address and port. An accepted peer is answered from the listener's port.
+        To a robot, the first datagram opens a socket that hears the robot's address and port only. An accepted peer
+        gets datagrams from the listener's port.
         """
         if self._hub is not None:
             self._hub.send(self, data)
@@ -102,13 +102,13 @@ class TcpLink(asyncio.BufferedProtocol):
             self._datagrams.send(data)
 
     def drop_source(self) -> None:
-        """Take no more datagrams from the source that was taken for an accepted peer's; idempotent."""
+        """Forget which source an accepted peer's datagrams come from; idempotent."""
         if self._hub is not None:
             self._hub.unbind(self)
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the peer's machine has owed an answer: it was unplugged, or its network is in trouble."""
+        """Seconds for which the peer's machine has not answered: it is unplugged, or its network fails."""
         if self._transport is None or not hasattr(socket, "TCP_INFO"):
             return 0.0
         sock = self._transport.get_extra_info("socket")
@@ -121,7 +121,7 @@ class TcpLink(asyncio.BufferedProtocol):
 
     @property
     def unacknowledged_s(self) -> float:
-        """Seconds for which the oldest byte written has waited for its acknowledgement; see :class:`Link`."""
+        """Seconds for which the oldest written byte has waited for its acknowledgement; see :class:`Link`."""
         backlog, transport = self._backlog, self._transport
         if backlog is None or backlog.since is None or transport is None:
             return 0.0
@@ -149,17 +149,17 @@ class TcpLink(asyncio.BufferedProtocol):
                 asyncio.get_running_loop().call_later(CLOSE_S, self.abort)
 
     def abort(self) -> None:
-        """Close the connection now, whatever was written; idempotent."""
+        """Close the connection now; what was written may be lost. Idempotent."""
         if self._transport is not None:
             self._transport.abort()
 
-    # asyncio's side
+    # What asyncio calls
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast(asyncio.Transport, transport)  # uvloop's is none by inheritance
-        self._transport.set_write_buffer_limits(high=0)  # so uvloop writes at once, not at the end of its round
+        self._transport = cast(asyncio.Transport, transport)  # uvloop's transport does not inherit from it
+        self._transport.set_write_buffer_limits(high=0)  # makes uvloop write at once, not at the end of its iteration
         peer = transport.get_extra_info("peername")
-        if peer is None:  # reset before we came to look; connection_lost follows
+        if peer is None:  # already reset; connection_lost follows
             self._transport.abort()
             return
         self.peer = str(Address(*peer[:2]))
@@ -169,7 +169,7 @@ class TcpLink(asyncio.BufferedProtocol):
             _keep_alive(sock)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         else:
-            _try_again_soon(sock)
+            _bound_retries(sock)
             self._backlog = _new_backlog(sock)
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
@@ -181,7 +181,7 @@ class TcpLink(asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         data = bytes(self._view[:nbytes])
         if self._hub is not None:
-            self._hub.drain()  # datagrams that wait are older: motion must not overtake the stop that followed it
+            self._hub.drain()  # datagrams that wait are older: an old drive must not follow a newer stop
         self._receiver.received(data)
 
     def eof_received(self) -> bool:
@@ -217,36 +217,36 @@ def _tune(sock: socket.socket, give_up_s: float) -> None:
 
 
 def _keep_alive(sock: socket.socket) -> None:
-    """Ask a silent peer every second whether it is there; the connection is given up as late as any other."""
+    """Ask a silent peer for a sign of life every second; ``_tune`` says when the connection ends."""
     for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
         if hasattr(socket, option):
             sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
 
-def _try_again_soon(sock: socket.socket) -> None:
-    """Have what a broken link lost sent again within :data:`_RETRY_MOST_S`, where the kernel can be told."""
+def _bound_retries(sock: socket.socket) -> None:
+    """Bound the time between retransmissions by :data:`_RETRY_MOST_S`, where the kernel can."""
     with contextlib.suppress(OSError):
         sock.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(_RETRY_MOST_S * 1000))
 
 
-_unwatched_said = False
+_unwatched_warned = False
 
 
 def _new_backlog(sock: socket.socket) -> Backlog | None:
-    """Give a backlog where the platform tells what is not acknowledged; say once where it does not."""
-    global _unwatched_said
+    """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
+    global _unwatched_warned
     try:
         _queued(sock)
     except OSError:
-        if not _unwatched_said:
-            _unwatched_said = True
+        if not _unwatched_warned:
+            _unwatched_warned = True
             log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
         return None
     return Backlog()
 
 
 def _outstanding(transport: asyncio.Transport) -> int:
-    """Count the bytes that were written and not acknowledged: the kernel's and the transport's own."""
+    """Count the unacknowledged bytes: the kernel's and the transport's own."""
     queued = 0
     with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
         queued = _queued(transport.get_extra_info("socket"))
@@ -254,13 +254,13 @@ def _outstanding(transport: asyncio.Transport) -> int:
 
 
 def _queued(sock: socket.socket) -> int:
-    """Count the bytes that the kernel keeps until they are acknowledged; raise OSError where it does not tell."""
+    """Count the unacknowledged bytes of the kernel; raise OSError where the platform does not tell."""
     queued: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
     return queued
 
 
 async def connect(address: Address, receiver: Receiver) -> TcpLink:
-    """Connect within :data:`CONNECT_S`; raise LinkError with the reason otherwise."""
+    """Connect within :data:`CONNECT_S`, or raise LinkError with the reason."""
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(CONNECT_S):
@@ -276,10 +276,10 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
 async def listen(
     address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False, foreign: Count | None = None
 ) -> AsyncIterator[Address]:
-    """Listen for peers, each with a receiver of its own; give the address, with the port that was had.
+    """Accept peers, each with a receiver of its own; give the address that is bound, with its port.
 
-    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts those that are no peer's. Raises LinkError
-    where the address cannot be had.
+    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. Raise LinkError if
+    the address cannot be bound.
     """
     loop = asyncio.get_running_loop()
     hub = DatagramHub(foreign or Count()) if datagrams else None

@@ -17,13 +17,13 @@ _DATAGRAM_BYTES = 65_536
 _DATAGRAMS = 64
 """Most datagrams taken from a socket before the loop serves others."""
 STRAYS_HZ = 20.0
-"""Datagrams a second of one host that nobody claimed and that are shown to its links; the others are counted."""
+"""Unclaimed datagrams a second of one host that its links are shown; the others are only counted."""
 STRAY_S = 0.02
-"""Seconds for which a source is not listened to after a datagram that nobody claimed: a flood costs little."""
+"""Seconds for which a source is ignored after an unclaimed datagram: a flood must cost little."""
 STRAY_SOURCES = 1024
-"""Such sources that are kept; of more, all are forgotten."""
+"""Ignored sources that are kept; one more clears them all."""
 _DRAINED = 1024
-"""Most datagrams taken before a stream is read: more than a socket's buffer holds by default."""
+"""Most datagrams taken before a stream is read; a socket's default buffer holds fewer."""
 
 
 class _DatagramReader:
@@ -46,7 +46,7 @@ class _DatagramReader:
         self._loop.add_reader(sock.fileno(), self._read)
 
     def drain(self) -> None:
-        """Take all datagrams that wait."""
+        """Read all datagrams that wait."""
         self._read(_DRAINED)
 
     def _read(self, most: int = _DATAGRAMS) -> None:
@@ -76,7 +76,7 @@ class _DatagramReader:
 
 
 class DatagramSocket(_DatagramReader):
-    """Our own UDP socket towards one peer: it hears the peer's address and port, and counts everything else."""
+    """A UDP socket to one robot: hears the address and port of the robot, and counts everything else."""
 
     def __init__(self, transport: asyncio.Transport, receiver: Receiver) -> None:
         super().__init__()
@@ -96,11 +96,11 @@ class DatagramSocket(_DatagramReader):
 
 
 class DatagramHub(_DatagramReader):
-    """The UDP socket of a listener: each source belongs to the link of the same host that claimed it.
+    """The UDP socket of a listener: each source (address and port) belongs to the link of its host that claimed it.
 
-    A datagram of a source that is nobody's is shown to every link of its host. The one that claims it gets the source,
-    if it has none; where several claim it, or one that has a source already, somebody speaks in another's name: none
-    of them has a source from then on.
+    Every link of the host is asked for a datagram of a source that is nobody's. If exactly one claims it and has no
+    source yet, the source is that link's. If several claim it, or one that has a source, somebody speaks in another's
+    name: all of them lose their sources and are told so (``rivalled``).
     """
 
     def __init__(self, foreign: Count) -> None:
@@ -117,7 +117,7 @@ class DatagramHub(_DatagramReader):
         self._listen(host, port)
 
     def add(self, link: Link, host: str, receiver: Receiver) -> None:
-        """Let a link have the datagrams of its host that it claims."""
+        """Ask this link for the datagrams of its host from now on."""
         self._hosts.setdefault(host, {})[link] = receiver
         self._strays.setdefault(host, RateLimit(STRAYS_HZ))
 
@@ -136,7 +136,7 @@ class DatagramHub(_DatagramReader):
             del self._owners[source]
 
     def send(self, link: Link, data: bytes) -> None:
-        """Send to the source a link has claimed; nowhere while there is none."""
+        """Send to the source of a link; without a source the datagram is lost."""
         source = self._sources.get(link)
         if source is not None:
             self._send(data, source)
@@ -166,7 +166,7 @@ class DatagramHub(_DatagramReader):
             self._note_stray(data, source, now)
 
     def _note_stray(self, data: bytes, source: tuple[str, int], now: float) -> None:
-        """Show a datagram that nobody claimed to the links of its host; do not listen to its source for a moment."""
+        """Show an unclaimed datagram to the links of its host; ignore its source for :data:`STRAY_S`."""
         if len(self._deaf_until) >= STRAY_SOURCES:
             self._deaf_until.clear()
         self._deaf_until[source] = now + STRAY_S

@@ -24,6 +24,7 @@ from zbridge.wire.fields import (
     Whole,
 )
 from zbridge.wire.frames import FrameBuffer
+from zbridge.wire.lines import Line, Lines
 from zbridge.wire.text import TextCodec
 
 __all__ = [
@@ -40,6 +41,8 @@ __all__ = [
     "F32Array",
     "FrameBuffer",
     "I64Fill",
+    "Line",
+    "Lines",
     "Message",
     "Rest",
     "Scalar",

@@ -1,6 +1,6 @@
 """The binary codec: a message declaration compiled once into functions between bytes and message. Sans-IO.
 
-Little endian throughout; every legacy protocol of this project is.
+Little endian; a message of fields of fixed width can be big-endian.
 """
 
 from __future__ import annotations
@@ -52,10 +52,12 @@ class BinaryCodec(Generic[M]):
         if any(field.optional for field in fields[:-1]):
             raise TypeError(f"{message.__name__}: only the last field may be missing")
         if scalars is None:
+            if message.byte_order != "<":
+                raise TypeError(f"{message.__name__}: only fields of fixed width can be big-endian")
             self._steps = [_Step(field, fields[place + 1 :]) for place, field in enumerate(fields)]
             self.decode, self.encode = self._decode_steps, self._encode_steps
         else:
-            self._fixed = struct.Struct("<" + scalars)
+            self._fixed = struct.Struct(message.byte_order + scalars)
             self._names = [field.name for field in fields]
             self.decode = _fixed_decoder(message, self._fixed)
             self.encode = self._encode_fixed

@@ -13,7 +13,7 @@ codec makes the bytes.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -21,7 +21,12 @@ import numpy.typing as npt
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):
-    """A typed legacy value; its fields are declared with the wire types of this module."""
+    """A typed legacy value; its fields are declared with the wire types of this module.
+
+    ``byte_order = ">"``: its fields, all of fixed width, are big-endian in binary.
+    """
+
+    byte_order: ClassVar[str] = "<"
 
     def check(self) -> None:
         """Raise ProtocolError where decoded values do not go together."""

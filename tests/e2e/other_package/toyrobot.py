@@ -18,6 +18,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Pose
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
 from zbridge.protocol.session import Limits, Role, Session
 
@@ -47,21 +48,29 @@ def line_end(data: bytes, start: int) -> int:
     return len(data) + 1 if end < 0 else end + 1
 
 
+def write(message: At) -> bytes:
+    return b"at %f %f %f\n" % (message.x, message.y, message.heading)
+
+
+def read(frame: bytes) -> At:
+    try:
+        word, x, y, heading = frame.split()
+        if word != b"at":
+            raise ValueError(word)
+        return At(float(x), float(y), float(heading))
+    except ValueError as error:
+        raise ProtocolError(f"{frame!r}: {error}") from error
+
+
 class ToySession(Session[At]):
     role = Role.HQ
     frame_end = staticmethod(line_end)
 
     def encode(self, message: At) -> bytes:
-        raise NotImplementedError
+        return write(message)
 
     def decode(self, frame: bytes) -> At:
-        try:
-            word, x, y, heading = frame.split()
-            if word != b"at":
-                raise ValueError(word)
-            return At(float(x), float(y), float(heading))
-        except ValueError as error:
-            raise ProtocolError(f"{frame!r}: {error}") from error
+        return read(frame)
 
     def opened(self, now: float) -> None:
         self.establish("7.0", ("wheels",))
@@ -76,7 +85,7 @@ class ToyRobot(Robot):
     def __init__(self, options: Options, links: int, metrics: Metrics) -> None:
         self._session: ToySession | None = None
 
-    def session(self, link: int, peer: str) -> ToySession:
+    def session(self, link: str, peer: str) -> ToySession:
         self._session = ToySession(Limits(frame_bytes=100, handshake_s=5.0))
         return self._session
 
@@ -103,7 +112,7 @@ class ToyRobot(Robot):
         if self._session is None:
             raise NotReady("no connection")
         frame = b"go %f %f\n" % (forward, turn)
-        self._session.outbox.stand("motion", (frame,), now, period_s=0.1, **more)
+        self._session.outbox.set("motion", (frame,), now, period_s=0.1, **more)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported("it cannot be asked")
@@ -141,4 +150,5 @@ PROTOCOL = Protocol(
     robot=ToyRobot,
     simulate=simulate,
     template=TEMPLATE,
+    codecs=(Codec("lines", write, read, line_end, (At,)),),
 )

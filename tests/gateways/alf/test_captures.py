@@ -61,7 +61,7 @@ def written(session: AlfSession, messages: list[AlfMessage]) -> bytes:
     return data
 
 
-def told(robot: AlfRobot, link: int, name: str, port: int) -> list[tuple[Topic, FleetMessage]]:
+def told(robot: AlfRobot, link: str, name: str, port: int) -> list[tuple[Topic, FleetMessage]]:
     """What the fleet is told of everything a vehicle sent on one link, each at its recorded time."""
     session = robot.session(link, "tcp://robot.test:1")
     session.open(0.0)
@@ -157,8 +157,8 @@ def test_a_vehicle_that_is_sent_the_recorded_end_answers_it() -> None:
 # On to the fleet
 
 
-@pytest.mark.parametrize("link", [0, 1])
-def test_the_recorded_scanner_is_in_radians_seconds_and_metres_on_either_link(link: int) -> None:
+@pytest.mark.parametrize("link", ["drive", "laser"])
+def test_the_recorded_scanner_is_in_radians_seconds_and_metres_on_either_link(link: str) -> None:
     (topic, scanner), *_ = told(AlfRobot(Options(), 2), link, LASER, LASER_PORT)
     assert topic is topics.SCANNER
     assert isinstance(scanner, Scanner)
@@ -173,7 +173,7 @@ def test_the_recorded_scanner_is_in_radians_seconds_and_metres_on_either_link(li
 
 def test_the_recorded_measurements_are_scans_in_metres() -> None:
     metrics = Metrics()
-    _, *scans = told(AlfRobot(Options(), 2, metrics), 1, LASER, LASER_PORT)
+    _, *scans = told(AlfRobot(Options(), 2, metrics), "laser", LASER, LASER_PORT)
     assert len(scans) == 6
     arrived_s = (0.1013, 0.2016, 0.3019, 0.4022, 0.5025, 0.6028)
     for number, (topic, scan) in enumerate(scans):
@@ -196,7 +196,7 @@ def test_the_recorded_measurements_are_scans_in_metres() -> None:
 
 
 def test_a_point_of_the_recorded_scan_lies_where_its_angle_says() -> None:
-    _, (_, scan), *_ = told(AlfRobot(Options()), 0, LASER, LASER_PORT)
+    _, (_, scan), *_ = told(AlfRobot(Options()), "vehicle", LASER, LASER_PORT)
     assert isinstance(scan, Scan)
     angle = scan.angle_min + 384 * scan.angle_increment
     assert math.degrees(angle) == pytest.approx(-0.000192, abs=1e-6)  # -135 + 384 * 0.351562
@@ -204,7 +204,7 @@ def test_a_point_of_the_recorded_scan_lies_where_its_angle_says() -> None:
 
 
 def test_the_recorded_drive_infos_are_motions_in_si_units() -> None:
-    motions = told(AlfRobot(Options(), 2), 0, DRIVE, DRIVE_PORT)
+    motions = told(AlfRobot(Options(), 2), "drive", DRIVE, DRIVE_PORT)
     forward_m_s2 = (2.4516625, 12.2583125, 22.0649625, 31.8716125, 41.6782625, 51.4849125)  # n + 0.25 times 9.80665
     speeds = (0.10, 0.11, 0.12, 0.13, 0.14, 0.15)
     arrived_us = (300, 300_600, 800_900, 1_301_100, 1_801_500, 2_301_700)
@@ -221,7 +221,7 @@ def test_the_recorded_drive_infos_are_motions_in_si_units() -> None:
 
 def test_a_drive_of_the_fleet_gives_the_recorded_command() -> None:
     robot = AlfRobot(Options(), 2)
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("drive", "tcp://robot.test:1")
     session.open(0.0)
     assert session.outgoing(0.0) == payloads(DRIVE, destination=DRIVE_PORT)[0].payload
     robot.command(topics.CMD_DRIVE, Drive(forward=0.8, turn=RIGHT_ANGLE_THIRD, light=True), 0.5)

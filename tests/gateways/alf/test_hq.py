@@ -836,7 +836,7 @@ def test_what_a_recorded_vehicle_sent_passes_the_bus_and_reaches_an_hq_as_it_was
     """All but the points outside the valid indices: on the bus they have no range, here they are 0."""
     port = 16668 if name == "alf-drive.hex" else 16667
     robot, scene = AlfRobot(Options(), 2), Scene()
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("drive", "tcp://robot.test:1")
     session.open(0.0)
     written = b""
     for record in payloads(name, source=port):

@@ -59,7 +59,7 @@ class Wire:
             self.connect(link)
 
     def connect(self, link: int = 0) -> None:
-        session = self.robot.session(link, "tcp://robot.test:1")
+        session = self.robot.session(self.robot.link_names[link], "tcp://robot.test:1")
         self.sessions[link : link + 1] = [session]
         session.open(self.now)
 
@@ -624,9 +624,9 @@ def test_a_single_link_has_a_name_of_its_own(wire: Wire) -> None:
 def test_a_robot_takes_commands_while_its_drive_link_is_up() -> None:
     robot = AlfRobot(Options(), 2)
     assert not robot.ready
-    robot.session(1, "tcp://robot.test:2").open(0.0)
+    robot.session("laser", "tcp://robot.test:2").open(0.0)
     assert not robot.ready
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("drive", "tcp://robot.test:1")
     session.open(0.0)
     assert robot.ready
     session.lost("closed by peer")

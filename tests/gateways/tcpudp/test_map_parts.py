@@ -88,7 +88,7 @@ class Drawn:
 
     def __init__(self, settings: bytes = SETTINGS) -> None:
         self.robot = TcpUdpRobot(Options())
-        self.session = self.robot.session(0, "tcp://robot.test:1")
+        self.session = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(0.0)
         self.session.receive(settings, 0.1)
 
@@ -181,7 +181,7 @@ def test_a_shown_map_does_not_change_with_later_parts() -> None:
 def test_a_new_connection_begins_with_an_empty_map() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    drawn.session = drawn.robot.session(0, "tcp://robot.test:1")
+    drawn.session = drawn.robot.session("robot", "tcp://robot.test:1")
     drawn.session.open(0.0)
     drawn.session.receive(SETTINGS, 0.1)
     assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
@@ -229,7 +229,7 @@ def test_a_robot_that_sends_parts_is_never_asked_for_its_map_on_no_later_connect
     drawn = Drawn()
     drawn.take(FIRST)
     asked_for_all(drawn)
-    drawn.session = drawn.robot.session(0, "tcp://robot.test:1")
+    drawn.session = drawn.robot.session("robot", "tcp://robot.test:1")
     drawn.session.open(0.0)
     drawn.session.receive(SETTINGS, 0.1)
     assert known(drawn) is None, "the map of a new connection is another one"
@@ -248,7 +248,7 @@ def asked_for_all(drawn: Drawn) -> None:
 def test_a_robot_that_is_another_one_after_a_reconnection_is_asked() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    session = drawn.robot.session(0, "tcp://robot.test:1")
+    session = drawn.robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     session.receive(server_settings(b"1.1,1.2,1.3", "00010101010101" + SIZE_30_10), 0.1)
     session.outgoing(0.1)

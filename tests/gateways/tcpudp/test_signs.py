@@ -45,7 +45,7 @@ class Link:
         self.robot = TcpUdpRobot(Options())
 
     def connect(self, client_id: int = 2, *, versions: bytes = LISTED) -> Timed:
-        timed = Timed(self.robot.session(0, "tcp://robot.test:1"))
+        timed = Timed(self.robot.session("robot", "tcp://robot.test:1"))
         timed.stream(settings(client_id, versions=versions), 0.1)
         return timed
 

@@ -45,7 +45,7 @@ class Stage:
         self.connect(settings or SETTINGS[version])
 
     def connect(self, settings: bytes) -> None:
-        self.session: HqSession = self.robot.session(0, "tcp://robot.test:1")
+        self.session: HqSession = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(self.now)
         self.session.receive(settings, self.now)
         self.session.outgoing(self.now)

@@ -40,7 +40,7 @@ class Wire:
 
     def __init__(self, options: Options | None = None, announced: bytes = settings()) -> None:
         self.robot = TcpUdpRobot(options or Options())
-        self.session: HqSession = self.robot.session(0, "tcp://robot.test:1")
+        self.session: HqSession = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(0.0)
         self.session.receive(announced, 0.0)
         self.session.outgoing(0.0)
@@ -437,7 +437,7 @@ def test_before_the_first_connection_nothing_can_be_sent() -> None:
 
 def test_a_robot_is_ready_when_its_session_is_established() -> None:
     robot = TcpUdpRobot(Options())
-    session = robot.session(0, "")
+    session = robot.session("robot", "")
     session.open(0.0)
     assert not robot.ready
     session.receive(settings(), 0.1)

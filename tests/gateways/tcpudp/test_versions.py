@@ -146,7 +146,7 @@ def test_a_settings_block_that_is_too_short_for_its_version_is_malformed(listed:
     ],
 )
 def test_the_gateway_announces_what_it_is_told(announce: tuple[str, ...], listed: bytes, answered: str) -> None:
-    session = TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session(0, "")
+    session = TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", "")
     timed = Timed(session)
     block = {b"1.1": ALL[:10], b"1.2": ALL[:12]}.get(listed, ALL + SIZE_100_10)
     timed.stream(server_settings(listed, block), 0.1)
@@ -155,7 +155,7 @@ def test_the_gateway_announces_what_it_is_told(announce: tuple[str, ...], listed
 
 
 def test_a_gateway_that_does_not_announce_datagrams_neither_waits_for_them_nor_sends_any() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("lidar_sim",))).session(0, ""))
+    timed = Timed(TcpUdpRobot(Options(announce=("lidar_sim",))).session("robot", ""))
     timed.stream(server_settings(LISTED, ALL + SIZE_100_10), 0.1)
     assert timed.session.state is State.ESTABLISHED
     timed.until(10.0)
@@ -163,7 +163,7 @@ def test_a_gateway_that_does_not_announce_datagrams_neither_waits_for_them_nor_s
 
 
 def test_a_robot_without_datagrams_is_not_told_of_ours() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("udp", "chat"))).session(0, ""))
+    timed = Timed(TcpUdpRobot(Options(announce=("udp", "chat"))).session("robot", ""))
     timed.stream(server_settings(LISTED, "00" + ALL[2:] + SIZE_100_10), 0.1)
     assert timed.frames("tcp") == [framed(5, 3, counted(LISTED) + bytes.fromhex("00000001000000"))]
 

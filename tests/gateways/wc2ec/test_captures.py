@@ -9,7 +9,8 @@ import pytest
 
 from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
 from gateways.wc2ec.session import ControllerSession, ExternalSession
-from gateways.wc2ec.translate import Options, Wc2EcRobot
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading
@@ -48,7 +49,7 @@ def delivered(session: ExternalSession, data: bytes) -> list[Wc2EcMessage]:
 
 def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
     """What the fleet is told of everything the controller sent, each segment at its recorded time."""
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     telemetry: list[tuple[Topic, FleetMessage]] = []
     for record in payloads(NAME, source=PORT):

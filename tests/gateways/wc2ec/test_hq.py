@@ -17,7 +17,8 @@ from gateways.wc2ec.conformance.fragile_hq import Reader
 from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq
 from gateways.wc2ec.messages import Dialect as WireDialect
 from gateways.wc2ec.messages import Wc2EcMessage
-from gateways.wc2ec.translate import DeviceOption, Options, Wc2EcRobot
+from gateways.wc2ec.settings import DeviceOption, Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet import payload, topics
@@ -1063,7 +1064,7 @@ def test_the_recorded_controller_says_nothing_and_so_commands_nothing() -> None:
 )
 def test_what_a_webots_robot_sent_passes_the_bus_and_reaches_a_controller_as_it_was(sent: bytes) -> None:
     robot, scene = Wc2EcRobot(Options()), Scene(None)
-    session = robot.session(0, "tcp://robot.test:1")
+    session = robot.session("robot", "tcp://robot.test:1")
     session.open(0.0)
     written = b""
     for message in session.receive(sent, 0.0):

@@ -9,7 +9,8 @@ from collections.abc import AsyncIterator
 
 import msgpack
 
-from gateways.wc2ec.translate import Options, Wc2EcRobot
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from tests.clock import jumping
 from zbridge.address import Address
 from zbridge.bus import Publisher

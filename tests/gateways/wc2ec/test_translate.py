@@ -13,7 +13,8 @@ import pytest
 
 from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalSession
-from gateways.wc2ec.translate import Options, Wc2EcRobot
+from gateways.wc2ec.settings import Options
+from gateways.wc2ec.translate import Wc2EcRobot
 from zbridge.app import config
 from zbridge.app.templates import robot_template
 from zbridge.errors import ConfigError, EncodeError, PayloadError, ProtocolError, Refused
@@ -116,7 +117,7 @@ class Wire:
             self.told(greeting)
 
     def connect(self) -> None:
-        self.session = self.robot.session(0, "tcp://robot.test:1")
+        self.session = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(self.now)
         if self.session.state is State.ESTABLISHED:
             self.begun = self.robot.begun(STAMP)

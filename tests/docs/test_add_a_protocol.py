@@ -1,0 +1,53 @@
+"""The guide: its listings are the files of the example, nothing is missing, and it stays short."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+EXAMPLE = DOCS / "examples" / "khepera"
+GUIDE = (DOCS / "add-a-protocol.md").read_text()
+LISTINGS = re.findall(r"^```(?:python|toml) (\S+)\n(.*?)^```$", GUIDE, re.DOTALL | re.MULTILINE)
+FILES = ("pyproject.toml", *(str(path.relative_to(EXAMPLE)) for path in sorted((EXAMPLE / "khepera").glob("*.py"))))
+MOST_LINES = 250
+
+
+def lines(text: str) -> list[str]:
+    return [line for line in text.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_the_listings_of_a_file_put_together_are_the_file(file: str) -> None:
+    shown = [line for name, listing in LISTINGS if name == file for line in lines(listing)]
+    assert shown == lines((EXAMPLE / file).read_text())
+
+
+def test_every_listing_is_of_a_file_or_is_run() -> None:
+    assert {name for name, _ in LISTINGS} == {*FILES, "run"}
+    assert len(re.findall(r"^```\S", GUIDE, re.MULTILINE)) == len(LISTINGS)
+
+
+@pytest.mark.parametrize("program", [listing for name, listing in LISTINGS if name == "run"])
+def test_a_listing_of_no_file_runs(program: str) -> None:
+    exec(compile(program, "the guide", "exec", dont_inherit=True), {"__name__": "guide"})
+
+
+def test_the_protocol_takes_no_more_lines_than_the_guide_says() -> None:
+    files = [path for path in (EXAMPLE / "khepera").glob("*.py") if path.name != "simulator.py"]
+    assert sum(len(path.read_text().splitlines()) for path in files) <= MOST_LINES
+    assert f"{MOST_LINES} lines" in GUIDE
+
+
+def test_every_name_that_the_guide_imports_from_the_package_for_authors_is_there() -> None:
+    from zbridge import fleet, protocol
+
+    for name in re.findall(r"protocol\.([A-Z]\w+)", GUIDE):
+        assert hasattr(protocol, name), name
+    for name in ("ExchangeSession", "Session", "Odometry", "BearingScan", "Differential", "Factors", "DeviceClock"):
+        assert f"`{name}`" in GUIDE
+        assert hasattr(protocol, name)
+    for name in re.findall(r"`(CMD_\w+|POSE|MOTION|SCAN|SENSOR|TEXT)", GUIDE):
+        assert hasattr(fleet.topics, name), name

@@ -1,0 +1,84 @@
+"""The table of a session's states, and that a session does what it says."""
+
+from collections.abc import Callable
+
+import pytest
+
+from tests.protocol.test_session import LIMITS, WELCOME, Toy
+from zbridge.protocol.session import LINGER_S, State
+from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
+
+ORDER = list(State)
+EVENTS: dict[SessionEvent, Callable[[Toy], object]] = {
+    SessionEvent.OPEN: lambda session: session.open(1.0),
+    SessionEvent.AGREED: lambda session: session.establish("2.0", ()),
+    SessionEvent.CLOSE: lambda session: session.close("closed by us", 1.0),
+    SessionEvent.WRITTEN: lambda session: session.outgoing(1.0),
+    SessionEvent.OVERDUE: lambda session: session.expire(1.0 + LIMITS.handshake_s),
+    SessionEvent.LOST: lambda session: session.lost("closed by peer"),
+}
+
+
+def session_in(state: State) -> Toy:
+    session = Toy(LIMITS)
+    if state is not State.CONNECTING:
+        session.open(0.0)
+        session.outgoing(0.0)
+    if state is State.ESTABLISHED:
+        session.receive(WELCOME, 0.1)
+    if state in (State.CLOSING, State.CLOSED):
+        session.close("over", 0.2)
+    if state is State.CLOSED:
+        session.lost("over")
+    assert session.state is state
+    return session
+
+
+@pytest.mark.parametrize("event", SessionEvent)
+@pytest.mark.parametrize("state", State)
+def test_a_session_obeys_the_table_and_ignores_what_it_does_not_name(state: State, event: SessionEvent) -> None:
+    session = session_in(state)
+    _, wanted = TRANSITIONS[state].get(event, (None, state))
+    EVENTS[event](session)
+    assert session.state is wanted
+
+
+def test_every_state_has_a_row_and_every_event_and_action_a_place() -> None:
+    steps = [(event, action) for row in TRANSITIONS.values() for event, (action, _) in row.items()]
+    assert list(TRANSITIONS) == ORDER
+    assert {event for event, _ in steps} == set(SessionEvent)
+    assert {action for _, action in steps} == set(SessionAction)
+
+
+def test_a_session_only_moves_down_the_list() -> None:
+    for state, row in TRANSITIONS.items():
+        for event, (_, wanted) in row.items():
+            again = state is State.ESTABLISHED and event is SessionEvent.AGREED
+            assert ORDER.index(wanted) >= ORDER.index(state) + (not again)
+
+
+def test_an_ended_session_is_not_established_any_more() -> None:
+    for state in (State.CLOSING, State.CLOSED):
+        session = session_in(state)
+        session.establish("9.9", ("wings",))
+        assert (session.state, session.version, session.features) == (state, None, ())
+
+
+def test_the_first_reason_stands() -> None:
+    session = session_in(State.CLOSING)
+    session.lost("closed by peer")
+    assert session.reason == "over"
+
+
+def test_a_handshake_whose_limit_is_lifted_takes_as_long_as_its_own_timers() -> None:
+    session = session_in(State.HANDSHAKING)
+    session.lift_limit()
+    session.expire(1e9)
+    assert (session.state, session.deadline()) == (State.HANDSHAKING, None)
+
+
+def test_each_end_has_a_time_limit() -> None:
+    session = session_in(State.ESTABLISHED)
+    session.send(b"last words")
+    session.close("over", 2.0)
+    assert session.deadline(writing=False) == 2.0 + LINGER_S

@@ -1,0 +1,65 @@
+"""The right to drive a robot: its states, the inputs that change them, and the events that come of it. Sans-IO."""
+
+from __future__ import annotations
+
+from enum import Enum, StrEnum
+
+import msgspec
+
+from zbridge.errors import Code
+
+
+class State(StrEnum):
+    """The state of the right to drive; ``control`` shows the middle three as ``held``."""
+
+    FREE = "free"
+    HELD = "held"
+    MOVING = "moving"
+    HELD_BACK = "held back"
+    STOPPED = "stopped"
+
+
+class Input(StrEnum):
+    """What the authority is told."""
+
+    ACQUIRE = "acquire"
+    OUTRANK = "acquire with a higher priority"
+    TAKEOVER = "takeover"
+    RENEW = "renew"
+    RELEASE = "release"
+    MOTION = "motion carried out"
+    NEUTRAL = "neutral carried out"
+    DEADMAN = "deadman"
+    HOLD_BACK = "hold back"
+    STOP = "stop"
+    EXPIRED = "lease expired"
+    HOLDER_LOST = "holder lost"
+    BUS_LOST = "bus lost"
+
+
+class EventKind(Enum):
+    """What happened to the right to drive."""
+
+    ACQUIRED = "acquired"
+    TAKEN_OVER = "taken over"
+    RELEASED = "released"
+    REFUSED = "refused"
+    STOPPED = "stopped"
+    ENDED = "ended"
+
+
+class Event(msgspec.Struct, frozen=True):
+    """One event to write down. stops: whether the robot must be sent its stop now."""
+
+    what: EventKind
+    who: str | None = None
+    reason: str | None = None
+    priority: int | None = None
+    command: str | None = None
+    code: Code | None = None
+    stops: bool = False
+
+    def __str__(self) -> str:
+        who = f" {self.who}" if self.who else ""
+        command = f" {self.command}" if self.command else ""
+        return f"{self.what.value}{who}{command}{f' ({self.reason})' if self.reason else ''}"

@@ -1,0 +1,362 @@
+"""The lease as a program holds it: asks for it, renews it, proves commands, notices its loss. Sans-IO.
+
+Theory of operation. The machine is :attr:`LeaseClient.TABLE`, ``{state: {input: (action, next state)}}``;
+``docs/control.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing.
+
+FREE: no lease. ASKING: the question for one is on its way; DROPPED: so it is, but the lease is not wanted any more;
+RECALLED: it was dropped and is wanted again. PAUSED: the gateway could not answer, the question is repeated soon. HELD:
+commands may be sent. CHECKING: a renewal is on its way; DOUBTED: so it is, and news that came since need another one.
+RETURNING: the lease is being given back; WANTED: so it is, and is wanted again. Commands may be sent in HELD, CHECKING
+and DOUBTED.
+
+Whoever drives it calls :meth:`want`, :meth:`drop`, :meth:`look` for news from ``control``, :meth:`gateway_lost`, and
+:meth:`expire` at :meth:`deadline`; after each of them asks :meth:`question` and takes :meth:`events`; and hands what
+was replied to :meth:`answered`, with ``now``. :class:`zbridge.control.lease_holder.LeaseHolder` does so on a bus.
+
+Guarantees. At most one question is waited for. A reply to an earlier question changes nothing. A lease that is granted
+after it was dropped is given back. Every lease that ends without :meth:`drop` ends with one LOST event.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from typing import ClassVar, TypeAlias
+
+import msgspec
+
+from zbridge.bus import Answer
+from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind, Reply, code_of, passes, read
+from zbridge.control.proof import Signer
+from zbridge.control.refusal_news import RefusalNews
+from zbridge.errors import BusError, Code, PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
+from zbridge.fleet.topics import KeySpace
+
+ASK_S = 1.0
+"""The longest time that one question waits for its answer, seconds."""
+RETRY_S = 0.1
+"""Seconds between two questions to a gateway that does not answer, or cannot say."""
+LEASE_S = 3.0
+"""The length of a lease that does not tell its own, seconds."""
+
+
+class State(StrEnum):
+    """What a program has, and what it waits for."""
+
+    FREE = "free"
+    ASKING = "asking"
+    DROPPED = "dropped"
+    RECALLED = "recalled"
+    PAUSED = "paused"
+    HELD = "held"
+    CHECKING = "checking"
+    DOUBTED = "doubted"
+    RETURNING = "returning"
+    WANTED = "wanted"
+
+
+class Input(StrEnum):
+    """What the program wants, what was replied, and what is heard."""
+
+    WANT = "want"
+    DROP = "drop"
+    GRANTED = "granted"
+    DENIED = "denied"
+    LATER = "ask later"
+    CONFIRMED = "confirmed"
+    UNANSWERED = "unanswered"
+    ENDED = "ended"
+    RETURNED = "returned"
+    DOUBT = "doubt"
+    DUE = "due"
+    GATEWAY_LOST = "gateway lost"
+
+
+class Question(msgspec.Struct, frozen=True):
+    """A query about the lease, to be asked at once. returns: only after all commands before it are with the bus."""
+
+    key: str
+    payload: bytes
+    timeout_s: float
+    asked_at: float
+    returns: bool = False
+
+
+Row: TypeAlias = dict[Input, tuple[Callable[..., None], State]]
+
+
+class LeaseClient:
+    """The lease of one robot for one program. name: the one it is asked for in, with which ``request.who`` begins.
+
+    wait_s: for how many seconds a gateway that does not answer is asked again; then also, a lease is lost only by its
+    gateway's word or at its expiry. None: whatever is no grant is a denial, whatever is no confirmation a loss.
+    concerns: whether a refusal is news to this program.
+    """
+
+    def __init__(
+        self,
+        keys: KeySpace,
+        request: Acquire,
+        name: str,
+        *,
+        concerns: Callable[[Refusal], bool],
+        takeover: bool = False,
+        wait_s: float | None = None,
+    ) -> None:
+        self.keys = keys
+        self.request = request
+        self.renews = wait_s is not None
+        """Whether the lease is renewed three times in its length; else commands must do so."""
+        self.news = RefusalNews(concerns)
+        self._acquire_key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
+        self._wait_s = wait_s
+        self._state = State.FREE
+        self._signer: Signer | None = None
+        self._lease_s = LEASE_S
+        self._expires_at = self._due_at = math.inf
+        self._wait_until = -math.inf
+        self._waiting: Question | None = None
+        self._unasked: Question | None = None
+        self._later: Reply = None
+        """What the gateway said last when it could not decide."""
+        self._events: list[LeaseEvent] = []
+
+    def __repr__(self) -> str:
+        return f"<LeaseClient of {self.keys.robot} {self._state}>"
+
+    @property
+    def held(self) -> bool:
+        """Whether commands can be proven."""
+        return self._signer is not None
+
+    @property
+    def free(self) -> bool:
+        """Whether there is no lease, and no question on its way."""
+        return self._state is State.FREE
+
+    def prove(self, key: str, payload: bytes) -> bytes:
+        """Return the attachment of the next command on this key; only while :attr:`held`."""
+        assert self._signer is not None, "a command without a lease"
+        return self._signer.command(key, payload)
+
+    # What the program wants
+
+    def want(self, now: float) -> None:
+        """Get the lease."""
+        self._later = None
+        if self._wait_s is not None:
+            self._wait_until = now + self._wait_s
+        self._handle(Input.WANT, now)
+
+    def drop(self, now: float) -> None:
+        """Give the lease back, or give up asking for it."""
+        self._handle(Input.DROP, now)
+
+    # What is heard
+
+    def look(self, control: Control, now: float) -> list[Refusal]:
+        """Take news from ``control``, and return what was refused to this program since the last call."""
+        if self._signer is not None and control.lease != self._signer.lease:
+            self._handle(Input.DOUBT, now)
+        news = []
+        for refused in self.news.take(control):
+            if refused.code != Code.LEASE_ENDED:
+                news.append(refused)
+            elif refused.who is not None:  # of an earlier lease, or of this one: the gateway knows
+                self._handle(Input.DOUBT, now)
+        return news
+
+    def gateway_lost(self, now: float) -> None:
+        """Record that the robot's gateway is gone, and every lease with it."""
+        self._handle(
+            Input.GATEWAY_LOST, now, LeaseEvent.of(LeaseEventKind.LOST, BusError("the robot's gateway is gone"))
+        )
+
+    def answered(self, question: Question, replied: Sequence[Answer] | BusError, now: float) -> None:
+        """Take the replies to a question, or why it could not be asked."""
+        if question is not self._waiting:
+            return
+        self._waiting = None
+        reply = read(replied)
+        if question.returns:
+            self._handle(Input.RETURNED, now)
+        elif question.key == self._acquire_key:
+            self._on_acquire_reply(reply, now)
+        else:
+            self._on_renew_reply(question, reply, now)
+
+    # Time, questions and events
+
+    def deadline(self) -> float | None:
+        """Return when :meth:`expire` is next due; None: never."""
+        due = self._state is State.PAUSED or (self._state is State.HELD and self.renews)
+        return self._due_at if due else None
+
+    def expire(self, now: float) -> None:
+        """Do what is due: renew, or ask again."""
+        deadline = self.deadline()
+        if deadline is not None and now >= deadline:
+            self._handle(Input.DUE, now)
+
+    def question(self) -> Question | None:
+        """Return the question that must be asked now, once."""
+        question, self._unasked = self._unasked, None
+        return question
+
+    def events(self) -> list[LeaseEvent]:
+        """Return what happened since the last call, in order."""
+        events, self._events = self._events, []
+        return events
+
+    # Replies
+
+    def _on_acquire_reply(self, reply: Reply, now: float) -> None:
+        if isinstance(reply, Lease) and reply.ok:
+            try:
+                signer = Signer(reply)
+            except PayloadError as error:
+                reply = error
+            else:
+                self._handle(Input.GRANTED, now, signer, reply.expires_in_s)
+                return
+        if passes(reply):
+            self._later = reply = reply or self._later
+            if now < self._wait_until:
+                self._handle(Input.LATER, now)
+                return
+        self._handle(Input.DENIED, now, LeaseEvent.of(LeaseEventKind.DENIED, reply))
+
+    def _on_renew_reply(self, question: Question, reply: Reply, now: float) -> None:
+        confirmed = isinstance(reply, Lease) and reply.ok
+        if confirmed or code_of(reply) == Code.OUT_OF_ORDER:  # somebody repeated the question, and was first with it
+            expires_in_s = reply.expires_in_s if isinstance(reply, Lease) else None
+            self._handle(Input.CONFIRMED, now, question.asked_at + (expires_in_s or self._lease_s))
+        elif self._wait_s is None or (isinstance(reply, Lease) and not passes(reply)):
+            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, reply))
+        elif now >= self._expires_at:
+            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, None))
+        else:
+            self._handle(Input.UNANSWERED, now)
+
+    # The machine
+
+    def _handle(self, said: Input, *arguments: object) -> None:
+        """Carry out the table. A pair that it lacks changes nothing."""
+        entry = self.TABLE[self._state].get(said)
+        if entry is not None:
+            action, self._state = entry
+            action(self, *arguments)
+
+    def _wait(self, now: float, *rest: object) -> None:
+        """Do nothing before the answer comes."""
+
+    def _ask(self, now: float, *rest: object) -> None:
+        """Ask for the lease."""
+        left_s = max(RETRY_S, self._wait_until - now) if self._wait_s is not None else ASK_S
+        self._put(Question(self._acquire_key, payloads.encode(self.request), min(ASK_S, left_s), now))
+
+    def _pause(self, now: float) -> None:
+        """Ask again soon."""
+        self._due_at = min(now + RETRY_S, self._wait_until)
+
+    def _begin(self, now: float, signer: Signer, lease_s: float | None) -> None:
+        """Hold the lease."""
+        self._signer, self._lease_s = signer, lease_s or LEASE_S
+        self._expires_at, self._due_at = now + self._lease_s, now + self._lease_s / 3
+        self._events.append(LeaseEvent(LeaseEventKind.GRANTED, expires_in_s=lease_s))
+
+    def _tell(self, now: float, event: LeaseEvent) -> None:
+        """Tell the program why there is no lease."""
+        self._signer = None
+        self._events.append(event)
+
+    def _check(self, now: float, *rest: object) -> None:
+        """Renew the lease, or learn that it has ended."""
+        assert self._signer is not None
+        key = self.keys.key(topics.RPC_RENEW.path)
+        timeout_s = ASK_S if self._wait_s is None else min(ASK_S, self._lease_s / 3)
+        self._put(Question(key, self._signer.question(key), timeout_s, now))
+
+    def _extend(self, now: float, expires_at: float) -> None:
+        """Note how long the lease lasts at least."""
+        self._expires_at, self._due_at = expires_at, now + self._lease_s / 3
+
+    def _recheck(self, now: float, expires_at: float) -> None:
+        """Note how long the lease lasts at least, and renew it again."""
+        self._extend(now, expires_at)
+        self._check(now)
+
+    def _bear(self, now: float) -> None:
+        """Renew later."""
+        self._due_at = now + self._lease_s / 3
+
+    def _give_back(self, now: float, signer: Signer | None = None, lease_s: float | None = None) -> None:
+        """Release the lease."""
+        signer, self._signer = signer or self._signer, None
+        assert signer is not None
+        key = self.keys.key(topics.RPC_RELEASE.path)
+        self._put(Question(key, signer.question(key), ASK_S, now, returns=True))
+
+    def _put(self, question: Question) -> None:
+        self._waiting = self._unasked = question
+
+    _HELD: ClassVar[Row] = {
+        Input.DROP: (_give_back, State.RETURNING),
+        Input.GATEWAY_LOST: (_tell, State.FREE),
+        Input.ENDED: (_tell, State.FREE),
+    }
+    TABLE: ClassVar[dict[State, Row]] = {
+        State.FREE: {
+            Input.WANT: (_ask, State.ASKING),
+        },
+        State.ASKING: {
+            Input.GRANTED: (_begin, State.HELD),
+            Input.DENIED: (_tell, State.FREE),
+            Input.LATER: (_pause, State.PAUSED),
+            Input.DROP: (_wait, State.DROPPED),
+            Input.GATEWAY_LOST: (_tell, State.DROPPED),
+        },
+        State.DROPPED: {
+            Input.WANT: (_wait, State.RECALLED),
+            Input.GRANTED: (_give_back, State.RETURNING),
+            Input.DENIED: (_wait, State.FREE),
+            Input.LATER: (_wait, State.FREE),
+        },
+        State.RECALLED: {
+            Input.GRANTED: (_begin, State.HELD),
+            Input.DENIED: (_ask, State.ASKING),
+            Input.LATER: (_ask, State.ASKING),
+            Input.DROP: (_wait, State.DROPPED),
+            Input.GATEWAY_LOST: (_tell, State.DROPPED),
+        },
+        State.PAUSED: {
+            Input.DUE: (_ask, State.ASKING),
+            Input.DROP: (_wait, State.FREE),
+            Input.GATEWAY_LOST: (_tell, State.FREE),
+        },
+        State.HELD: _HELD | {Input.DOUBT: (_check, State.CHECKING), Input.DUE: (_check, State.CHECKING)},
+        State.CHECKING: _HELD
+        | {
+            Input.DOUBT: (_wait, State.DOUBTED),
+            Input.CONFIRMED: (_extend, State.HELD),
+            Input.UNANSWERED: (_bear, State.HELD),
+        },
+        State.DOUBTED: _HELD
+        | {
+            Input.CONFIRMED: (_recheck, State.CHECKING),
+            Input.UNANSWERED: (_check, State.CHECKING),
+        },
+        State.RETURNING: {
+            Input.WANT: (_wait, State.WANTED),
+            Input.RETURNED: (_wait, State.FREE),
+        },
+        State.WANTED: {
+            Input.RETURNED: (_ask, State.ASKING),
+            Input.DROP: (_wait, State.RETURNING),
+            Input.GATEWAY_LOST: (_tell, State.RETURNING),
+        },
+    }

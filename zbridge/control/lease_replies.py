@@ -1,0 +1,78 @@
+"""What questions about a lease come to: replies as they are read, and the events that come of them. Sans-IO."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import TypeAlias
+
+import msgspec
+
+from zbridge.bus import Answer
+from zbridge.errors import BusError, NotReady, PayloadError, Refused, TooFast, ZbridgeError, refusal
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.messages import Lease
+
+Reply: TypeAlias = Lease | ZbridgeError | None
+"""What a question came to: a lease, granted or not; the error instead of one; None: no gateway answered."""
+
+NO_ANSWER = "no gateway answers"
+_PASSING: tuple[str, ...] = (*NotReady.codes, *TooFast.codes)
+"""Codes that do not decide whose the lease is."""
+
+
+class LeaseEventKind(StrEnum):
+    """What happened to the lease."""
+
+    GRANTED = "granted"
+    DENIED = "denied"
+    LOST = "lost"
+
+
+class LeaseEvent(msgspec.Struct, frozen=True):
+    """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if told.
+
+    unanswered: whether no gateway said so. expires_in_s: how long the holder's lease lasts at least.
+    """
+
+    kind: LeaseEventKind
+    error: ZbridgeError | None = None
+    holder: str | None = None
+    expires_in_s: float | None = None
+    unanswered: bool = False
+
+    @classmethod
+    def of(cls, kind: LeaseEventKind, reply: Reply) -> LeaseEvent:
+        """Tell what was replied instead of a lease."""
+        if reply is None:
+            return cls(kind, BusError(NO_ANSWER), unanswered=True)
+        if isinstance(reply, Lease):
+            error = refusal(reply.code or "", reply.reason or "no reason given", holder=reply.holder)
+            return cls(kind, error, reply.holder, reply.expires_in_s)
+        return cls(kind, reply)
+
+
+def read(replied: Sequence[Answer] | BusError) -> Reply:
+    """Return the lease that was replied, else why it was not, else None."""
+    if isinstance(replied, BusError):
+        return replied
+    reply: Reply = None
+    for answer in replied:
+        if answer.error is None:
+            try:
+                return payloads.decode(Lease, answer.payload)
+            except PayloadError as error:
+                return error
+        if isinstance(answer.error, Refused):
+            reply = answer.error
+    return reply
+
+
+def code_of(reply: Reply) -> str | None:
+    """Return the code of a refusal."""
+    return reply.code if isinstance(reply, Lease | Refused) else None
+
+
+def passes(reply: Reply) -> bool:
+    """Return whether this decides nothing about the lease: no reply, or a gateway that cannot say now."""
+    return reply is None or code_of(reply) in _PASSING

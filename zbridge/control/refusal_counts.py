@@ -1,0 +1,40 @@
+"""The refusals that ``control`` shows, each different one with its count. Sans-IO."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from zbridge.control.wishes import NAMED
+from zbridge.errors import Code, Refused
+from zbridge.fleet.messages import Refusal
+
+REFUSALS = 16
+"""Different refusals that ``control`` shows; a new one replaces the one that was counted least recently."""
+_EXPLAINED = 200
+"""Characters of a reason that are kept."""
+
+
+class RefusalCounts:
+    """Counts refusals that agree in sender, command, code, reason and listener; keeps the last :data:`REFUSALS`."""
+
+    def __init__(self) -> None:
+        self._counts: OrderedDict[tuple[str | None, str, Code, str, str | None], int] = OrderedDict()
+
+    def __repr__(self) -> str:
+        return f"<RefusalCounts of {len(self._counts)} different refusals>"
+
+    def add(self, command: str, refused: Refused, who: str | None, by: str | None, count: int) -> Refusal:
+        """Count a refusal and return it as it is shown, with its total. Names and reasons are shortened."""
+        who, command, reason = who and who[:NAMED], command[:NAMED], str(refused)[:_EXPLAINED]
+        key = (who, command, refused.code, reason, by)
+        self._counts[key] = total = self._counts.pop(key, 0) + count
+        if len(self._counts) > REFUSALS:
+            self._counts.popitem(last=False)
+        return Refusal(who=who, command=command, code=refused.code, reason=reason, count=total, by=by)
+
+    def shown(self) -> tuple[Refusal, ...]:
+        """Return all refusals that are kept, the newest last."""
+        return tuple(
+            Refusal(who=who, command=command, code=code, reason=reason, count=count, by=by)
+            for (who, command, code, reason, by), count in self._counts.items()
+        )

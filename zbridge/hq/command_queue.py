@@ -1,0 +1,106 @@
+"""Commands of one HQ program that need the lease, on their way to the bus: in order, bounded, never too late."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import msgspec
+
+from zbridge.control.lease_client import LeaseClient
+from zbridge.errors import BusError, Code, NotReady
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor
+from zbridge.fleet.topics import Topic
+from zbridge.hq.bridge import Bridge
+
+log = logging.getLogger("zbridge.hq")
+
+WAITING = 64
+"""Commands of one client that may wait for the bus besides motion; one more is refused."""
+
+
+class CommandQueue:
+    """Puts commands on the bus. Each is numbered when it is put, so none may overtake another.
+
+    A drive is put at once. All other commands are written by a thread of the bus: the next command waits until the
+    bus has them. What waits longer than its sender means it is dropped. late: called when the queue goes on; returns
+    whether motion must not be sent any more.
+    """
+
+    def __init__(self, bridge: Bridge, lease: LeaseClient, *, who: str, late: Callable[[], bool]) -> None:
+        self._bridge = bridge
+        self._lease = lease
+        self._who = who
+        self._late = late
+        self._waiting: list[tuple[Topic, FleetMessage]] = []
+        self._writing = False
+        self._light = False
+
+    def __repr__(self) -> str:
+        return f"<CommandQueue of {self._who}, {len(self._waiting)} waiting>"
+
+    def send(self, topic: Topic, message: FleetMessage) -> None:
+        """Put a command on the bus after those before it; raise NotReady if too many wait."""
+        if self._writing or not self._lease.held:
+            self.wait(topic, message)
+        else:
+            self.put(topic, message)
+
+    def put(self, topic: Topic, message: FleetMessage) -> None:
+        """Put a command on the bus now."""
+        if isinstance(message, Drive):
+            message = self._lit(message)
+        self._bridge.put(topic, message, self._lease)
+        if topic is not topics.CMD_DRIVE:
+            self._writing = True
+            self._bridge.spawn(self._written())
+
+    def wait(self, topic: Topic, message: FleetMessage) -> None:
+        """Keep a command for later, of motion only the newest of each key; raise NotReady if too many wait."""
+        if isinstance(message, Drive | Motor):
+            self._waiting = [entry for entry in self._waiting if entry[0].path != topic.path]
+        elif len(self._waiting) >= WAITING:
+            raise NotReady(f"{WAITING} commands wait for the bus", Code.BUSY)
+        self._waiting.append((topic, message))
+
+    def begin(self) -> list[tuple[Topic, FleetMessage]]:
+        """Start a new lease: the light is unknown; return what waited for it."""
+        self._light = False
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+    def resume(self, waiting: list[tuple[Topic, FleetMessage]]) -> None:
+        """Send what waited for the lease and is not late."""
+        for topic, message in waiting:
+            if not self._overdue(message):
+                self.send(topic, message)
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self._waiting.clear()
+
+    async def _written(self) -> None:
+        try:
+            await self._bridge.bus.flush()
+        except BusError as error:
+            log.warning("%s: %s", self._who, error)
+        self._writing = False
+        while self._waiting and not self._writing and self._lease.held:
+            topic, message = self._waiting.pop(0)
+            if not self._overdue(message):
+                self.send(topic, message)
+
+    def _overdue(self, message: FleetMessage) -> bool:
+        """Return whether this is motion that waited until neutral had to come first."""
+        neutral = isinstance(message, Drive | Motor) and not message.moving
+        return self._late() and not neutral and not isinstance(message, Mode)
+
+    def _lit(self, message: Drive) -> Drive:
+        """Leave the light out unless it changes: programs repeat it with every command."""
+        if message.light is None:
+            return message
+        if message.light == self._light:
+            return msgspec.structs.replace(message, light=None)
+        self._light = message.light
+        return message

@@ -1,0 +1,41 @@
+"""What one session may carry, and what it has carried. Sans-IO."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+
+
+class Limits(msgspec.Struct, frozen=True):
+    """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes.
+
+    ``rate_hz``: frames a second that the peer may send, a second's worth at once; one more ends the session.
+    """
+
+    frame_bytes: int
+    handshake_s: float
+    gap_s: float = 0.0
+    rate_hz: float = math.inf
+
+
+class Datagram(bytes):
+    """A frame that goes by datagram; every other frame goes by the stream."""
+
+
+class Traffic(msgspec.Struct):
+    """Counters of one session."""
+
+    frames_in: int = 0
+    frames_out: int = 0
+    bytes_in: int = 0
+    bytes_out: int = 0
+    malformed: int = 0
+    foreign: int = 0
+    """Datagrams from other sources than the peer."""
+    dropped: int = 0
+    """Frames that found no place in the queue."""
+    refused: int = 0
+    """Commands of the peer that were not carried out."""
+    unanswered: int = 0
+    """Requests that the peer did not answer in time."""

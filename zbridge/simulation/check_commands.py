@@ -1,0 +1,148 @@
+"""Conformance of commands: the stop goes first, and each command is carried out or refused with a code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from zbridge.errors import EncodeError, Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, SensorSetting, Switch, Text
+from zbridge.fleet.topics import Topic
+from zbridge.protocol.plugin import Protocol
+from zbridge.protocol.session import State
+from zbridge.simulation.check_report import Finding
+from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
+
+STOP_S = 0.5
+"""Seconds for which the stop is repeated."""
+WATCHED_S = 0.4
+"""Virtual seconds in which a command has to have an effect."""
+MORE_FRAMES = 20
+"""Frames of the robot after the handshake."""
+
+
+def check_stop(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+    """Check that the stop is the next thing written, and that motion that waits is not sent after it."""
+    claim = "the stop goes before all that waits, and no motion after it"
+    try:
+        yield Finding.of(claim, _stop(protocol, recording))
+    except Exception as error:  # whatever the protocol's own code raises is a finding
+        yield Finding.broken(claim, error)
+    claim = "a stop before the first connection is refused or ignored"
+    try:
+        robot_of(protocol).stop(0.0, 0.0)
+    except Refused:
+        pass
+    except Exception as error:
+        yield Finding.broken(claim, error)
+        return
+    yield Finding(claim)
+
+
+def _stop(protocol: Protocol, recording: Recording) -> list[str]:
+    standing, driven = _established(protocol, recording), _established(protocol, recording)
+    idle = set(standing.run(WATCHED_S))
+    standing.robot.stop(standing.now, standing.now)
+    written = set(standing.run(WATCHED_S))
+    stop = written - idle or written
+    if not stop:
+        return ["a stop writes nothing"]
+    _give(driven, topics.CMD_DRIVE, FORWARD)
+    motion = set(driven.run(WATCHED_S)) - idle - stop
+    if not motion:
+        return ["a drive writes nothing that a stop does not write: nothing can be told from it"]
+    queued = _established(protocol, recording)
+    for topic, commands in _commands(protocol):
+        for command in commands if topic is not topics.CMD_MODE else ():
+            _give(queued, topic, command)
+    _give(queued, topics.CMD_DRIVE, FORWARD)
+    queued.robot.stop(queued.now, queued.now + STOP_S)
+    first, *later = queued.run(WATCHED_S) or [b""]
+    problems = [] if first in stop else [f"{first!r} is written before the stop"]
+    return problems + [f"{frame!r} moves the robot after its stop" for frame in later if frame in motion]
+
+
+def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+    """Check that every fleet command has an effect or is refused; a question likewise."""
+    for topic, commands in _commands(protocol):
+        claim = f"{topic.path} is carried out or refused with a code"
+        try:
+            rehearsal = _established(protocol, recording)
+            results = [_carry_out(rehearsal, topic, command) for command in commands]
+        except Exception as error:  # whatever the protocol's own code raises is a finding
+            yield Finding.broken(claim, error)
+            continue
+        silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
+        yield Finding(claim, silent, next(filter(None, results), ""))
+    yield from (_question(protocol, recording, topic) for topic in (topics.MAP, topics.POSE))
+
+
+def _commands(protocol: Protocol) -> tuple[tuple[Topic, tuple[FleetMessage, ...]], ...]:
+    return (*COMMANDS, (topics.CMD_RAW(protocol.name), (Raw(200, b"body"), Raw(1, b""))))
+
+
+def _question(protocol: Protocol, recording: Recording, topic: Topic) -> Finding:
+    claim = f"a question for {topic.path} is answered, asked or refused"
+    try:
+        rehearsal = _established(protocol, recording)
+        idle = set(rehearsal.run(WATCHED_S))
+        if rehearsal.robot.known(topic) is not None:
+            return Finding(claim, None, "answered")
+        rehearsal.robot.ask(topic)
+        asked = set(rehearsal.run(WATCHED_S)) - idle
+        return Finding(claim, None, "asked") if asked else Finding(claim, "nothing is written for it")
+    except Refused as refusal:
+        return Finding(claim, None, refusal.code)
+    except Exception as error:
+        return Finding.broken(claim, error)
+
+
+def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
+    """Give what became of a command; an empty text where nothing did."""
+    idle = set(rehearsal.run(WATCHED_S))
+    outcome = _give(rehearsal, topic, command)
+    if outcome:
+        return outcome
+    if set(rehearsal.run(WATCHED_S)) - idle:
+        return "carried out"
+    if rehearsal.session.over:
+        raise RuntimeError(f"the session ended: {rehearsal.session.reason}")
+    return ""
+
+
+def _give(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:
+    """Give a command; tell its code where it is refused, and what it shows or leaves out."""
+    try:
+        outcome = rehearsal.robot.command(topic, command, rehearsal.now)
+    except Refused as refusal:
+        return str(refusal.code)
+    except EncodeError:
+        return "malformed"
+    return "left out" if outcome.left_out else "shown" if outcome.telemetry else ""
+
+
+def _established(protocol: Protocol, recording: Recording) -> Rehearsal:
+    rehearsal = Rehearsal(protocol, recording)
+    frames = rehearsal.establish()
+    rehearsal.play(recording.heard[frames : frames + MORE_FRAMES])
+    if rehearsal.session.state is not State.ESTABLISHED:
+        raise RuntimeError(f"{rehearsal.session!r} after what established it before")
+    return rehearsal
+
+
+FORWARD = Drive(forward=0.5)
+COMMANDS: tuple[tuple[Topic, tuple[FleetMessage, ...]], ...] = (
+    (topics.CMD_DRIVE, (FORWARD, Drive(turn=0.5), Drive(left=0.5), Drive(forward=-0.5, left=0.1, light=True), Drive())),
+    (topics.CMD_MODE, (Mode(mode="manual"), Mode(mode="autonomous"), Mode(mode="none"))),
+    (topics.CMD_LIGHT, (Switch(on=True), Switch(on=False))),
+    (topics.CMD_LIDAR, (Switch(on=True), Switch(on=False))),
+    (topics.CMD_CAMERA, (Switch(on=True), Switch(on=False))),
+    (topics.CMD_TEXT, (Text(text="hello"), Text(text="Grüße"), Text(text=""))),
+    (topics.CMD_SCAN, (Scan(-1.0, 0.5, 0.1, 10.0, np.array([1.0, 2.0, np.nan], np.float32)),)),
+    (topics.CMD_MOTOR("nobody"), (Motor(1.0), Motor(0.0))),
+    (topics.CMD_SENSOR("nobody"), (SensorSetting(enable=True), SensorSetting(index=0, value=1.0))),
+    (topics.CMD_RAW("nobody"), (Raw(1, b"body"),)),
+)
+"""Every fleet command but the protocol's own raw ones."""

@@ -1,0 +1,160 @@
+"""Conformance of messages: they round-trip, and any bytes in any cut give messages or ProtocolError."""
+
+from __future__ import annotations
+
+import random
+import types
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, get_args, get_origin
+
+import msgspec
+import numpy as np
+
+from zbridge.errors import EncodeError, ProtocolError
+from zbridge.protocol.codec import Codec
+from zbridge.protocol.plugin import Protocol
+from zbridge.simulation.check_report import Finding, raised
+from zbridge.wire import Whole
+from zbridge.wire.frames import FrameBuffer
+
+MOST_BYTES = 2**20
+RANDOM_CASES = 500
+RANDOM_BYTES = 60
+
+
+def check_messages(protocol: Protocol) -> Iterator[Finding]:
+    """Check every codec of a protocol."""
+    if not protocol.codecs:
+        yield Finding("messages are declared", "Protocol.codecs is empty: nothing can be checked")
+    for codec in protocol.codecs:
+        messages, problems = _examples(codec)
+        frames = _frames(codec, messages, problems)
+        yield Finding.of(f"{codec.name}: {len(codec.messages)} messages round-trip", problems)
+        yield Finding.of(f"{codec.name}: whole, byte by byte and joined give the same", _cuts(codec, frames))
+        yield Finding.of(f"{codec.name}: what is cut off is a message or a ProtocolError", _truncated(codec, frames))
+        yield Finding.of(f"{codec.name}: random bytes are a message or a ProtocolError", _random(codec, frames))
+
+
+def example(declared: type) -> Any:
+    """Make an example of a message class: fields without a default get a value of their type."""
+    values = {
+        field.name: _value(field.type)
+        for field in msgspec.structs.fields(declared)
+        if field.required  # the default of another field is its example
+    }
+    return declared(**values)
+
+
+def _value(hint: Any) -> Any:
+    whole = None
+    if get_origin(hint) is Annotated:
+        hint, *marks = get_args(hint)
+        whole = next((mark for mark in marks if isinstance(mark, Whole)), None)
+    if get_origin(hint) is types.UnionType:
+        hint = get_args(hint)[0]
+    if get_origin(hint) is np.ndarray:
+        (dtype,) = get_args(get_args(hint)[1])
+        return np.array([1, 2], dtype)
+    if hint is int and whole is not None:
+        return max(whole.low, min(whole.high, 1))
+    return _VALUES[hint]
+
+
+def _examples(codec: Codec) -> tuple[list[Any], list[str]]:
+    messages, problems = [], []
+    for declared in codec.messages:
+        try:
+            messages.append(example(declared) if isinstance(declared, type) else declared)
+        except (KeyError, TypeError) as error:
+            problems.append(f"no example of {declared} can be made ({error!r}): list an instance of it")
+    return messages, problems
+
+
+def _frames(codec: Codec, messages: list[Any], problems: list[str]) -> list[bytes]:
+    """Write and read every example; add what is wrong to ``problems``."""
+    frames = []
+    for message in messages:
+        try:
+            frame = codec.write(message)
+            again = codec.read(frame)
+            frames.append(frame)
+            if not _same(message, again):
+                problems.append(f"{message} was read as {again}")
+            elif codec.write(again) != frame:
+                problems.append(f"{message} is written as {frame!r}, and as {codec.write(again)!r} once read")
+        except Exception as error:  # whatever the protocol's own code raises is a finding
+            problems.append(f"{message}: {raised(error)}")
+    return frames
+
+
+def _same(one: Any, other: Any) -> bool:
+    if type(one) is not type(other):
+        return False
+    if not isinstance(one, msgspec.Struct):
+        return bool(one == other)
+    pairs = zip(msgspec.structs.astuple(one), msgspec.structs.astuple(other), strict=True)
+    return all(np.array_equal(mine, its) if isinstance(mine, np.ndarray) else mine == its for mine, its in pairs)
+
+
+def _cuts(codec: Codec, frames: list[bytes]) -> list[str]:
+    problems: list[str] = []
+    for frame in frames:
+        for what, parts in (("whole", [frame]), ("byte by byte", [frame[i : i + 1] for i in range(len(frame))])):
+            _try(problems, f"{frame!r} {what}", lambda parts=parts: _cut(codec, parts), [frame])  # type: ignore[misc]
+    _try(problems, "all messages joined", lambda: _cut(codec, [b"".join(frames)]), frames)
+    return problems
+
+
+def _cut(codec: Codec, parts: list[bytes]) -> list[bytes]:
+    buffer = FrameBuffer(codec.frame_end, MOST_BYTES)
+    return [frame for part in parts for frame in buffer.feed(part)]
+
+
+def _try(problems: list[str], what: str, cut: Callable[[], list[bytes]], expected: list[bytes]) -> None:
+    try:
+        found = cut()
+    except Exception as error:
+        problems.append(f"{what}: {raised(error)}")
+        return
+    if found != expected:
+        problems.append(f"{what} is cut to {found!r}, expected {expected!r}")
+
+
+def _truncated(codec: Codec, frames: list[bytes]) -> list[str]:
+    return _fed(codec, [frame[:size] for frame in frames for size in range(1, len(frame))])
+
+
+def _random(codec: Codec, frames: list[bytes]) -> list[str]:
+    """Feed noise, and messages of which one byte was changed."""
+    rng = random.Random(1)
+    noise = [rng.randbytes(rng.randint(1, RANDOM_BYTES)) for _ in range(RANDOM_CASES)]
+    changed = []
+    for frame in frames:
+        for _ in range(20):
+            place = rng.randrange(len(frame))
+            changed.append(frame[:place] + rng.randbytes(1) + frame[place + 1 :])
+    return _fed(codec, noise + changed)
+
+
+def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
+    """Read every stream, and every piece of it as a frame; list what raised anything but ProtocolError."""
+    problems: dict[str, str] = {}
+    for stream in streams:
+        try:
+            for frame in FrameBuffer(codec.frame_end, MOST_BYTES).feed(stream):
+                _read(codec, frame)
+        except ProtocolError:
+            pass
+        except Exception as error:
+            problems.setdefault(raised(error), f"{stream!r}: {raised(error)}")
+    return list(problems.values())
+
+
+def _read(codec: Codec, frame: bytes) -> None:
+    try:
+        codec.write(codec.read(frame))
+    except (ProtocolError, EncodeError):
+        return
+
+
+_VALUES: dict[Any, Any] = {int: 1, float: 0.5, bool: True, str: "ab", bytes: b"ab"}

@@ -1,0 +1,104 @@
+"""Conformance of the simulated robot: it drives when it is told to, and stands after its stop."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import Iterator
+
+from zbridge.errors import Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, Mode, Motion, Pose
+from zbridge.protocol.plugin import Protocol
+from zbridge.simulation.check_report import Finding
+from zbridge.simulation.check_stage import Live, live
+
+DRIVE_S = 1.0
+AGAIN_S = 0.1
+IDLE_S = 0.3
+STAND_S = 0.7
+"""Seconds after a stop in which the robot has to come to rest."""
+WATCHED_S = 1.2
+MOVED_M = 0.02
+MOVING = 0.05
+"""The speed, of full scale, at which a robot moves."""
+
+
+def check_motion(protocol: Protocol, establish_s: float) -> Iterator[Finding]:
+    """Drive the simulated robot forward, then stop it, and see what it shows or what is written."""
+    try:
+        yield from asyncio.run(_drive_and_stop(protocol, establish_s))
+    except Exception as error:  # whatever the protocol's own code raises is a finding
+        yield Finding.broken("the simulated robot drives and stands", error)
+
+
+async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[Finding]:
+    async with live(protocol) as scene:
+        if not await scene.established(establish_s):
+            return [Finding("the simulated robot drives and stands", "a second session is not established")]
+        clock = asyncio.get_running_loop().time
+        scene.robot.begun(1)
+        with contextlib.suppress(Refused):  # where a mode is needed or known
+            scene.robot.command(topics.CMD_MODE, Mode(mode="manual"), clock())
+        idle = await _watch(scene, IDLE_S)
+        for _ in range(round(DRIVE_S / AGAIN_S)):
+            scene.robot.command(topics.CMD_DRIVE, Drive(forward=0.4), clock())
+            await _watch(scene, AGAIN_S, keep=True)
+        drive = _Seen(scene)
+        scene.robot.stop(clock(), clock() + STAND_S / 2)
+        stop = await _watch(scene, STAND_S)
+        stand = await _watch(scene, WATCHED_S)
+        return [drive.moves(idle), stand.stands(stop, drive)]
+
+
+async def _watch(scene: Live, seconds: float, *, keep: bool = False) -> _Seen:
+    """Let the robot live; give what it showed. ``keep``: what it showed before counts too."""
+    if not keep:
+        scene.shown.clear()
+        scene.frames.clear()
+    scene.pump()
+    await asyncio.sleep(seconds)
+    return _Seen(scene)
+
+
+class _Seen:
+    """What a robot showed of its motion, and what was written."""
+
+    def __init__(self, scene: Live) -> None:
+        self.poses: list[Pose] = []
+        self.speeds: list[float] = []
+        self.written = {frame for direction, frame in scene.frames if direction == "out"}
+        for _, shown in scene.shown:
+            self.poses += [shown] if isinstance(shown, Pose) else []
+            self.speeds += [shown.speed] if isinstance(shown, Motion) and shown.speed is not None else []
+
+    @property
+    def way_m(self) -> float:
+        """How far the robot is from where it was first."""
+        first, last = self.poses[0], self.poses[-1]
+        return math.hypot(last.x - first.x, last.y - first.y)
+
+    def moves(self, idle: _Seen) -> Finding:
+        """Tell whether it moved, or at least was told so."""
+        claim = "the simulated robot drives"
+        if not self.poses and not self.speeds:
+            told = bool(self.written - idle.written)
+            return Finding(claim, None if told else "nothing is written for a drive", "seen on the wire only")
+        if self.poses and self.way_m < MOVED_M:
+            return Finding(claim, f"it moved {self.way_m:.3f} m in {DRIVE_S:g} s")
+        if self.speeds and max(map(abs, self.speeds)) < MOVING:
+            return Finding(claim, f"it shows a speed of {max(map(abs, self.speeds)):g}")
+        return Finding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
+
+    def stands(self, stop: _Seen, drive: _Seen) -> Finding:
+        """Tell whether it stood after the stop, or at least was told so."""
+        claim = "the simulated robot stands after its stop"
+        if not self.poses and not self.speeds:
+            told = bool(stop.written - drive.written)
+            return Finding(claim, None if told else "nothing is written for a stop", "seen on the wire only")
+        if self.poses and self.way_m > MOVED_M:
+            return Finding(claim, f"it moves on: {self.way_m:.3f} m in {WATCHED_S:g} s")
+        if self.speeds and abs(self.speeds[-1]) > MOVING:
+            return Finding(claim, f"it shows a speed of {self.speeds[-1]:g}")
+        return Finding(claim)

@@ -1,0 +1,44 @@
+"""What a check of the conformance kit says: one claim, and why it does not hold where it does not."""
+
+from __future__ import annotations
+
+import traceback
+
+import msgspec
+
+
+class Finding(msgspec.Struct, frozen=True):
+    """One line of the report. ``problem`` None: the claim holds. ``note``: what a reader should know of it."""
+
+    claim: str
+    problem: str | None = None
+    note: str = ""
+
+    @classmethod
+    def of(cls, claim: str, problems: list[str], note: str = "") -> Finding:
+        """Make the finding of a claim that was tried in many ways: the first problems are shown."""
+        if not problems:
+            return cls(claim, None, note)
+        more = f" (and {len(problems) - _SHOWN} more)" if len(problems) > _SHOWN else ""
+        return cls(claim, "; ".join(problems[:_SHOWN]) + more, note)
+
+    @classmethod
+    def broken(cls, claim: str, error: BaseException) -> Finding:
+        """Make the finding of a claim whose check ended with an exception."""
+        return cls(claim, raised(error))
+
+    def __str__(self) -> str:
+        note = f" ({self.note})" if self.note else ""
+        return (
+            f"ok    {self.claim}{note}" if self.problem is None else f"FAIL  {self.claim}{note}\n      {self.problem}"
+        )
+
+
+def raised(error: BaseException) -> str:
+    """Say what was raised, and where."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" at {frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
+
+
+_SHOWN = 3

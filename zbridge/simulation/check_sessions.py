@@ -1,0 +1,109 @@
+"""Conformance of sessions: established against the simulated robot; garbage, silence and the end at each step."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+
+from zbridge.errors import ProtocolError
+from zbridge.fleet import payload as payloads
+from zbridge.protocol.plugin import Protocol
+from zbridge.protocol.session import State
+from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
+
+STEPS = 12
+"""Steps of a long handshake at which something goes wrong."""
+SEEDS = 4
+GARBAGE_BYTES = 80
+
+
+def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
+    """Check the session of the driving link."""
+    yield Finding("the session with the simulated robot is established", recording.reason)
+    if not recording.established:
+        return
+    yield Finding.of(
+        f"{len(recording.messages)} messages of the robot are translated", _translated(protocol, recording)
+    )
+    try:
+        steps = _steps(protocol, recording)
+    except Exception as error:
+        yield Finding.broken("what the robot said establishes a session again", error)
+        return
+    tried = f"{len(steps)} steps of the handshake"
+    for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):
+        problems = [problem for step in steps for problem in _at(step, protocol, recording, go_wrong)]
+        yield Finding.of(f"{claim} at {tried} ends or spares the session", problems)
+
+
+def _steps(protocol: Protocol, recording: Recording) -> list[int]:
+    """List after how many frames of the robot something goes wrong: 0, all of the handshake, and some between."""
+    rehearsal = Rehearsal(protocol, recording)
+    frames = rehearsal.establish()
+    if rehearsal.session.state is not State.ESTABLISHED:
+        raise ProtocolError(f"{rehearsal.session!r} after the {frames} frames that established it before")
+    return sorted({round(frames * step / STEPS) for step in range(STEPS + 1)} | {frames})
+
+
+def _at(
+    step: int,
+    protocol: Protocol,
+    recording: Recording,
+    go_wrong: Callable[[Rehearsal, list[bytes]], Iterator[str]],
+) -> Iterator[str]:
+    try:
+        for seed in range(SEEDS):
+            rehearsal = Rehearsal(protocol, recording)
+            rehearsal.play(recording.heard[:step])
+            noise = random.Random(seed).randbytes(GARBAGE_BYTES)
+            for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
+                yield f"after {step} frames: {problem}"
+    except Exception as error:  # whatever the protocol's own code raises is a finding
+        yield f"after {step} frames: {raised(error)}"
+
+
+def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
+    rehearsal.play(frames)
+    rehearsal.run(1.0)
+    yield from _told(rehearsal)
+
+
+def _silence(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
+    limit_s = rehearsal.session.limits.handshake_s + 1.0
+    rehearsal.run(limit_s, answers=False)
+    if rehearsal.session.state in (State.CONNECTING, State.HANDSHAKING):
+        yield f"still {rehearsal.session.state.value} after {limit_s:g} s of silence"
+    yield from _told(rehearsal)
+
+
+def _lost(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
+    session = rehearsal.session
+    session.lost("closed by peer")
+    rehearsal.run(1.0)
+    if session.state is not State.CLOSED or session.deadline() is not None or session.receive(frames[0], rehearsal.now):
+        yield f"{session!r} still does something when its connection is gone"
+    yield from _told(rehearsal)
+
+
+def _told(rehearsal: Rehearsal) -> Iterator[str]:
+    if rehearsal.session.over and not rehearsal.session.reason:
+        yield "ended without a reason"
+
+
+def _translated(protocol: Protocol, recording: Recording) -> list[str]:
+    """Translate what the robot sent; telemetry has to be what its topic promises."""
+    robot, problems = robot_of(protocol), []
+    for name in robot.link_names:
+        robot.session(name, "tcp://robot.test:1")
+    if not recording.messages:
+        problems.append("the simulated robot sent none")
+    for message in recording.messages:
+        try:
+            for topic, shown in robot.telemetry(message, 1):
+                payloads.decode(topic.message, payloads.encode(shown))
+        except ProtocolError:
+            continue
+        except Exception as error:
+            problems.append(f"{message}: {raised(error)}")
+    return problems

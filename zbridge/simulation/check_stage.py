@@ -1,0 +1,213 @@
+"""The stage of the conformance kit: a protocol's simulated robot on loopback, and rehearsals of what it said.
+
+:func:`record` runs the simulated robot and a conversation with each of its links, and keeps what was said. A
+:class:`Rehearsal` plays that to a new session without any link, in a time of its own: so each step of a handshake can
+go wrong on purpose, and hours pass at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+import msgspec
+
+from zbridge.address import Address
+from zbridge.errors import ProtocolError
+from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
+from zbridge.protocol.plugin import Protocol, Robot, Simulation
+from zbridge.protocol.session import Session, State
+from zbridge.transport.conversation import Conversation
+from zbridge.transport.tcp import connect
+
+SHOWN_S = 1.0
+"""Seconds that a recording goes on after the session was established."""
+HANG_UP_S = 0.2
+"""Seconds that the simulated robot is given to see that its peer is gone."""
+STEP_S = 0.01
+"""Virtual seconds between two frames of a rehearsal."""
+_MOST_WRITES = 10_000
+_MOST_FRAMES = 400
+_ANSWER_FRAMES = 8
+
+
+class Recording(msgspec.Struct):
+    """What was said on the driving link, and whether all links were established. ``answers``: what followed a frame."""
+
+    heard: list[bytes] = []
+    answers: dict[bytes, list[bytes]] = {}
+    messages: list[Any] = []
+    established: bool = False
+    reason: str | None = None
+
+
+def robot_of(protocol: Protocol) -> Robot:
+    """Make the device side as it fits the simulated robot."""
+    return protocol.robot(msgspec.convert(protocol.simulated, protocol.options), protocol.links, Metrics())
+
+
+class Live:
+    """A robot object with a conversation on each link of the simulated robot."""
+
+    def __init__(self, protocol: Protocol) -> None:
+        self.robot = robot_of(protocol)
+        self.sessions: list[Session[Any]] = []
+        self.frames: list[tuple[str, bytes]] = []
+        """What was said on the first link: ``in`` or ``out``, and the frame."""
+        self.messages: list[Any] = []
+        """What the sessions handed on."""
+        self.shown: list[tuple[Topic, FleetMessage]] = []
+        self._conversations: list[Conversation] = []
+
+    async def connect(self, addresses: tuple[Address, ...]) -> None:
+        """Begin a conversation with each link of the simulated robot."""
+        loop = asyncio.get_running_loop()
+        for name, address in zip(self.robot.link_names, addresses, strict=True):
+            session = self.robot.session(name, str(address))
+            if not self.sessions:
+                session.tap = lambda direction, frame: self.frames.append((direction, frame))
+            self.sessions.append(session)
+            self._conversations.append(Conversation(session, loop, deliver=self._deliver))
+            await connect(address, self._conversations[-1])
+
+    def _deliver(self, messages: list[Any]) -> None:
+        self.messages += messages
+        for message in messages:
+            with contextlib.suppress(ProtocolError):
+                self.shown += self.robot.telemetry(message, 1)
+
+    async def established(self, within_s: float) -> bool:
+        """Wait until all links are established, for at most ``within_s`` seconds."""
+        deadline = asyncio.get_running_loop().time() + within_s
+        while asyncio.get_running_loop().time() < deadline and not any(session.over for session in self.sessions):
+            if all(session.state is State.ESTABLISHED for session in self.sessions):
+                return True
+            await asyncio.sleep(STEP_S)
+        return False
+
+    def pump(self) -> None:
+        """Write what may be written."""
+        for conversation in self._conversations:
+            conversation.pump()
+
+    def close(self) -> None:
+        """End the conversations."""
+        for conversation in self._conversations:
+            conversation.abandon()
+
+
+@contextlib.asynccontextmanager
+async def live(protocol: Protocol) -> AsyncIterator[Live]:
+    """Run the simulated robot on loopback and connect to it."""
+    ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    addresses = tuple(Address("127.0.0.1", 0) for _ in range(protocol.links))
+    simulated = asyncio.ensure_future(protocol.simulate(Simulation(addresses, ready=ready.set_result)))
+    scene = Live(protocol)
+    try:
+        parts: tuple[asyncio.Future[Any], ...] = (simulated, ready)
+        await asyncio.wait(parts, timeout=5.0, return_when=asyncio.FIRST_COMPLETED)
+        if simulated.done():
+            simulated.result()
+        if not ready.done():
+            raise TimeoutError("the simulated robot does not say where it listens (Simulation.ready)")
+        await scene.connect(ready.result())
+        yield scene
+    finally:
+        scene.close()
+        await asyncio.sleep(HANG_UP_S)
+        simulated.cancel()
+        await asyncio.wait([simulated])
+
+
+async def record(protocol: Protocol, establish_s: float) -> Recording:
+    """Converse with the simulated robot until a while after all links are established; keep what was said."""
+    async with live(protocol) as scene:
+        established = await scene.established(establish_s)
+        if established:
+            await asyncio.sleep(SHOWN_S)
+        reasons = [session.reason or session.state.value for session in scene.sessions]
+        return Recording(
+            [frame for direction, frame in scene.frames if direction == "in"][:_MOST_FRAMES],
+            _answers(scene.frames),
+            list(scene.messages),
+            established,
+            None if established else f"{'; '.join(reasons)} after {establish_s:g} s",
+        )
+
+
+def _answers(frames: list[tuple[str, bytes]]) -> dict[bytes, list[bytes]]:
+    """Tell what the robot said after each frame and before the next one."""
+    answers: dict[bytes, list[bytes]] = {}
+    asked = b""
+    for direction, frame in frames:
+        if direction == "out":
+            asked = frame
+        elif len(answers.setdefault(asked, [])) < _ANSWER_FRAMES:
+            answers[asked].append(frame)
+    return answers
+
+
+class Rehearsal:
+    """The first link of a new robot object, without a link. ``now``: its time, seconds."""
+
+    def __init__(self, protocol: Protocol, recording: Recording) -> None:
+        self.robot = robot_of(protocol)
+        self.now = 0.0
+        sessions = [self.robot.session(name, "tcp://robot.test:1") for name in self.robot.link_names]
+        self.session: Session[Any] = sessions[0]
+        self._recording = recording
+        self._begun = False
+        self.session.open(self.now)
+
+    def play(self, frames: list[bytes]) -> None:
+        """Let the robot say these frames, one after the other."""
+        for frame in frames:
+            self.run(STEP_S)
+            self._hear(frame)
+
+    def establish(self) -> int:
+        """Let the robot say what it said, until the session is established; give how many frames that took."""
+        for count, frame in enumerate(self._recording.heard):
+            self.run(STEP_S)
+            if self.session.state is not State.HANDSHAKING:
+                return count
+            self._hear(frame)
+        self.run(1.0)
+        return len(self._recording.heard)
+
+    def run(self, seconds: float, *, answers: bool = True) -> list[bytes]:
+        """Let time pass and write what is due; give what was written. Raise RuntimeError where that never ends.
+
+        ``answers``: the robot says what it said after the same frame, once the session is established.
+        """
+        written: list[bytes] = []
+        end, session = self.now + seconds, self.session
+        for _ in range(_MOST_WRITES):
+            session.expire(self.now)
+            frame = session.outgoing(self.now)
+            if frame is not None:
+                written.append(frame)
+                session.outbox.written(self.now)
+                if answers and session.state is State.ESTABLISHED:
+                    for answer in self._recording.answers.get(frame, ()):
+                        self._hear(answer)
+                continue
+            deadline = session.deadline()
+            if deadline is None or deadline > end:
+                self.now = end
+                return written
+            self.now = max(self.now + 1e-6, deadline)
+        raise RuntimeError(f"{_MOST_WRITES} writes and timers within {seconds:g} s")
+
+    def _hear(self, frame: bytes) -> None:
+        """Let the session and the translation take what the robot says."""
+        for message in self.session.receive(frame, self.now):
+            with contextlib.suppress(ProtocolError):
+                list(self.robot.telemetry(message, 1))
+        if self.session.state is State.ESTABLISHED and not self._begun:
+            self._begun = True
+            self.robot.begun(1)

@@ -1,6 +1,6 @@
-"""What is wrong with a robot that is served all the same, or with its gateway: ``status.reason`` tells people. Sans-IO.
+"""Lasting faults of a robot that is served all the same, or of its gateway; ``status.reason`` shows them. Sans-IO.
 
-Whoever finds a condition sets it under a name of its own, and clears it when it has passed.
+Each part that finds a fault sets a condition under a name of its own and clears it when the fault has passed.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 
 class Conditions:
-    """The conditions that hold now. ``changed`` is called when one comes, changes or goes."""
+    """The conditions of now. ``changed`` is called when one is set, changed or cleared."""
 
     def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
         self.changed = changed
@@ -20,11 +20,11 @@ class Conditions:
 
     @property
     def texts(self) -> tuple[str, ...]:
-        """What to tell people, oldest first."""
+        """The texts for people, oldest first."""
         return tuple(self._texts.values())
 
     def set(self, name: str, text: str | None) -> None:
-        """Say what holds under a name; None: nothing any more."""
+        """Set the condition of a name; None clears it."""
         if self._texts.get(name) == text:
             return
         if text is None:

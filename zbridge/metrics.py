@@ -30,7 +30,7 @@ class Metrics:
         self._counts: dict[tuple[str, Labels], Count] = {}
 
     def count(self, name: str, **labels: str) -> Count:
-        """Give the counter of this name and these labels, made on first use."""
+        """Return the counter of this name and these labels; make it on first use."""
         return self._counts.setdefault((name, tuple(sorted(labels.items()))), Count())
 
     def total(self, name: str) -> int:

@@ -41,7 +41,7 @@ class Table:
         return f"<Table of {len(self._by_number)} devices>"
 
     def add(self, device: WebotsDevice) -> WebotsDevice | None:
-        """Enter a device; give it as entered: the number is added to a name that is taken. None: the number is taken."""
+        """Enter a device; give it as entered (a number is added to a taken name). None: its number is taken."""
         if device.number in self._by_number:
             return None
         if device.name in self._by_name:

@@ -30,7 +30,7 @@ STAGES = {
     "taken": "sample read",
     "admitted": "lease checked",
     "decoded": "drive decoded, checked and limited",
-    "ordered": "translated to a frame that stands",
+    "ordered": "translated to a frame",
     "written": "written to the socket",
     "done": "timers set, accounts kept (the robot has it already)",
 }

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.clock import jumping
-from zbridge.bus import Answer, Lane, Question, Sample, Sort
-from zbridge.bus.fake import FakeBus, FakeQuestion, matches, meet
+from zbridge.bus import Answer, IncomingQuery, Lane, Sample, Sort
+from zbridge.bus.fake import FakeBus, FakeQuery, matches, meet
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
 
@@ -149,7 +149,7 @@ async def test_a_query_gets_last_values_until_their_publisher_goes() -> None:
 async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> None:
     bus = FakeBus()
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         question.answer(question.payload + b"!")
 
     bus.answer("fleet/r1/@rpc/map", answer)
@@ -280,7 +280,7 @@ async def test_frames_are_wanted_only_while_somebody_listens() -> None:
 
 
 def test_a_question_keeps_its_replies() -> None:
-    question = FakeQuestion("k", b"?")
+    question = FakeQuery("k", b"?")
     question.answer(b"a")
     no = NotReady("no")
     question.refuse(no)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,8 +15,9 @@ from zbridge.bus.fake import FakeBus
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.context import RobotContext
+from zbridge.control.enforcer import Enforcer
 from zbridge.control.lease_server import LeaseServer
-from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Unsupported
 from zbridge.fleet import payload as payloads
@@ -82,47 +84,35 @@ class Gateway:
         self._loop = asyncio.get_running_loop()
         metrics = Metrics()
         self.authority = Authority(lease_s, DEADMAN_S, numbered())
-        self.leases = LeaseServer(
+        context = RobotContext(
             self.machine,
-            self.authority,
             self.keys,
+            self._bus,
             metrics,
-            Audit(name, lambda line: None),
-            MotionLimits(),
-            Standstill(
-                self.machine,
-                Conditions(),
-                idle_stop_s=0.0,
-                driven=lambda: self.authority.driven,
-                pump=lambda: None,
-                clock=self._loop.time,
-            ),
-            publish=self.publish,
-            clock=self._loop.time,
-        )
-        self.commands = Commands(
-            self.machine,
-            self.leases,
-            self.keys,
-            metrics,
+            Conditions(),
             publish=self.publish,
             pump=lambda: None,
             clock=self._loop.time,
+            clock_ns=time.time_ns,
         )
+        standstill = Standstill(context, self.authority, idle_stop_s=0.0)
+        self.enforcer = Enforcer(context, self.authority, standstill, Audit(name, lambda line: None))
+        self.leases = LeaseServer(context, self.enforcer)
+        self.commands = Commands(context, self.enforcer)
 
     def serve(self) -> None:
         """Come to the bus."""
         self._bus.announce(self.keys.alive("gateway"))
         self.publish(topics.STATUS, Status(state="established"))
-        self.leases.report()
+        self.enforcer.report()
         for name in ("acquire/*", "takeover/*", "renew", "release"):
             self._bus.answer(self.keys.key(f"@rpc/control/{name}"), self._note)
-        self.leases.serve(self._bus)
+        self.leases.serve()
         self._bus.subscribe(self.keys.key("@cmd/**"), self._take)
 
     async def vanish(self) -> None:
         """Be gone, without a word."""
-        self.leases.close()
+        self.enforcer.close()
         await self._bus.close()
 
     def publish(self, topic: Topic, message: FleetMessage) -> None:
@@ -136,7 +126,7 @@ class Gateway:
         """Give another program the lease."""
         decide = self.authority.takeover if takeover else self.authority.acquire
         lease = decide(Acquire(who=who, **wishes), self._loop.time())
-        self.leases.settle()
+        self.enforcer.settle()
         assert lease.lease is not None, lease.reason
         assert lease.token is not None
         return Holder(lease.lease, lease.token, self.name)
@@ -149,7 +139,7 @@ class Gateway:
     def refuse(self, command: str, reason: str, who: str | None) -> None:
         """Show a refusal on ``control``."""
         self.authority.refuse(command, NotReady(reason), who)
-        self.leases.settle()
+        self.enforcer.settle()
 
     @property
     def control(self) -> Control:

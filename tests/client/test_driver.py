@@ -19,8 +19,8 @@ import pytest
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
 from tests.proofs import lease, proof
-from zbridge.bus import Answer, Handle, Publisher, Question, Sample
-from zbridge.bus.fake import FakeBus, FakeQuestion
+from zbridge.bus import Answer, Handle, IncomingQuery, Publisher, Sample
+from zbridge.bus.fake import FakeBus, FakeQuery
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import RETRY_S, default_who
 from zbridge.errors import (
@@ -385,7 +385,7 @@ async def test_during_no_time_only_stands() -> None:
 async def test_during_ends_where_the_lease_is_lost() -> None:
     async with driving() as (world, drive):
         world.loop.call_later(1.0, world.gateway.give, "bob@there")
-        world.loop.call_later(1.0, lambda: world.gateway.leases.stop("stop"))
+        world.loop.call_later(1.0, lambda: world.gateway.enforcer.stop("stop"))
         began = world.loop.time()
         with pytest.raises(LeaseLost):
             await drive.during(10.0, forward=0.5)
@@ -593,7 +593,7 @@ async def test_the_refusals_of_a_program_of_the_same_name_that_lost_its_lease_ar
 async def test_a_lease_that_ran_out_is_noticed() -> None:
     async with driving() as (world, drive):
         world.gateway.authority.expire(world.loop.time() + 10 * LEASE_S)
-        world.gateway.leases.settle()
+        world.gateway.enforcer.settle()
         assert await lost(world, drive, 0.1) == "r1: the lease has ended (lease expired)"
 
 
@@ -639,10 +639,10 @@ async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -
     async with driving() as (world, drive):
         heard: list[bytes] = []
 
-        def repeat(question: Question) -> None:
+        def repeat(question: IncomingQuery) -> None:
             if question.payload not in heard:
                 heard.append(question.payload)
-                world.gateway.answer_first(FakeQuestion(question.key, question.payload))
+                world.gateway.answer_first(FakeQuery(question.key, question.payload))
 
         world.bus.answer("fleet/r1/@rpc/control/renew", repeat)
         queryables = world.bus._shared.queryables
@@ -679,7 +679,7 @@ async def test_what_a_listener_says_it_refused_in_our_name_is_nothing_to_us() ->
         for refusal in (NotReady("offline"), LeaseLost("gone"), Held("held by bob"), NeutralFirst("stop")):
             world.gateway.authority.refuse("drive", refusal, ME, by="hq.forger")
             world.gateway.authority.refuse("stop", refusal, None, by="hq.forger")
-        world.gateway.leases.settle()
+        world.gateway.enforcer.settle()
         await asyncio.sleep(SEEN_S)
         asked = len(world.gateway.questions("renew"))
         await drive(forward=0.5)
@@ -704,7 +704,7 @@ async def test_after_a_loss_nothing_is_asked_or_declared_any_more() -> None:
 async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
     """It never waits for anything but its own commands."""
     async with driving() as (world, drive):
-        world.loop.call_later(0.0, lambda: world.gateway.leases.stop("stop"))
+        world.loop.call_later(0.0, lambda: world.gateway.enforcer.stop("stop"))
         sent = 0
         with contextlib.suppress(LeaseLost):
             while sent < 100:
@@ -747,7 +747,7 @@ async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> Non
             with pytest.raises(Refused, match=REFUSED):
                 await drive()
             await asyncio.sleep(1.0)
-            world.gateway.leases.beat()
+            world.gateway.enforcer.beat()
             await drive()
             await drive()
 
@@ -841,7 +841,7 @@ async def test_refusals_of_before_the_lease_are_not_raised() -> None:
     world.gateway.refuse("drive", REFUSED, ME)
     await asyncio.sleep(SEEN_S)
     async with world.robot.control(ME) as drive:
-        world.gateway.leases.beat()
+        world.gateway.enforcer.beat()
         await asyncio.sleep(SEEN_S)
         await drive(forward=0.5)
         await world.refused(drive)
@@ -890,7 +890,7 @@ async def test_motion_after_the_deadman_is_refused_and_neutral_makes_it_possible
 async def test_a_refusal_is_raised_as_the_class_of_its_code(refusal: Refused, kind: type[Refused]) -> None:
     async with driving() as (world, drive):
         world.gateway.authority.refuse("drive", refusal, ME)
-        world.gateway.leases.settle()
+        world.gateway.enforcer.settle()
         await asyncio.sleep(SEEN_S)
         with pytest.raises(kind) as raised:
             await drive(forward=0.5)
@@ -924,9 +924,9 @@ async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words
 @jumping
 async def test_a_lease_that_cannot_be_given_for_now_is_asked_for_again(code: Code) -> None:
     world = World(served=False)
-    asked: list[Question] = []
+    asked: list[IncomingQuery] = []
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         asked.append(question)
         question.answer(payloads.encode(Lease(ok=False, reason="later", code=code)))
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.client import Gateway, settle, subscriptions, tokens
 from tests.clock import jumping
-from zbridge.bus import Answer, Question, Sample
+from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.fleet import CONFIRM_S
@@ -124,9 +124,9 @@ async def test_questions_are_answered_refused_or_not_answered(
     world = World()
     with pytest.raises(BusError, match=r"^r1: no gateway answered"):
         await ask(world.robot)
-    asked: list[Question] = []
+    asked: list[IncomingQuery] = []
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         asked.append(question)
         if len(asked) == 1:
             question.answer(payloads.encode(message))
@@ -286,7 +286,7 @@ async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_t
 async def test_a_refusal_of_long_ago_is_none_of_this_stop() -> None:
     world = World("r1")
     world.gateway.machine.unstoppable = "not now"
-    world.gateway.leases.stop("stop")
+    world.gateway.enforcer.stop("stop")
     world.gateway.machine.unstoppable = None
     await world.robot.stop()
     assert world.gateway.machine.stops >= 1

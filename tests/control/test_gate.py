@@ -19,7 +19,7 @@ from zbridge.control.gate import (
     SHOWN_HZ,
     CommandGate,
     NameGate,
-    QuestionGate,
+    QueryGate,
     Sieve,
 )
 from zbridge.errors import Code, Refused
@@ -178,7 +178,7 @@ def test_a_robot_that_may_move_is_stopped_by_every_stop() -> None:
 def test_the_holders_questions_are_told_from_everybody_elses() -> None:
     rig = Rig()
     key = "fleet/r1/@rpc/control/renew"
-    gate = QuestionGate(rig.authority, lambda: rig.now)
+    gate = QueryGate(rig.authority, lambda: rig.now)
     lanes = [gate(key, question, 0, bytes) for question in [None, b"", rig.forged(2**60)] * FLOOD]
     assert lanes.count(Lane.OTHER) == SHOWN_HZ
     assert Lane.COMMAND not in lanes

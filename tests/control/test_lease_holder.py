@@ -10,7 +10,7 @@ import pytest
 
 from tests.clock import jumping
 from tests.proofs import numbered
-from zbridge.bus import Question
+from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.control.authority import Authority
 from zbridge.control.lease_client import LeaseClient
@@ -54,7 +54,7 @@ class Scene:
     async def tokens(self) -> list[str]:
         return await self.bus.alive(KEYS.alive("*"))
 
-    def _decide(self, question: Question) -> None:
+    def _decide(self, question: IncomingQuery) -> None:
         name = KEYS.path(question.key).removeprefix("@rpc/control/")
         self.asked.append(name)
         now = self.loop.time()

@@ -23,7 +23,7 @@ from tests.clock import jumping
 from tests.hq.test_operator import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import Answer, Question
+from zbridge.bus.interface import Answer, IncomingQuery
 from zbridge.errors import BusError, EncodeError, NotReady, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -759,7 +759,7 @@ class Told:
         self.refusals: list[Refusal] = []
         scene.gateway.bus.answer(KEYS.key("@rpc/control/refused/hq.toy"), self._hear)
 
-    def _hear(self, question: Question) -> None:
+    def _hear(self, question: IncomingQuery) -> None:
         self.refusals += payloads.decode(Refusals, question.payload).refusals
         question.answer(payloads.encode(Query()))
 
@@ -1051,10 +1051,10 @@ async def test_a_driver_whose_gateway_went_must_let_go_first() -> None:
 # Questions
 
 
-def answering(scene: Scene, topic: Topic, answer: Callable[[Question], None]) -> list[Question]:
-    asked: list[Question] = []
+def answering(scene: Scene, topic: Topic, answer: Callable[[IncomingQuery], None]) -> list[IncomingQuery]:
+    asked: list[IncomingQuery] = []
 
-    def take(question: Question) -> None:
+    def take(question: IncomingQuery) -> None:
         asked.append(question)
         answer(question)
 
@@ -1088,7 +1088,9 @@ async def test_a_question_of_many_is_asked_once_and_answered_to_each() -> None:
     ],
 )
 @jumping
-async def test_a_question_without_an_answer_is_answered_with_what_is_known(answer: Callable[[Question], None]) -> None:
+async def test_a_question_without_an_answer_is_answered_with_what_is_known(
+    answer: Callable[[IncomingQuery], None],
+) -> None:
     async with serving() as scene:
         answering(scene, topics.RPC_POSE, answer)
         program = scene.connect().greeted()

@@ -11,8 +11,8 @@ import pytest
 
 from tests.proofs import numbered
 from zbridge.bus import Answer
-from zbridge.bus.fake import FakeBus, FakeQuestion
-from zbridge.bus.interface import Handle, Question, Sample
+from zbridge.bus.fake import FakeBus, FakeQuery
+from zbridge.bus.interface import Handle, IncomingQuery, Sample
 from zbridge.control.authority import Authority
 from zbridge.control.proof import read
 from zbridge.errors import BusError, Code, NotReady, Refused
@@ -73,7 +73,7 @@ class Gateway:
         for handle in self.serving:
             handle.close()
 
-    def _decide(self, question: Question) -> None:
+    def _decide(self, question: IncomingQuery) -> None:
         what, _, name = KEYS.path(question.key).removeprefix("@rpc/control/").partition("/")
         self.asked.append(what)
         now = self.scene.now
@@ -722,12 +722,12 @@ async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lea
     helm = await scene.driving()
     answering = scene.gateway.serving[2]
     answering.close()
-    again: list[Question] = []
+    again: list[IncomingQuery] = []
 
-    def repeat(question: Question) -> None:
+    def repeat(question: IncomingQuery) -> None:
         """Play somebody on the bus who hears the question, and repeats it before it has arrived."""
         again.append(question)
-        scene.gateway._decide(FakeQuestion(question.key, question.payload))
+        scene.gateway._decide(FakeQuery(question.key, question.payload))
         scene.gateway._decide(question)
 
     scene.gateway.bus.answer(KEYS.key(topics.RPC_RENEW.path), repeat)

@@ -10,7 +10,7 @@ from typing import Any
 import msgpack
 
 from tests.clock import jumping
-from zbridge.bus import Question
+from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import Code, LeaseLost, NeutralFirst, NotReady, Refused
 from zbridge.fleet.messages import TOLD
@@ -35,7 +35,7 @@ class Scene:
         self.teller = Teller(self.bus.join("hq"), KeySpace("fleet", "r1"), "hq.desk", self.spawn, untold)
 
     def serve(self, refusal: Refused | None = None) -> None:
-        def hear(question: Question) -> None:
+        def hear(question: IncomingQuery) -> None:
             self.told.append((self.loop.time(), msgpack.unpackb(question.payload)["refusals"]))
             if refusal is not None:
                 question.refuse(refusal)

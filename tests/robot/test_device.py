@@ -20,8 +20,8 @@ from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import JumpingLoop, jumping
 from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.address import Address
-from zbridge.bus import Handle, Lane, Question, Sample
-from zbridge.bus.fake import FakeBus, FakeQuestion, meet
+from zbridge.bus import Handle, IncomingQuery, Lane, Sample
+from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
@@ -32,7 +32,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.device import ATTEND_EVERY, HEARTBEAT_S, Device
+from zbridge.robot.device import HEARTBEAT_S, Device
+from zbridge.robot.telemetry import ATTEND_EVERY
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
 
@@ -89,10 +90,10 @@ class OpenBus(FakeBus):
 
     def __init__(self) -> None:
         super().__init__("1")
-        self.answers: dict[str, Callable[[Question], None]] = {}
+        self.answers: dict[str, Callable[[IncomingQuery], None]] = {}
         self.lanes: dict[str, Lane | Sort] = {}
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         self.answers[key] = handler
         self.lanes[key] = lane
         return super().answer(key, handler, lane=lane)
@@ -238,9 +239,9 @@ class Rig:
         assert isinstance(self.loop, JumpingLoop)
         self.loop._jumping.now += seconds
 
-    def ask(self, name: str, payload: bytes = b"", *, asked: str | None = None) -> FakeQuestion:
+    def ask(self, name: str, payload: bytes = b"", *, asked: str | None = None) -> FakeQuery:
         """Play a program on the bus that asks the robot; ``asked``: by another key expression."""
-        question = FakeQuestion(f"fleet/r1/@rpc/{name}", payload, asked=asked)
+        question = FakeQuery(f"fleet/r1/@rpc/{name}", payload, asked=asked)
         next(answer for key, answer in self.bus.answers.items() if meet(key, question.key))(question)
         return question
 
@@ -2109,7 +2110,7 @@ async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() 
         shown = await rig.refusals()
         assert [command for command, _, _ in shown] == ["drive", "mode", "lidar", "raw/tcpudp"]
         assert all("does not announce" in reason for _, reason, _ in shown)
-        assert not rig.device._leases.authority.moving, "there is nothing to stop"
+        assert not rig.device._enforcer.authority.moving, "there is nothing to stop"
 
 
 @jumping

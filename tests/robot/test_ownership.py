@@ -11,7 +11,7 @@ import pytest
 
 from tests.clock import jumping
 from tests.tables import documented, executed
-from zbridge.bus import Answer, Handle, Lane, Question
+from zbridge.bus import Answer, Handle, IncomingQuery, Lane
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.fleet.topics import KeySpace
@@ -148,7 +148,7 @@ CLAIM = "fleet/r1/@rpc/claim/gateway"
 def forge(bus: FakeBus, *claims: Any) -> Handle:
     """Answer for a gateway that there is not: with these claims, or these bytes, one after the other."""
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         for claim in claims:
             question.answer(claim if isinstance(claim, bytes) else msgpack.packb(claim))
 
@@ -378,7 +378,7 @@ class Distant(FakeBus):
 
         return Declared()
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         return self._later(lambda: super(Distant, self).answer(key, handler, lane=lane))
 
     def announce(self, key: str) -> Handle:

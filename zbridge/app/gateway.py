@@ -15,7 +15,7 @@ from typing import Any
 
 from zbridge.app.config import Plan
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, Handle, Question, open_bus
+from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
 from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
@@ -116,7 +116,7 @@ class Gateway:
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer who asks for the session table of this process."""
 
-        def answer(question: Question) -> None:
+        def answer(question: IncomingQuery) -> None:
             question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
@@ -155,6 +155,7 @@ class Gateway:
 
     def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
         control = self._plan.config.control
+        limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
             plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
             plan.addresses,
@@ -162,7 +163,7 @@ class Gateway:
             keys=self._keys,
             bus=bus,
             authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes),
-            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf),
+            limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
             manager=self.sessions,
             metrics=self.metrics,
             audit=audit,

@@ -1,7 +1,8 @@
-"""The bus: what gateways and commands use of Zenoh, its implementation, and a fake for tests.
+"""The bus: what gateways and clients use of Zenoh, its implementation, and a fake for tests.
 
-Nothing here knows a robot. Only :mod:`zbridge.bus.zenohbus` imports zenoh; it is imported where a bus is
-opened, so that whatever needs no bus starts without it.
+Knows no robot and no protocol. ``interface`` is what others use; ``inbox`` carries what comes in to the event loop,
+``writer`` what goes out from it; ``zenoh`` alone imports zenoh, and is imported when a bus is opened: whatever needs no
+bus starts without it.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from zbridge.bus.interface import (
     Bus,
     BusSettings,
     Handle,
+    IncomingQuery,
     Lane,
     Look,
     Publisher,
-    Question,
     Sample,
     Sort,
     Tls,
@@ -29,10 +30,10 @@ __all__ = [
     "Bus",
     "BusSettings",
     "Handle",
+    "IncomingQuery",
     "Lane",
     "Look",
     "Publisher",
-    "Question",
     "Sample",
     "Sort",
     "Tls",
@@ -45,9 +46,9 @@ async def open_bus(
 ) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
 
-    ``wait_for_peers`` returns only when the peers that scouting finds at once are connected. bounds: what comes in on
-    these keys and is larger is dropped by Zenoh, before anybody can count it.
+    wait_for_peers: return only when the peers that scouting finds at once are connected. bounds: Zenoh drops what comes
+    in on these keys and is larger; nobody can count it.
     """
-    from zbridge.bus.zenohbus import open_zenoh
+    from zbridge.bus.zenoh import open_zenoh
 
     return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds)

@@ -1,6 +1,6 @@
-"""A bus inside one process, for tests: the same interface, key matching as Zenoh's, no threads, no delays.
+"""A bus inside one process, for tests: the bus interface and Zenoh's key matching, without threads and delays.
 
-Handlers are called on the spot. Publishers keep what was put, so that a test may look at it.
+Handlers are called at once, by the caller of ``put`` or ``ask``. All that was put is kept, for the test to look at.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import msgspec
 
-from zbridge.bus.interface import Answer, Batch, Handle, Lane, Publisher, Question, Sample, Sort
+from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete
 
@@ -78,17 +78,17 @@ class FakeBus:
         return FakeBus(zid, self._shared)
 
     def values(self, key_expr: str) -> list[bytes]:
-        """Give every payload that was put on matching keys, in order."""
+        """Return every payload that was put on matching keys, in order."""
         return [sample.payload for sample in self._shared.history if matches(key_expr, sample.key)]
 
     def connection(self, up: bool) -> None:
-        """Play the loss or the return of the bus."""
+        """Simulate the loss or the return of the bus."""
         self.up = up
         for handler in tuple(self._connected):
             handler(up)
 
     def relieve(self) -> None:
-        """Take what was too much before."""
+        """Take messages again, and tell the sources that pause."""
         self.takes = True
         for handler in tuple(self._relief):
             handler()
@@ -123,24 +123,24 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         entry = (key, handler, self._zid)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        questions = []
+        queries = []
         for key, handler, zid in tuple(self._shared.queryables):
             if meet(key_expr, key):
                 concrete = key if is_concrete(key) else key_expr
-                questions.append((question := FakeQuestion(concrete, payload, asked=key_expr), zid))
-                handler(question)
+                queries.append((query := FakeQuery(concrete, payload, asked=key_expr), zid))
+                handler(query)
         kept = [Answer(key, last) for key, last in self._shared.last.items() if matches(key_expr, key)]
-        replies = [(reply, zid) for question, zid in questions for reply in question.replies]
+        replies = [(reply, zid) for query, zid in queries for reply in query.replies]
         return [msgspec.structs.replace(reply, replier=zid) for reply, zid in replies] + kept
 
     def attend(self) -> None:
-        """Do nothing: handlers are called on the spot."""
+        """Do nothing: handlers are called at once."""
 
     def announce(self, key: str) -> Handle:
         self._shared.tokens.append(key)
@@ -192,18 +192,18 @@ class FakeBus:
 
 
 class _Shared:
-    """What all sessions of one fake bus see."""
+    """The state that all sessions of one fake bus share."""
 
     def __init__(self) -> None:
         self.subscribers: list[tuple[str, Callable[[Sample], None]]] = []
-        self.queryables: list[tuple[str, Callable[[Question], None], str]] = []
+        self.queryables: list[tuple[str, Callable[[IncomingQuery], None], str]] = []
         self.tokens: list[str] = []
         self.watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self.last: dict[str, bytes] = {}
         self.history: list[Sample] = []
 
     def tell(self, key: str, alive: bool) -> None:
-        """Tell those who watch that a liveliness token came or went."""
+        """Call the watchers of a liveliness token that came or went."""
         for key_expr, handler in tuple(self.watchers):
             if matches(key_expr, key):
                 handler(key, alive)
@@ -240,8 +240,8 @@ class _FakePublisher(_FakeHandle):
         self._shared.last.pop(self.key, None)
 
 
-class FakeQuestion:
-    """A query whose answers a test may look at."""
+class FakeQuery:
+    """A query whose replies a test may look at."""
 
     def __init__(self, key: str, payload: bytes = b"", *, asked: str | None = None) -> None:
         self.key = key

@@ -1,15 +1,14 @@
-"""Carries what the bus's own threads bring to the event loop. Knows no zenoh.
+"""Carries what Zenoh's threads bring to the event loop. Knows no zenoh.
 
 Theory of operation. Every subscription and every queryable has a :class:`Source`, with one bounded queue for each lane
-it uses, so that a flood of one fills nobody else's queue. The lane of the holder's commands alone has one queue for all
-sources: what one program says keeps its order, and a release must not overtake the neutral before it. A queue that has
-items stands in the line of its lane. The event loop is woken once per batch; a batch serves the lanes in their order,
-one item of each queue in the line by turns, and of each lane no more than its share: so a stop waits for one item at
-most, and a lane that never empties leaves the others their part. What is over is served after the loop has had its turn
-with sockets and timers.
+it uses: a flood of one source fills no other's queue. Only the lane COMMAND has one queue for all sources: the holder's
+commands and queries keep their order, and a release must not overtake the neutral before it. A queue that has items is
+listed in the line of its lane. The event loop is woken once per batch. A batch serves the lanes in their order, one
+item of each listed queue by turns, and of each lane no more than its share: a stop waits for one item at most, and a
+lane that never empties leaves the others their share. The rest is served after the loop's turn with sockets and timers.
 
-A queue is filled by one thread (or several) and emptied by the loop's, without a lock: every step is one operation of a
-deque, and whoever adds an item has the queue stand in the line after it; a queue that stands there twice is harmless.
+Several threads fill a queue and the loop's thread empties it, without a lock: every step is one operation of a deque,
+and an item is added before its queue is listed. A queue that is listed twice is harmless.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ from zbridge.metrics import Count, Metrics
 log = logging.getLogger("zbridge.bus")
 
 QUEUE = 4096
-"""Items of one source that may wait in a lane; the oldest makes room."""
+"""Items of one source that may wait in a lane; one more drops the oldest."""
 QUEUE_BYTES = 4 * 2**20
-"""Bytes of sized items of one source that may wait in a lane; the oldest makes room."""
+"""Bytes of one source's items that may wait in a lane; more drop the oldest."""
 SHARES = {Lane.STOP: 64, Lane.COMMAND: 128, Lane.OTHER: 64}
 """Items of each lane that one batch serves at most."""
 
@@ -38,7 +37,7 @@ Read = Callable[[Any], Any]
 
 
 class Inbox:
-    """The lines of the lanes, and the loop that empties them."""
+    """Serves the queues of all sources, lane by lane, on the event loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, metrics: Metrics) -> None:
         self._loop = loop
@@ -48,16 +47,19 @@ class Inbox:
         self._dropped = metrics.count("bus_in_dropped")
         self._folded = metrics.count("bus_in_folded")
 
-    def source(self, handler: Handler, read: Read) -> Source:
-        """Give what one subscription or queryable puts its items in. read: makes of each what the handler takes."""
+    def source(self, handler: Handler, read: Read | None = None) -> Source:
+        """Make the source of one subscription or queryable.
+
+        read: makes of each item what the handler takes, on the event loop's thread; None: the handler takes the item.
+        """
         return Source(self, handler, read, self._dropped, self._folded)
 
     def attend(self) -> None:
-        """Serve the stops and commands that wait, and nothing else."""
+        """Serve the stops and commands that wait, no other lane."""
         self._serve({**SHARES, Lane.OTHER: 0})
 
     def line_up(self, queue: _Queue, lane: Lane) -> None:
-        """Have a queue stand in the line of its lane, and the loop awake; from any thread."""
+        """List a queue in the line of its lane and wake the loop; from any thread."""
         if not queue.listed:
             queue.listed = True
             self._lines[lane].append(queue)
@@ -74,7 +76,7 @@ class Inbox:
             self._loop.call_soon(self._drain)
 
     def _serve(self, shares: dict[Lane, int]) -> None:
-        """Serve one item after the other, always of the first lane that has some and has not had its share."""
+        """Serve one item after the other, always of the first lane that has items and share left."""
         lines = tuple(self._lines.items())
         while True:
             for lane, line in lines:
@@ -87,24 +89,24 @@ class Inbox:
 
     def _serve_one(self, line: deque[_Queue]) -> None:
         queue = line.popleft()
-        queue.listed = False  # before the item is taken: what comes from now on lists it anew
+        queue.listed = False  # before the item is taken: a later item lists the queue anew
         try:
             source, raw = queue.take()
-        except IndexError:  # it stood in the line twice, or its items had to make room
+        except IndexError:  # the queue was listed twice, or its items were dropped
             return
         if queue.items and not queue.listed:
             queue.listed = True
             line.append(queue)
         try:
-            source.handler(source.read(raw))
+            source.handler(raw if source.read is None else source.read(raw))
         except Exception:
             log.exception("a handler failed")
 
 
 class Source:
-    """Where one subscription or queryable puts what comes in."""
+    """The entrance of one subscription or queryable."""
 
-    def __init__(self, inbox: Inbox, handler: Handler, read: Read, dropped: Count, folded: Count) -> None:
+    def __init__(self, inbox: Inbox, handler: Handler, read: Read | None, dropped: Count, folded: Count) -> None:
         self.handler = handler
         self.read = read
         self._inbox = inbox
@@ -117,7 +119,7 @@ class Source:
         return f"<Source {waiting or 'empty'}>"
 
     def put(self, raw: Any, lane: Lane, size: int = 0) -> None:
-        """Store an item of so many bytes for the loop, from any thread."""
+        """Queue an item of ``size`` bytes for the loop, from any thread; drop and count the oldest where it is full."""
         queue = self._queues[lane]
         while queue.items and (len(queue.items) >= QUEUE or queue.bytes + size > QUEUE_BYTES):
             queue.forget()
@@ -126,7 +128,7 @@ class Source:
         self._inbox.line_up(queue, lane)
 
     def fold(self, raw: Any, lane: Lane) -> None:
-        """Store an item unless one waits that the loop has not begun: then both are the same, and it is counted."""
+        """Queue an item unless one waits already: then both are the same, and the new one is counted."""
         queue = self._queues[lane]
         if queue.items:
             self._folded.value += 1
@@ -136,7 +138,7 @@ class Source:
 
 
 class _Queue:
-    """Items of one lane, of one source or of all. Either side counts its bytes for itself."""
+    """Items of one lane, of one source or of all. Each side counts bytes in numbers of its own, without a lock."""
 
     def __init__(self) -> None:
         self.listed = False
@@ -155,7 +157,7 @@ class _Queue:
         self.items.append((source, raw, size))
 
     def forget(self) -> None:
-        """Forget the oldest item, on the thread that adds."""
+        """Drop the oldest item, on the thread that adds."""
         with contextlib.suppress(IndexError):  # the loop was quicker
             self._forgotten += self.items.popleft()[2]
 

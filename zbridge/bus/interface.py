@@ -40,17 +40,17 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sample(msgspec.Struct, frozen=True):
-    """What came in on a key."""
+    """One message that came in on a key."""
 
     key: str
     payload: bytes
     attachment: bytes | None = None
 
 
-class Question(Protocol):
-    """A query that waits for its answer; answer or refuse it once.
+class IncomingQuery(Protocol):
+    """A query that waits for its answer. Call :meth:`answer` or :meth:`refuse` once.
 
-    key: the one that is answered. asked: what was asked for, perhaps with wildcards.
+    key: the key that is answered. asked: the key expression of the query, perhaps with wildcards.
     """
 
     key: str
@@ -66,9 +66,9 @@ class Question(Protocol):
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """One reply to a query; ``error`` instead of a payload.
+    """One reply to a query of ours.
 
-    It is Refused as whoever was asked refused it, or BusError with what else came instead of an answer.
+    error: None, or why there is no payload: Refused as the replier refused, BusError for any other error reply.
     replier: the id of the session that replied, as the bus says; None where it does not say.
     """
 
@@ -84,25 +84,25 @@ class Publisher(Protocol):
     key: str
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        """Publish as the key's class of delivery says, without blocking; False asks to pause the source."""
+        """Publish with the key's delivery, without blocking; False asks to pause the source."""
 
     def close(self) -> None:
-        """Give the key up; idempotent."""
+        """Undeclare the key; idempotent."""
 
 
 class Handle(Protocol):
-    """Something declared on the bus."""
+    """A declaration on the bus."""
 
     def close(self) -> None:
-        """Take it back; idempotent."""
+        """Undeclare; idempotent."""
 
 
 Batch = Sequence[tuple[Publisher, list[bytes]]]
-"""What was published together: for each key its payloads in order."""
+"""Stream messages of one read: for each key its payloads in order."""
 
 
 class Lane(IntEnum):
-    """What waits for the event loop, in the order it is served; each lane has its own bound and its own share."""
+    """Where input waits for the event loop, in the order of service; each lane has a bound and a share of its own."""
 
     STOP = 0
     COMMAND = 1
@@ -110,12 +110,13 @@ class Lane(IntEnum):
 
 
 Look = Callable[[], bytes]
-"""Gives the payload that an authorization proves; of a question, whose payload the authorization is, none."""
+"""Returns the payload that an authorization proves: of a query, whose payload is the authorization, b""."""
 Sort = Callable[[str, bytes | None, int, Look], Lane | None]
-"""Chooses a lane, or drops what came (None) and counts it; called on the bus's own threads: quick and sure.
+"""Chooses the lane of a sample or query; None: the sort has counted it, and it is dropped.
 
-Arguments: the key (of a question what was asked, perhaps with wildcards), the attachment of a sample or the payload of
-a question, the bytes of payload and attachment together, and a look at the payload.
+Runs on Zenoh's threads: must not block and must not raise. Arguments: the key (of a query the asked key expression),
+the attachment of a sample or the payload of a query, the bytes of payload and attachment together, and a look at the
+payload.
 """
 
 
@@ -130,10 +131,13 @@ class Bus(Protocol):
         """Declare that ``key`` will be written."""
 
     def put_all(self, batch: Batch) -> bool:
-        """Publish stream messages in order; False asks to pause the source until the relief handler is called."""
+        """Publish stream messages in order; False asks to pause the source until the relief handler is called.
+
+        The bus takes the lists over: the caller must not use them again.
+        """
 
     def on_relief(self, handler: Callable[[], None]) -> None:
-        """Call ``handler`` when a source that was asked to pause may go on."""
+        """Call ``handler`` when a paused source may go on."""
 
     def subscribe(
         self,
@@ -143,19 +147,19 @@ class Bus(Protocol):
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
     ) -> Handle:
-        """Take samples by way of a lane; ``history`` asks for last values too.
+        """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
 
-        Of those that a Sort sends by the lane STOP only one waits: what comes meanwhile is the same stop.
+        Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
 
-    def answer(self, key: str, handler: Callable[[Question], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        """Query ``key_expr`` and collect the replies that come within ``timeout_s``, as far as they are no flood."""
+        """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
 
     def attend(self) -> None:
-        """Hand over the stops and the holder's commands that wait: to be called in the midst of long work."""
+        """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
 
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
@@ -164,19 +168,19 @@ class Bus(Protocol):
         """List the liveliness tokens that exist."""
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
-        """Be told the key of every liveliness token there is or comes (True), and of each that goes (False)."""
+        """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
 
     async def flush(self) -> None:
-        """Wait until what may block, streams apart, is with the bus; raise BusError where that takes too long."""
+        """Wait until all queued states and answers are handed to Zenoh (streams excluded); raise BusError after 2 s."""
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; ``listened`` is told when the first listener comes and the last one goes."""
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
-        """Be told when the first listener of ``key`` comes and when the last one goes."""
+        """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
-        """Be told when the first connection to the bus is made and when the last one is gone."""
+        """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
 
     async def close(self) -> bool:
-        """Leave the bus; False where that hangs, and its threads must be left to the end of the process."""
+        """Leave the bus; False where that hangs: its threads then end with the process."""

@@ -1,4 +1,10 @@
-"""A thread that writes what may block, so that the event loop never does. Knows no zenoh."""
+"""A thread that makes the calls that may block, so that the event loop never does. Knows no zenoh.
+
+Theory of operation. :meth:`Writer.put` queues a call, in order and bounded by :data:`BACKLOG`; :meth:`Writer.replace`
+keeps one call for each key, the newest. The thread makes all calls by key, then one queued call, and begins anew. Where
+calls come faster than the thread makes them, a lossy writer drops the oldest and counts it; a ``lossless`` writer keeps
+all, and tells its callers to pause until half of the backlog is free.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +19,16 @@ from zbridge.metrics import Metrics
 log = logging.getLogger("zbridge.bus")
 
 BACKLOG = 4096
-"""How much may wait: each message counts one, and one more for every 256 bytes of a state."""
+"""Bound of what waits: a message counts one, a state one more for every 256 bytes."""
 
 Call = Callable[[], object]
 
 
 class Writer:
-    """Carries out calls in order, within :data:`BACKLOG`.
+    """Makes calls in order, within :data:`BACKLOG`.
 
-    Where that is not enough, a ``lossless`` writer asks to pause the source, and calls ``relieved`` (on its own
-    thread) when it may go on; any other forgets the oldest call and counts it: the newest wins.
+    lossless: ask to pause the source instead of dropping the oldest call. relieved: called on the writer's thread when
+    a paused source may go on. name: the label of the counters.
     """
 
     def __init__(self, name: str, metrics: Metrics, *, lossless: bool, relieved: Call) -> None:
@@ -43,7 +49,7 @@ class Writer:
         self._thread.start()
 
     def put(self, call: Call, size: int = 1) -> bool:
-        """Carry out a call of ``size`` messages; False asks to pause the source."""
+        """Queue a call of ``size`` messages; False asks to pause the source."""
         with self._lock:
             if self._ended:
                 self._dropped.value += size
@@ -58,7 +64,7 @@ class Writer:
             return not self._full
 
     def replace(self, key: str, call: Call, size: int = 1) -> bool:
-        """Carry out a call unless a newer one of the same key comes first; a lossless writer does every one."""
+        """Queue a call in place of an older one of the same key; a lossless writer makes every call."""
         if self._lossless:
             return self.put(call, size)
         with self._lock:
@@ -72,7 +78,7 @@ class Writer:
             return True
 
     def stop(self, timeout_s: float = 0.5) -> None:
-        """Finish what waits, for at most ``timeout_s`` seconds."""
+        """Make the calls that wait, for at most ``timeout_s`` seconds, and end the thread."""
         with self._lock:
             self._stopping = True
             self._ring()
@@ -85,7 +91,7 @@ class Writer:
             self._dropped.value += size
 
     def _ring(self) -> None:
-        """Wake the thread, once: a condition variable takes several times as long to do it."""
+        """Wake the thread, once. A queue does it several times faster than a condition variable."""
         if not self._rung:
             self._rung = True
             self._bell.put(None)
@@ -102,7 +108,7 @@ class Writer:
                     return
 
     def _work(self) -> bool:
-        """Carry out all that waits by key, and the first of the line; False when there was nothing."""
+        """Make all calls by key and the oldest queued call; False where there was none."""
         with self._lock:
             latest = list(self._latest.values())
             self._latest.clear()

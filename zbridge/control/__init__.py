@@ -1,4 +1,56 @@
-"""Who may drive one robot: leases, proofs, stops, limits and the audit log.
+"""Who may drive one robot: leases and proofs, stops and deadlines, limits on motion, the audit log.
 
-Knows no link and no protocol; the authority is a machine without clock, loop or bus.
+Knows no link and no protocol. The authority decides and is a machine without clock, loop or bus; the gate sorts
+commands on the bus's threads; the enforcer carries out what the authority decides; the lease server answers queries.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from zbridge.control.audit_log import Audit, AuditFile
+    from zbridge.control.authority import Authority
+    from zbridge.control.context import RobotContext
+    from zbridge.control.enforcer import Enforcer
+    from zbridge.control.lease_server import LeaseServer
+    from zbridge.control.motion_limits import MotionLimits
+    from zbridge.control.proof import Signer, Verifier
+    from zbridge.control.settings import ControlSettings
+    from zbridge.control.standstill import Standstill
+
+__all__ = [
+    "Audit",
+    "AuditFile",
+    "Authority",
+    "ControlSettings",
+    "Enforcer",
+    "LeaseServer",
+    "MotionLimits",
+    "RobotContext",
+    "Signer",
+    "Standstill",
+    "Verifier",
+]
+
+_MODULES = {
+    "Audit": "audit_log",
+    "AuditFile": "audit_log",
+    "Authority": "authority",
+    "ControlSettings": "settings",
+    "Enforcer": "enforcer",
+    "LeaseServer": "lease_server",
+    "MotionLimits": "motion_limits",
+    "RobotContext": "context",
+    "Signer": "proof",
+    "Standstill": "standstill",
+    "Verifier": "proof",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load the module of a public name when it is asked for: a client needs proofs alone."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

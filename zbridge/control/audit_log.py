@@ -56,7 +56,7 @@ MOST = 20
 OTHERS = "others"
 _DAY_S = 86_400.0
 _MAY_PASS = (errno.ENXIO, errno.ENOSPC, errno.EDQUOT, errno.EIO)
-"""What keeps a file from being opened now and may pass: a pipe that nobody reads, a full disk."""
+"""Errors of opening a file that may pass: a pipe that nobody reads, a full disk."""
 
 _Kind = tuple[EventKind, str | None, str | None, str | None, bool]
 
@@ -69,7 +69,7 @@ class _Folded(msgspec.Struct):
 
 
 class Audit:
-    """Writes events down, by ``write`` and in the gateway's log; :meth:`flush` is to be called about once a second."""
+    """Writes events by ``write`` and to the gateway's log. Call :meth:`flush` about once a second."""
 
     def __init__(self, robot: str, write: Callable[[str], None], clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._robot = robot
@@ -84,7 +84,7 @@ class Audit:
         return f"<Audit {self._robot}>"
 
     def write(self, event: Event) -> None:
-        """Write one event down: now, or where it is one of many, with a later :meth:`flush`."""
+        """Write one event: now, or counted with a later :meth:`flush` where it is one of many."""
         kind = (event.what, event.who, event.command, event.reason, event.stops)
         folded = self._folded.get(kind)
         if folded is not None:
@@ -98,7 +98,7 @@ class Audit:
             self._folded.setdefault((event.what, who, None, OTHERS, event.stops), _Folded(others)).count += 1
 
     def flush(self) -> None:
-        """Write what repeated itself since the last call, and fill the budgets."""
+        """Write the counts of repeated events since the last call, and refill the budgets."""
         self._counts = min(COUNTS, self._counts + COUNTS_HZ)
         for what, budgets in self._budgets.items():
             share = LINES_HZ / (len(budgets) + 1)
@@ -113,7 +113,7 @@ class Audit:
                 self._counts -= 1
                 self._line(folded.event, folded.count)
                 written[kind] = _Folded(folded.event)
-        self._folded = waiting | written  # who had to wait is first the next time
+        self._folded = waiting | written  # those that had to wait come first the next time
 
     def close(self) -> None:
         """Write all that was counted."""
@@ -121,7 +121,7 @@ class Audit:
         self.flush()
 
     def _affords(self, event: Event) -> bool:
-        """Tell whether the actor may have another line, and take it off its budget."""
+        """Tell whether the actor may have another line; if so, take it off the budget."""
         budgets = self._budgets[event.what]
         left = budgets.get(event.who, BURST)
         if event.who not in budgets and len(budgets) >= ACTORS:
@@ -149,9 +149,9 @@ class Audit:
 
 
 class AuditFile:
-    """A file that lines are appended to by a thread; see :class:`_Appended` for its rotation.
+    """A file to which a thread appends lines; see :class:`_Appended` for its rotation.
 
-    ``tell`` is called on that thread with what keeps lines from being written, and with None when they are again.
+    tell: called on that thread with the reason when lines cannot be written, and with None when they can again.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class AuditFile:
         self._writer.start()
 
     def write(self, line: str) -> None:
-        """Append a line, soon."""
+        """Queue a line; drop and count it where the queue is full."""
         try:
             self._lines.put_nowait(line.encode() + b"\n")
         except queue.Full:
@@ -216,7 +216,7 @@ class AuditFile:
         self._file.close()
 
     def _insist(self, do: Callable[[], None]) -> bool:
-        """Try until it is done; at the end of the gateway only once. Tell whether it was done."""
+        """Try until it is done, once only while the gateway ends. Return whether it was done."""
         while True:
             try:
                 do()
@@ -270,11 +270,11 @@ class _Appended:
             self._rotates = stat.S_ISREG(os.fstat(descriptor).st_mode)
 
     def take(self, line: bytes) -> None:
-        """Have a line to write."""
+        """Set the line that :meth:`write` writes."""
         self._line = self._rest = line
 
     def write(self) -> None:
-        """Write what there is to write of the line."""
+        """Write the line, or the rest of it; raise OSError where that is not possible now."""
         try:
             self.open()
             if self._rest is self._line:
@@ -283,7 +283,7 @@ class _Appended:
                 assert self._descriptor is not None
                 self._rest = self._rest[os.write(self._descriptor, self._rest) :]
         except OSError:
-            if not self._rotates:  # whoever reads a pipe next has not seen the beginning
+            if not self._rotates:  # the next reader of a pipe has not seen the beginning
                 self._rest = self._line
             self.close()
             raise

@@ -9,11 +9,11 @@ and no motion is commanded. MOVING: the last command for at least one part of th
 HELD_BACK: a program has the lease and must send neutral before motion.
 
 Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
-:meth:`vanished` for lost liveliness tokens, :meth:`stop`, and :meth:`expire` at :meth:`deadline`. The command handler
-calls :meth:`admit` for every command that needs the lease, :meth:`require_motion` if the command is motion, and
-:meth:`applied` after the robot was sent it. The device calls :meth:`hold_back`. After each call the caller takes
-:meth:`events`: each is to be written down, and one that ``stops`` demands that the robot is sent its stop at once.
-The gate reads :attr:`verifier` and :attr:`moving` from the bus's threads; all else is for the event loop's thread.
+and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
+:meth:`require_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
+:meth:`hold_back`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each down,
+and sends the robot its stop at once for one that ``stops``. The gate reads :attr:`verifier` and :attr:`moving` from the
+bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is

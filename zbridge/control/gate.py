@@ -1,11 +1,16 @@
-"""Gates: what of the bus reaches the event loop, and by which lane. They run on the bus's threads, one thread each.
+"""Gates choose for every sample and query whether it reaches the event loop, and by which lane.
 
-Theory of operation. Anybody on the bus may send as much as it takes, so what nobody has to obey must cost little: it is
-dropped here, before the event loop is woken. A command of the holder's is told by its proof, and only then chooses its
-lane and uses its number up: who merely knows the lease's public id fills no lane of the holder's and locks nobody out.
-Of everything else so many a second reach the event loop, which refuses them with reason and sender; the others are
-counted by code, and shown together once a second. A stop is never refused: one that comes right after another, while
-the robot is at rest and nobody holds it, is the same stop.
+Gates run on Zenoh's threads; one thread calls each.
+
+Theory of operation. Anybody on the bus may send as much as the network carries. Input that nobody has to obey must cost
+little: a gate drops it before the event loop is woken.
+
+- A command that needs the lease is proven first. Only a proven command enters the lane COMMAND and uses up its number:
+  a sender that merely knows the public id of the lease fills no lane of the holder's and spoils none of its numbers.
+- All other input is limited in rate. What passes is refused by the event loop with reason and sender. The rest is
+  counted by code and shown once a second.
+- A stop is never refused. A stop that follows another within :data:`SAME_STOP_S`, for a robot at rest without a
+  holder, changes nothing and is only counted.
 """
 
 from __future__ import annotations
@@ -25,32 +30,33 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.rate_limit import RateLimit
 
 OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
-"""Commands that move a robot, or may: they need the lease."""
+"""Commands that move a robot, or may move it: they need the lease."""
 SHOWN_HZ = 20.0
-"""Refused ones a second of each gate that reach the event loop, with reason and sender."""
+"""Refused samples or queries a second of each gate that reach the event loop, with reason and sender."""
 OPEN_HZ = 500.0
 """Commands a second that need no lease, all senders together."""
 NAME_HZ, ALL_NAMES_HZ = 20.0, 100.0
-"""Questions for the lease a second, of one name and of all."""
+"""Queries for the lease a second, of one name and of all."""
 NAMES = 256
-"""Names that are kept apart; the one not heard of for longest makes room."""
+"""Names that are limited apart; one more replaces the name that asked longest ago."""
 SAME_STOP_S = 0.05
-"""Seconds in which one stop is as good as the next, for a robot at rest that nobody holds."""
+"""Seconds within which a second stop changes nothing, for a robot at rest without a holder."""
 _KEPT = 1024
+"""Keys whose kind is remembered."""
 
 Clock = Callable[[], float]
 _STOP_PATH = f"/{topics.CMD_STOP.path}"
 
 
 def is_stop(key: str) -> bool:
-    """Tell whether a command's key is a stop's, which alone may have wildcards before its end."""
+    """Tell whether a command's key is a stop's. Only a stop may have wildcards before its last chunk."""
     return key.endswith(_STOP_PATH)
 
 
 class Sieve:
-    """Lets so many refused ones a second through, and counts the others by code.
+    """Lets ``rate_hz`` refused samples or queries through to the event loop, and counts the others by code.
 
-    Counting and reading are the business of a thread each: no number is written by both.
+    Zenoh's thread counts, the event loop's thread reads: no number is written by both.
     """
 
     def __init__(self, rate_hz: float, clock: Clock) -> None:
@@ -63,18 +69,18 @@ class Sieve:
         return f"<Sieve {sum(self._counted.values())} kept back>"
 
     def lane(self, code: Code) -> Lane | None:
-        """Give the lane by which a refused one goes on, None for one that is only counted."""
+        """Return the lane of a refused sample or query; None where it is only counted."""
         if self._allowance.take(self._clock()):
             return Lane.OTHER
         self._counted[code] += 1
         return None
 
     def count(self, code: Code) -> None:
-        """Count one that goes nowhere."""
+        """Count one that is dropped."""
         self._counted[code] += 1
 
     def kept_back(self) -> Iterator[tuple[Refused, int]]:
-        """Give what was counted since the last call; on the event loop's thread."""
+        """Yield what was counted since the last call; on the event loop's thread."""
         for code, total in self._counted.items():
             count, self._told[code] = total - self._told[code], total
             if count:
@@ -82,7 +88,7 @@ class Sieve:
 
 
 class _Kind(msgspec.Struct, frozen=True):
-    """What is known of a key: whether its commands need the lease, and the most bytes they may have."""
+    """What a key's commands are: whether they need the lease, and the most bytes they may have."""
 
     leased: bool
     most_bytes: int
@@ -94,7 +100,10 @@ _UNKNOWN = _Kind(leased=False, most_bytes=topics.LARGE_BYTES)
 
 
 class _Prover:
-    """Tells the holder's newest from everything else. notes: whether the event loop asks what was proven."""
+    """Tells new input of the holder's from all other input.
+
+    notes: keep each proof for the event loop, which admits the command without proving it again.
+    """
 
     def __init__(self, authority: Authority, clock: Clock, *, notes: bool = False) -> None:
         self._notes = notes
@@ -103,7 +112,7 @@ class _Prover:
         self._newest = (b"", -1)
 
     def prove(self, key: str, shown: bytes | None, look: Look) -> Lane | None:
-        """Choose the lane: COMMAND for what the proof shows to be the holder's and new."""
+        """Choose the lane: COMMAND if the proof shows the holder as the sender and the number is new."""
         verifier = self._authority.verifier
         if shown is None or verifier is None or not verifier.plausible(shown):
             return self.sieve.lane(Code.NO_LEASE)
@@ -138,7 +147,7 @@ class CommandGate:
         self._kinds: dict[str, _Kind] = {}
         self._stopped_at = float("-inf")
         self.same_stops = 0
-        """Stops that were taken for the one before."""
+        """Stops that were counted only."""
 
     def __repr__(self) -> str:
         return f"<CommandGate {self._keys.robot} {self.sieve!r}>"
@@ -157,11 +166,11 @@ class CommandGate:
         return None
 
     def stopped(self) -> None:
-        """Take note that a stop was carried out now; on the event loop's thread."""
+        """Note that a stop was carried out now; on the event loop's thread."""
         self._stopped_at = self._clock()
 
     def _stop(self) -> Lane | None:
-        """Let a stop through, unless it changes nothing: looked at in this order, as a new holder comes first."""
+        """Let a stop through unless it changes nothing. The holder is looked at last: a new one may come meanwhile."""
         fresh = self._clock() - self._stopped_at < SAME_STOP_S
         if fresh and not self._authority.moving and self._authority.verifier is None:
             self.same_stops += 1
@@ -183,22 +192,22 @@ class CommandGate:
         return _Kind(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
 
 
-class QuestionGate:
-    """Sorts the holder's questions about the lease; each key has a gate, and numbers of its own."""
+class QueryGate:
+    """Sorts the holder's queries about the lease; each key has a gate and numbers of its own."""
 
     def __init__(self, authority: Authority, clock: Clock) -> None:
         self._prover = _Prover(authority, clock)
         self.sieve = self._prover.sieve
 
     def __repr__(self) -> str:
-        return f"<QuestionGate {self.sieve!r}>"
+        return f"<QueryGate {self.sieve!r}>"
 
     def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
         return self._prover.prove(key, shown, look)
 
 
 class NameGate:
-    """Sorts who asks for the lease: so many a second of one name, the last chunk of the key, and of all names."""
+    """Sorts queries for the lease: limits their rate by name (the last chunk of the key) and altogether."""
 
     def __init__(self, clock: Clock) -> None:
         self.sieve = Sieve(0.0, clock)
@@ -230,4 +239,4 @@ _REFUSALS: dict[Code, Refused] = {
     Code.OUT_OF_ORDER: Malformed("repeated or out of order", Code.OUT_OF_ORDER),
     Code.RATE: TooFast("too many a second"),
 }
-"""What is shown of those that were only counted."""
+"""The refusals that ``control`` shows for what was only counted."""

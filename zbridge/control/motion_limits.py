@@ -10,15 +10,15 @@ from zbridge.errors import TooFast
 from zbridge.fleet.messages import Drive
 
 STEP_S = 0.25
-"""The longest time since the last command that a change is reckoned for, seconds."""
+"""Longest time since the last command that a change is computed for, seconds."""
 _BURST = 2.0
-"""Commands that may come at once."""
+"""Commands that may come at once, above the rate."""
 
 
 class MotionLimits:
-    """rate_hz: commands a second; slew_per_s: change of each part of a drive a second, in full scales.
+    """Limits the rate and the change of drives. Neutral is never refused, and slowing down is never limited.
 
-    Infinite: no limit. Neutral is never refused, and slowing down is never slowed.
+    rate_hz: commands a second. slew_per_s: change of each part of a drive, full scales a second. Infinite: no limit.
     """
 
     def __init__(self, rate_hz: float = math.inf, slew_per_s: float = math.inf) -> None:
@@ -30,7 +30,7 @@ class MotionLimits:
         self._counted_at = -math.inf
 
     def limit(self, drive: Drive, now: float) -> Drive:
-        """Give the drive that may be sent now; raise TooFast where commands come too fast."""
+        """Return the drive that may be sent now; raise TooFast where commands come too fast."""
         if not drive.moving:
             return drive
         if self.rate_hz < math.inf:
@@ -47,11 +47,11 @@ class MotionLimits:
         )
 
     def sent(self, drive: Drive, now: float) -> None:
-        """Take note of what the robot was told."""
+        """Note what the robot was told."""
         self._last, self._last_at = drive, now
 
     def stands(self) -> None:
-        """Take note that the robot stands, whatever it was told last."""
+        """Note that the robot is at rest, whatever it was told last."""
         self._last = Drive()
 
     def _count(self, now: float) -> None:
@@ -63,7 +63,7 @@ class MotionLimits:
 
 
 def _towards(last: float, wanted: float, step: float) -> float:
-    """Go from ``last`` towards ``wanted`` by ``step`` at most; towards zero at once."""
+    """Return ``last`` moved towards ``wanted`` by ``step`` at most; towards zero at once."""
     start = last if last * wanted > 0 else 0.0
     if abs(wanted) <= abs(start):
         return wanted

@@ -1,17 +1,16 @@
-"""Keeps a robot at rest that nobody drives: sends its stop, quickly for a second, and then again and again.
+"""Keeps a robot at rest while nobody drives: repeats its stop quickly for a second, then every ``idle_stop_s``.
 
-A robot program or a link that stalled may have lost all of the first ones (design, "Who may drive").
+A stalled robot program or link may have lost all of the first stops (design, "Who may drive").
 """
 
 from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
 
-from zbridge.conditions import Conditions
+from zbridge.control.authority import Authority
+from zbridge.control.context import RobotContext
 from zbridge.errors import Refused
-from zbridge.protocol.plugin import Robot
 from zbridge.protocol.session import State
 
 STOP_REPEAT_S = 1.0
@@ -22,29 +21,19 @@ _CONDITION = "stop"
 
 
 class Standstill:
-    """Sends stops to one robot. ``pump`` writes what its sessions have to write.
+    """Sends stops to one robot.
 
+    authority: tells whether somebody drives the robot now, or told it to move by itself.
     idle_stop_s: seconds between two stops while nobody drives; 0: only when motion ends.
-    ``driven``: whether somebody drives the robot now, or it was told to move by itself.
-    ``clock``: seconds on the event loop's time line.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        conditions: Conditions,
-        *,
-        idle_stop_s: float,
-        driven: Callable[[], bool],
-        pump: Callable[[], None],
-        clock: Callable[[], float],
-    ) -> None:
-        self._robot = robot
-        self._conditions = conditions
+    def __init__(self, context: RobotContext, authority: Authority, idle_stop_s: float = IDLE_STOP_S) -> None:
+        self._robot = context.robot
+        self._conditions = context.conditions
+        self._pump = context.pump
+        self._clock = context.clock
+        self._authority = authority
         self._idle_stop_s = idle_stop_s
-        self._driven = driven
-        self._pump = pump
-        self._clock = clock
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._repeated_until = -math.inf
@@ -58,7 +47,7 @@ class Standstill:
         return max(0.0, self._repeated_until - self._clock())
 
     def begin(self) -> None:
-        """Watch from now on that a robot that nobody drives is sent its stop."""
+        """Send stops from now on whenever nobody drives."""
         if self._idle_stop_s:
             self._timer = self._loop.call_later(self._idle_stop_s, self._on_time)
 
@@ -68,7 +57,7 @@ class Standstill:
             self._timer.cancel()
 
     def neutral(self, now: float) -> None:
-        """Take note that neutral is being repeated from now on."""
+        """Note that the session repeats neutral from now on: no stop is needed meanwhile."""
         self._repeated_until = now + STOP_REPEAT_S
 
     def stop(self) -> None:
@@ -91,8 +80,8 @@ class Standstill:
         session, now = self._robot.driving, self._clock()
         if session is None or session.state is not State.ESTABLISHED:
             self._conditions.set(_CONDITION, None)
-        elif not self._driven() and now >= self._repeated_until:
+        elif not self._authority.driven and now >= self._repeated_until:
             try:
                 self._send(now, now)
             except Refused:
-                return  # status says so
+                return  # the condition says so on status

@@ -19,13 +19,13 @@ LeaseId = Annotated[bytes, msgspec.Meta(min_length=8, max_length=8)]
 Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
 Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 TOLD = 16
-"""Different refusals that are told at a time."""
+"""Most different refusals in one report of a listener."""
 Floats = npt.NDArray[np.float32]
 Cells = npt.NDArray[np.uint8]
 
 
 class FleetMessage(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """What all fleet messages may carry; UNSET, and absent from the payload, where the device has none.
+    """The fields that every fleet message may have; UNSET, and absent from the payload, where the device gives none.
 
     stamp_ns: best estimate of when the content was measured, Unix nanoseconds on the gateway's clock.
     seq: the device's own sequence number. device_ms: the device's own clock, milliseconds.
@@ -92,7 +92,7 @@ class Map(FleetMessage, frozen=True, eq=False):
 
 
 class Reading(FleetMessage, frozen=True):
-    """One value of a named sensor, in the sensor's unit; ``fault`` where the value is not plausible."""
+    """One value of a named sensor, in the sensor's unit. fault: the value is not plausible."""
 
     value: float
     kind: str | None = None
@@ -109,19 +109,19 @@ class Device(msgspec.Struct, frozen=True):
 
 
 class Devices(FleetMessage, frozen=True):
-    """What the robot has registered."""
+    """The devices that the robot has registered."""
 
     devices: tuple[Device, ...]
 
 
 class Switch(FleetMessage, frozen=True):
-    """Something that is on or off."""
+    """A switch that is on or off."""
 
     on: bool
 
 
 class Text(FleetMessage, frozen=True):
-    """A text for people; ``request`` asks programs on the bus for something."""
+    """A text for people. kind ``request``: asks programs on the bus for something."""
 
     text: str
     kind: Literal["debug", "chat", "request"] = "debug"
@@ -148,7 +148,7 @@ RobotState = Literal["offline", "connecting", "handshaking", "established", "clo
 
 
 class Status(FleetMessage, frozen=True):
-    """Whether the robot can be used, and what was agreed with it."""
+    """Whether the robot can be used, and what was negotiated with it."""
 
     state: RobotState
     reason: str | None = None
@@ -160,7 +160,7 @@ class Status(FleetMessage, frozen=True):
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):
-    """A command that was not carried out, and how often. code: one of :class:`zbridge.errors.Code`, for programs.
+    """A command that was not carried out, and how often. code: a :class:`zbridge.errors.Code`, for programs.
 
     by: the listener that refused it, ``hq.<listener>``; None where the robot's gateway did.
     """
@@ -174,7 +174,7 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Control(FleetMessage, frozen=True):
-    """Who drives, and what was refused lately. lease: the public id of the lease that is held."""
+    """Who drives, and what was refused lately. lease: the public id of the current lease."""
 
     state: Literal["free", "held", "stopped"]
     holder: str | None = None
@@ -185,13 +185,13 @@ class Control(FleetMessage, frozen=True):
 
 
 class Refusals(FleetMessage, frozen=True):
-    """What a listener refused its HQ programs: for the robot's gateway, which shows it on ``control``."""
+    """A listener's report of what it refused its HQ programs; the robot's gateway shows it on ``control``."""
 
     refusals: Annotated[tuple[Refusal, ...], msgspec.Meta(max_length=TOLD)]
 
 
 class Drive(FleetMessage, frozen=True):
-    """Move: fractions of full scale, -1..1; ``light`` None leaves it as it is."""
+    """Move: fractions of full scale, -1..1. light: None leaves it unchanged."""
 
     forward: Fraction = 0.0
     left: Fraction = 0.0
@@ -211,22 +211,22 @@ class Motor(FleetMessage, frozen=True):
 
     @property
     def moving(self) -> bool:
-        """Tell motion from neutral; of a linear motor nobody here knows where it stands, so it counts as motion."""
+        """Tell motion from neutral. A linear motor's position is unknown here, so any value but 0 is motion."""
         return bool(self.value)
 
 
 class Mode(FleetMessage, frozen=True):
-    """Who moves the robot: nobody, a person, or the robot itself."""
+    """Who moves the robot: nobody (none), a person (manual) or the robot itself (autonomous)."""
 
     mode: Literal["none", "manual", "autonomous"]
 
 
 class Stop(FleetMessage, frozen=True):
-    """Stand still now."""
+    """Stop now. Anybody may send it."""
 
 
 class SensorSetting(FleetMessage, frozen=True):
-    """Settings of one sensor: any of enable, one value by index, or all values."""
+    """Settings of one sensor: any of ``enable``, one ``value`` by ``index``, all ``values``."""
 
     enable: bool | None = None
     index: int | None = None
@@ -235,15 +235,15 @@ class SensorSetting(FleetMessage, frozen=True):
 
 
 class Query(FleetMessage, frozen=True):
-    """A question without fields."""
+    """A query without fields."""
 
 
 class Acquire(FleetMessage, frozen=True):
     """Ask for the lease of a robot, or take it over.
 
-    who: whom others are shown as the holder. priority: a higher one is given the robot of a lower one.
-    lease_s, deadman_s: wishes in seconds, capped by the robot's configuration and its default where None.
-    alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``, whose loss ends the lease.
+    who: the name that others are shown. priority: a higher priority gets the lease of a holder with a lower one.
+    lease_s, deadman_s: wishes in seconds, capped by the robot's configuration; None: its default.
+    alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``; its loss ends the lease.
     """
 
     who: str
@@ -254,10 +254,10 @@ class Acquire(FleetMessage, frozen=True):
 
 
 class Lease(FleetMessage, frozen=True):
-    """The answer to every question about the lease.
+    """The answer to every query about the lease.
 
-    lease: its id, 8 bytes that everybody may know. token: 32 bytes for the holder alone, which are never sent again.
-    Both only when granted. code: one of :class:`zbridge.errors.Code` where it is refused, for programs.
+    lease: its public id, 8 bytes. token: 32 secret bytes for the holder, never sent again. Both only where the lease is
+    granted. code: a :class:`zbridge.errors.Code` where it is refused, for programs.
     """
 
     ok: bool
@@ -270,9 +270,9 @@ class Lease(FleetMessage, frozen=True):
 
 
 class Authorization(FleetMessage, frozen=True):
-    """What shows that a command, or a question about the lease, is the holder's: see :mod:`zbridge.control.proof`.
+    """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.control.proof`.
 
-    The attachment of a command, and what is asked at ``renew`` and ``release``. seq: rises with each of the lease.
+    Attachment of a command; payload of ``renew`` and ``release``. seq: rises with each command (query) of the lease.
     """
 
     lease: LeaseId
@@ -281,16 +281,16 @@ class Authorization(FleetMessage, frozen=True):
 
 
 class Denied(FleetMessage, frozen=True):
-    """The error reply to a query. code: one of :class:`zbridge.errors.Code`, for programs; reason: for people."""
+    """The error reply to a query. code: a :class:`zbridge.errors.Code`, for programs; reason: for people."""
 
     code: str
     reason: str
 
 
 class SessionEntry(msgspec.Struct, frozen=True):
-    """One session of the table: with a robot's link (role ``hq``) or with an HQ program (role ``robot``).
+    """One session of the table: with a robot's link (our role: ``hq``) or with an HQ program (our role: ``robot``).
 
-    counters: what it carried and lost. left_out: what the peer was not told, or could not be taken from it, by name.
+    counters: frames and bytes carried, lost and refused. left_out: counts of what has no form on the other side.
     """
 
     name: str

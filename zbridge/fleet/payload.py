@@ -1,7 +1,7 @@
 """Fleet messages as bus payloads: MessagePack maps with the field names as declared. Sans-IO.
 
-``ranges`` and ``cells`` travel as little-endian ``bin``, all other vectors as plain arrays. The optional
-``stamp_ns``, ``seq`` and ``device_ms`` are left out where unknown; every other field is always there.
+``ranges`` and ``cells`` are little-endian ``bin``, all other vectors plain arrays. ``stamp_ns``, ``seq`` and
+``device_ms`` are absent where unknown; every other field is always present.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ ENCODING = "application/msgpack"
 
 
 def schema(message: type[FleetMessage]) -> str:
-    """Name a message class as the schema of its encoding: ``zbridge.Scan.v1``."""
+    """Return the schema name of a message class: ``zbridge.Scan.v1``."""
     return f"zbridge.{message.__name__}.v1"
 
 
 def _array_bytes(value: Any) -> memoryview:
-    """Give the bytes of an array: uint8 as it is, everything else as float32 little endian."""
+    """Return the bytes of an array: uint8 unchanged, any other dtype as little-endian float32."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"{type(value).__name__} has no place in a payload")
     if value.dtype == _F4 and value.ndim == 1 and value.flags.c_contiguous:
@@ -37,17 +37,19 @@ def _array_bytes(value: Any) -> memoryview:
 
 
 encode = msgspec.msgpack.Encoder(enc_hook=_array_bytes).encode
-"""``encode(message)``: the MessagePack map its key carries."""
+"""``encode(message)``: the payload of a message, a MessagePack map."""
 
 
 def decode(message: type[F], payload: bytes) -> F:
-    """Decode a payload as ``message``; raise PayloadError naming the field and what was expected.
+    """Decode a payload as ``message``; raise PayloadError with the field and what was expected.
 
-    An empty payload is an empty map, unknown fields are ignored and missing optional ones take their default.
+    An empty payload is an empty map. Unknown fields are ignored; missing optional fields take their default.
     ``ranges`` becomes a read-only float32[n], ``cells`` a read-only uint8[rows, columns].
     """
     try:
-        decoded: F = _shaped(_decoder(message).decode(payload or _EMPTY))
+        decoded: F = _decoder(message).decode(payload or _EMPTY)
+        if isinstance(decoded, Map):
+            decoded = _shaped(decoded)
     except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message.__name__}: {error}") from error
     return decoded
@@ -82,16 +84,15 @@ def _decoder(message: type[FleetMessage]) -> msgspec.msgpack.Decoder[Any]:
 
 
 def _array(kind: Any, value: Any) -> Any:
-    """Read the array a field is declared as."""
+    """Read an array of the declared type."""
     dtype = np.dtype("<f4") if kind == Floats else np.dtype("|u1")
     if not isinstance(value, bytes) or len(value) % dtype.itemsize:
         raise ValueError(f"bin of {dtype.name} was expected")
     return np.frombuffer(value, dtype)
 
 
-def _shaped(message: Any) -> Any:
-    if not isinstance(message, Map):
-        return message
+def _shaped(message: Map) -> Any:
+    """Give the cells their rows and columns; raise ValueError where they do not fill them."""
     rows, columns, cells = message.rows, message.columns, message.cells
     if rows < 0 or columns < 0 or rows * columns != cells.size:
         raise ValueError(f"{cells.size} cells do not fill {rows} rows x {columns} columns")

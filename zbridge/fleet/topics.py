@@ -40,7 +40,7 @@ from zbridge.fleet.messages import (
 
 
 class Delivery(Enum):
-    """The classes of the design's key table; :data:`QOS` says what each means on the bus."""
+    """The classes of the design's key table; :data:`QOS` has the quality of service of each."""
 
     STREAM = "stream"
     STATE = "state"
@@ -49,7 +49,7 @@ class Delivery(Enum):
 
 
 class Congestion(Enum):
-    """What a full transmission queue does to a message."""
+    """What happens to a message where the transmission queue is full."""
 
     DROP = "drop"
     BLOCK = "block"
@@ -75,7 +75,7 @@ class QoS(msgspec.Struct, frozen=True):
 class Topic(msgspec.Struct, frozen=True):
     """One key of a robot: ``path`` below ``<realm>/<robot>/``.
 
-    most_bytes: what payload and attachment of a command or a query may have together.
+    most_bytes: bound of payload and attachment together, of a command or a query; None: unbounded.
     """
 
     path: str
@@ -85,12 +85,12 @@ class Topic(msgspec.Struct, frozen=True):
 
     @property
     def qos(self) -> QoS:
-        """How the bus treats this topic; a drive is dropped under congestion, the next one comes soon."""
+        """The quality of service. A drive is dropped under congestion: the next one comes soon."""
         return _DRIVE_QOS if self.message is Drive else QOS[self.delivery]
 
 
 SizeBounds = Sequence[tuple[tuple[str, ...], int]]
-"""Key expressions, and the most bytes that payload and attachment may have together on each."""
+"""Key expressions, and the bound of payload and attachment together on each, in bytes."""
 Family = Callable[[str], Topic]
 """Topics that share all but the last chunk: ``SENSOR("front left")``."""
 
@@ -103,39 +103,39 @@ QOS = {
 _DRIVE_QOS = QoS(Priority.REAL_TIME, Congestion.DROP, express=True)
 
 SMALL_BYTES = 256
-"""Bytes of what says little: a motion, a switch, a proof."""
+"""Bound of a small message: a motion, a switch, a proof."""
 QUERY_BYTES = 1024
-"""Bytes of a query: an acquire with the longest names."""
+"""Bound of a query: an acquire with the longest names."""
 SETTING_BYTES = 16_384
-"""Bytes of a sensor setting of 1 000 values, and of what a listener tells that it refused."""
+"""Bound of a sensor setting (1 000 values) and of a listener's report of refusals."""
 LARGE_BYTES = 65_536
-"""Bytes of a scan of 16 000 points, of a text, and of what only the robot's protocol can read."""
+"""Bound of a scan (16 000 points), a text and a raw message."""
 
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _ESCAPED = re.compile(rb"[^A-Za-z0-9_.-]")
 
 
 def is_name(name: str) -> bool:
-    """Tell whether ``name`` can stand in a key as it is."""
+    """Tell whether ``name`` is a key chunk without escapes."""
     return _NAME.fullmatch(name) is not None
 
 
 def escape(name: str) -> str:
-    """Write any name as one key chunk, reversibly."""
+    """Write any name as one key chunk; :func:`unescape` reverses it."""
     if not name:
         return "%"
     return _ESCAPED.sub(lambda match: b"%%%02X" % match.group()[0], name.encode("utf-8", "surrogateescape")).decode()
 
 
 def unescape(chunk: str) -> str:
-    """Read a name back from its key chunk."""
+    """Read a name from its key chunk."""
     return "" if chunk == "%" else unquote(chunk, errors="surrogateescape")
 
 
 def speaks_for(who: str, chunk: str) -> bool:
-    """Tell whether whoever asks at this key chunk may call itself ``who``: the chunk's name, or that and ``.suffix``.
+    """Tell whether a program that queries this key chunk may call itself ``who``: the chunk's name, or name.suffix.
 
-    So access rules on keys let each program ask in its own name only.
+    Access rules on keys can so restrict each program to its own name.
     """
     name = escape(who)
     return name == chunk or name.startswith(f"{chunk}.")
@@ -212,7 +212,7 @@ _FAMILIES = {
 
 
 def _bounded() -> Iterator[tuple[str, int]]:
-    """Give every command and query below a robot, families with a wildcard, and its bound."""
+    """Yield every command and query below a robot and its bound; a family with a wildcard."""
     for topic in _TOPICS.values():
         if topic.most_bytes is not None:
             yield topic.path, topic.most_bytes
@@ -223,10 +223,10 @@ def _bounded() -> Iterator[tuple[str, int]]:
 
 
 def size_bounds() -> SizeBounds:
-    """Give the most bytes that may come in on every command and query of any robot.
+    """Return the bounds of all commands and queries of any robot, for the bus to enforce.
 
-    Beyond the keys of the design stand all others of their kind, and whatever is put with wildcards: a message has to
-    keep within every bound whose key expression holds its key.
+    All other keys below ``@cmd`` and ``@rpc``, and puts with wildcards, have bounds too. A message must keep within
+    every bound whose key expression intersects its key.
     """
     groups: dict[int, list[str]] = {LARGE_BYTES: ["**/@cmd/**"], QUERY_BYTES: ["**/@rpc/**"]}
     for path, most_bytes in _bounded():
@@ -235,7 +235,7 @@ def size_bounds() -> SizeBounds:
 
 
 def find(path: str) -> Topic | None:
-    """Find the topic of a path below ``<realm>/<robot>/``, None where the design knows none."""
+    """Return the topic of a path below ``<realm>/<robot>/``; None for an unknown path."""
     topic = _TOPICS.get(path)
     if topic is None:
         prefix, _, name = path.rpartition("/")

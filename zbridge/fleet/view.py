@@ -1,4 +1,4 @@
-"""What a process knows of one robot from the bus: the last value of what it publishes. Sans-IO."""
+"""The last values of what one robot published, as a process saw them on the bus. Sans-IO."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import Topic
 
 READINGS = 256
-"""Sensors whose last reading is kept; one more is not."""
+"""Most sensors whose last reading is kept."""
 
 
 class RobotView:
     """The robot as it was last seen; None for what was not seen yet.
 
-    ``protocol``, ``version`` and ``features`` are those of the last time it was established: a robot that is away for
-    a moment has not become another one.
+    protocol, version, features: those of the last established connection, kept while the robot is away.
     """
 
     def __init__(self) -> None:
@@ -54,7 +53,7 @@ class RobotView:
 
     @property
     def missing(self) -> str | None:
-        """Say why the robot cannot be used now; None where it can."""
+        """Why the robot cannot be used now; None where it can."""
         if not self.alive or self.status is None:
             return "no gateway serves the robot"
         if self.status.state != "established":
@@ -62,14 +61,14 @@ class RobotView:
         return None
 
     def note(self, topic: Topic, message: FleetMessage) -> None:
-        """Take note of what was published."""
+        """Keep what was published."""
         if isinstance(message, Reading):
             name = topics.unescape(topic.path.rpartition("/")[2])
             if name in self.readings or len(self.readings) < READINGS:
                 self.readings[name] = message
             return
         if isinstance(message, Status) and message.state != "established":
-            self.readings.clear()  # of a connection that is gone: the next one may have other sensors
+            self.readings.clear()  # the next connection may have other sensors
         if isinstance(message, Status) and message.state == "established":
             if self.protocol is not None and self.protocol != message.protocol:
                 self.forget()
@@ -79,7 +78,7 @@ class RobotView:
             keep(self, message)
 
     def forget(self) -> None:
-        """Forget what was seen: the robot has become another one."""
+        """Forget what was seen: another robot has taken the name."""
         control, alive = self.control, self.alive
         self.__init__()  # type: ignore[misc]
         self.control, self.alive = control, alive

@@ -1,94 +1,80 @@
-"""Commands from the bus to one robot: who may give them, what becomes of them."""
+"""Commands from the bus to one robot: finds their topic, asks for leave, and tells the robot.
+
+A command that is refused is counted and shown on ``control``; none is dropped silently.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from zbridge.bus import Sample
+from zbridge.control.context import RobotContext
+from zbridge.control.enforcer import Enforcer
 from zbridge.control.gate import OF_THE_HOLDER, is_stop
-from zbridge.control.lease_server import LeaseServer
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
-from zbridge.fleet.topics import Delivery, KeySpace, Topic
-from zbridge.metrics import Metrics
-from zbridge.protocol.plugin import Outcome, Robot
-
-_MOVING = (Drive, Motor)
-
+from zbridge.fleet.messages import Drive, Mode, Motor, Raw
+from zbridge.fleet.topics import Delivery, Topic
+from zbridge.protocol.plugin import Outcome
+from zbridge.protocol.session import Session, State
 
 LINK_BLOCKED = "the robot's link takes nothing"
+_MOTIONS = (Drive, Motor)
+_ESTABLISHED = State.ESTABLISHED
 
 
 class Commands:
-    """Carries out and refuses. ``publish`` shows a message on the bus, ``pump`` writes to the robot."""
+    """Carries out the commands for one robot, or refuses them. :meth:`take` is the handler of ``@cmd/**``."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        leases: LeaseServer,
-        keys: KeySpace,
-        metrics: Metrics,
-        *,
-        publish: Callable[[Topic, FleetMessage], object],
-        pump: Callable[[], None],
-        clock: Callable[[], float],
-    ) -> None:
-        self._robot = robot
-        self._leases = leases
-        self._authority = leases.authority
-        self._limits = leases.limits
-        self._keys = keys
-        self._publish = publish
-        self._pump = pump
-        self._clock = clock
+    def __init__(self, context: RobotContext, enforcer: Enforcer) -> None:
+        self._context = context
+        self._enforcer = enforcer
+        self._robot = context.robot
+        self._keys = context.keys
+        self._clock = context.clock
+        self._pump = context.pump
         self._closing: str | None = None
         self.blocked = False
         """Whether the robot's link takes nothing: drives wait in vain, and all else is refused."""
-        self._topics = {keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
-        self._taken = metrics.count("commands")
-        self._slowed = metrics.count("drives_slowed")
-        self._unwritten = metrics.count("drives_unwritten")
+        self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
+        self._taken = context.metrics.count("commands")
+        self._unwritten = context.metrics.count("drives_unwritten")
 
     def __repr__(self) -> str:
         return f"<Commands {self._keys.robot}>"
 
     def take(self, sample: Sample) -> None:
-        """Carry out one command, or refuse it where everybody sees."""
+        """Carry out one command, or refuse it and show the refusal on ``control``."""
         self._taken.value += 1
-        if is_stop(sample.key):  # whatever the payload says and whoever says it
-            self._leases.stop("stop")
-            self._leases.gate.stopped()
-            return
         who = None
         try:
-            topic = self._topics.get(sample.key) or self._find(sample.key)
-            who = self._admit(topic, sample)
-            self._carry_out(topic, sample.payload, who)
+            topic = self._topics.get(sample.key)
+            if topic is None:
+                if is_stop(sample.key):  # whatever the payload says and whoever says it
+                    self._enforcer.stop_commanded()
+                    return
+                topic = self._find(sample.key)
+            now = self._clock()
+            if topic.message in OF_THE_HOLDER:
+                who = self._enforcer.admit(sample, now)
+            self._carry_out(topic, sample.payload, now, who)
         except (Refused, PayloadError, EncodeError) as error:
             refused = error if isinstance(error, Refused) else Malformed(str(error))
-            self._authority.refuse(sample.key.rpartition("@cmd/")[2], refused, refused.who or who)
-        self._leases.settle()
+            self._enforcer.refuse(sample.key.rpartition("@cmd/")[2], refused, refused.who or who)
+        self._enforcer.settle()
 
-    def require_ready(self) -> None:
-        """Raise Refused where the robot takes no commands now."""
+    def require_ready(self) -> Session[object]:
+        """Return the session that takes commands; raise Refused where the robot takes none now."""
         session = self._robot.driving
-        if session is None or session.over:
+        if session is None or (session.state is not _ESTABLISHED and session.over):
             raise NotReady("offline")
-        if not self._robot.ready:
+        if session.state is not _ESTABLISHED or session.busy is not None:
             raise NotReady(session.busy or session.state.value)
+        return session
 
     def require_flowing(self) -> None:
         """Raise Refused where the robot's link takes nothing: what waits for it would come after the stop."""
         if self.blocked:
             raise NotReady(LINK_BLOCKED)
-
-    def require_sure(self) -> None:
-        """Raise Refused where the robot is not to be set in motion: what it is told later might not arrive."""
-        session = self._robot.driving
-        if session is not None and session.doubtful is not None:
-            raise NotReady(session.doubtful)
 
     def refuse_all(self, reason: str) -> None:
         """Take nothing but stops from now on."""
@@ -102,63 +88,53 @@ class Commands:
             raise Unsupported("no such command")
         return topic
 
-    def _admit(self, topic: Topic, sample: Sample) -> str | None:
-        """Give the holder whose command this is, None of one that needs no lease; raise Refused where it may not be."""
-        if topic.message not in OF_THE_HOLDER:
-            return None
-        who = self._authority.admit(sample.attachment, sample.key, sample.payload, self._clock())
-        self._leases.settle()
-        return who
-
-    def _carry_out(self, topic: Topic, payload: bytes, who: str | None) -> None:
+    def _carry_out(self, topic: Topic, payload: bytes, now: float, who: str | None) -> None:
         if self._closing is not None:
             raise NotReady(self._closing, Code.CLOSING)
-        now = self._clock()
         command = payloads.decode(topic.message, payload)
-        if isinstance(command, _MOVING):
+        if isinstance(command, _MOTIONS):
             self._move(topic, command, now, who)
             return
-        self.require_ready()
+        session = self.require_ready()
         self.require_flowing()
-        autonomous = isinstance(command, Mode) and command.mode == "autonomous"
-        if autonomous or isinstance(command, Raw):
-            self.require_sure()
-            self._authority.require_motion()
+        if isinstance(command, Raw) or (isinstance(command, Mode) and command.mode == "autonomous"):
+            _require_sure(session)
+            self._enforcer.require_motion()
         self._show(topic, self._robot.command(topic, command, now), who)
-        if isinstance(command, Mode):
-            self._authority.mode_chosen(autonomous=autonomous)
-        elif isinstance(command, Raw):
-            self._authority.sent_opaque()
+        self._enforcer.commanded(command)
         self._pump()
 
     def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
+        """Tell the robot to move, or to be at rest: the robot is written to before anything is accounted for."""
+        moving = command.moving
         try:
-            self.require_ready()
-            if command.moving:
-                self.require_sure()
+            session = self.require_ready()
+            if moving:
+                _require_sure(session)
         except Refused as refusal:
-            if command.moving:
-                self._leases.hold_back(str(refusal), stops=False)
+            if moving:
+                self._enforcer.hold_back(str(refusal), stops=False)
             raise
-        if command.moving:
-            self._authority.require_motion()
-        if isinstance(command, Drive):
-            wished, command = command, self._limits.limit(command, now)
-            self._slowed.value += command is not wished and command != wished
+        if moving:
+            permitted = self._enforcer.permit(command, now)
+            if permitted is not command:
+                command, moving = permitted, permitted.moving
         outcome = self._robot.command(topic, command, now)
         self._unwritten.value += self.blocked
-        self._pump()  # the robot first, the accounts after it
-        if command.moving:
-            self._authority.require_motion()  # the link may just have begun to take again: a stop went instead
-        if isinstance(command, Drive):
-            self._limits.sent(command, now)
-        self._authority.applied(topic.path, now, moving=command.moving)
-        if isinstance(command, Drive) and not self._authority.driven:
-            self._leases.standstill.neutral(now)
-        self._show(topic, outcome, who)
+        self._pump()
+        self._enforcer.moved(topic.path, command, now, moving=moving)
+        if outcome.telemetry or outcome.left_out:
+            self._show(topic, outcome, who)
 
     def _show(self, topic: Topic, outcome: Outcome, who: str | None) -> None:
         for shown, message in outcome.telemetry:
-            self._publish(shown, message)
+            self._context.publish(shown, message)
         if outcome.left_out:
-            self._authority.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
+            self._enforcer.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
+
+
+def _require_sure(session: Session[object]) -> None:
+    """Raise Refused where the robot is not to be set in motion: a later stop might not arrive."""
+    doubt = session.doubtful
+    if doubt is not None:
+        raise NotReady(doubt)

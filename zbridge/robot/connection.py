@@ -1,10 +1,13 @@
-"""One address of a robot: connects, converses, and connects again, for ever. Knows no bus and no translation."""
+"""The links of one robot: each connects, converses, and connects again, until it is closed.
+
+Knows no bus and no translation.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
@@ -33,7 +36,7 @@ _STATES: dict[State, RobotState] = {
 
 
 class Hooks(msgspec.Struct, frozen=True):
-    """What an endpoint is given by the device it belongs to."""
+    """What a connection is given by the device it belongs to."""
 
     session: Callable[[], Session[Any]]
     deliver: Callable[[list[Any]], None]
@@ -45,13 +48,53 @@ class Hooks(msgspec.Struct, frozen=True):
     foreign: Count
     clock: Callable[[], float]
     before: Callable[[], object] = lambda: None
-    """Called before anything is written."""
+    """Called before a frame is written: a stop may have to be written first."""
     stalled: Callable[[bool], object] = lambda stalled: None
-    """Called when the link takes nothing any more (True), and when it does again (False)."""
+    """Called when the link stops taking bytes (True), and when it takes them again (False)."""
+
+
+class Links:
+    """The connections to one robot, in the order of its configuration; the first one drives."""
+
+    def __init__(self) -> None:
+        self._connections: list[Connection] = []
+
+    def __iter__(self) -> Iterator[Connection]:
+        return iter(self._connections)
+
+    def __repr__(self) -> str:
+        return f"<Links {self._connections}>"
+
+    @property
+    def first(self) -> Connection:
+        """The connection that drives."""
+        return self._connections[0]
+
+    def add(self, connection: Connection) -> None:
+        """Add the next connection of the configuration."""
+        self._connections.append(connection)
+
+    def pump(self) -> None:
+        """Write what may be written."""
+        for connection in self._connections:
+            if connection.conversation is not None:
+                connection.conversation.pump()
+
+    def pause(self) -> None:
+        """Read nothing until :meth:`resume`."""
+        for connection in self._connections:
+            if connection.conversation is not None:
+                connection.conversation.pause()
+
+    def resume(self) -> None:
+        """Read again."""
+        for connection in self._connections:
+            if connection.conversation is not None:
+                connection.conversation.resume()
 
 
 class Connection:
-    """One configured address, the conversation there when there is one, and who watches its frames."""
+    """One configured address, its conversation while there is one, and who watches its frames."""
 
     def __init__(self, name: str, label: str, address: DeviceAddress, hooks: Hooks) -> None:
         self.name = name
@@ -68,7 +111,7 @@ class Connection:
         return f"<Connection {self.name} {self.address} {self.state}>"
 
     async def run(self) -> None:
-        """Keep connected until :meth:`close`."""
+        """Connect, converse and connect again, until :meth:`close`."""
         backoff = Backoff()
         while not self._ending:
             reason, established = await self._converse()
@@ -80,7 +123,7 @@ class Connection:
             await asyncio.sleep(delay_s)
 
     async def close(self, reason: str, timeout_s: float) -> None:
-        """Take leave of the peer, for at most ``timeout_s`` seconds, and do not connect again."""
+        """End the conversation within ``timeout_s`` seconds, and do not connect again."""
         self._ending = True
         conversation = self.conversation
         if conversation is not None:
@@ -89,26 +132,11 @@ class Connection:
         self.state, self.reason = "offline", reason
 
     def status(self) -> LinkStatus:
-        """Show the endpoint as ``status`` does."""
+        """Return the entry of this link on ``status``."""
         return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
 
-    def pump(self) -> None:
-        """Write what may be written."""
-        if self.conversation is not None:
-            self.conversation.pump()
-
-    def pause(self) -> None:
-        """Read nothing until :meth:`resume`."""
-        if self.conversation is not None:
-            self.conversation.pause()
-
-    def resume(self) -> None:
-        """Read again."""
-        if self.conversation is not None:
-            self.conversation.resume()
-
     def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
-        """Show the raw frames of one direction (``in`` or ``out``) from now on; None: no more."""
+        """Show the raw frames of one direction (``in`` or ``out``) from now on; None: show none."""
         if show is not None:
             self._watchers[direction] = show
         else:
@@ -128,7 +156,7 @@ class Connection:
             show(frame)
 
     async def _converse(self) -> tuple[str, bool]:
-        """Hold one conversation to its end; tell why it ended and whether it was ever established."""
+        """Hold one conversation to its end; return why it ended and whether it was ever established."""
         hooks, session = self._hooks, self._hooks.session()
         session.name, session.tap = self.name, self._tap
         conversation = Conversation(

@@ -1,7 +1,4 @@
-"""The names under which a robot publishes (its sensors'): bounded, so that one that makes up new ones costs little.
-
-Sans-IO.
-"""
+"""Bounds the names that a robot may publish under (its sensors'): each costs memory on every router. Sans-IO."""
 
 from __future__ import annotations
 
@@ -11,11 +8,11 @@ HOUR_S = 3600.0
 
 
 class NameBudget:
-    """The names of the hour that began with the first of them; a name that was seen in it is free."""
+    """Counts the different names of an hour, which begins with its first name. A name counts once an hour."""
 
     def __init__(self) -> None:
         self.over = False
-        """Whether there was one more than there may be."""
+        """Whether a name was refused in this hour."""
         self._seen: set[str] = set()
         self._ends_at = 0.0
 
@@ -36,7 +33,7 @@ class NameBudget:
         return True
 
     def expire(self, now: float) -> None:
-        """Begin a new hour where it is time."""
+        """Begin a new hour if the current one is over."""
         if self._seen and now >= self._ends_at:
             self._seen.clear()
             self.over = False

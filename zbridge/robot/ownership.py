@@ -30,7 +30,7 @@ from typing import ClassVar
 
 import msgspec
 
-from zbridge.bus import Bus, Handle, Question
+from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.errors import BusError
 from zbridge.fleet.topics import KeySpace
 
@@ -243,7 +243,7 @@ class Ownership:
             return _Served()
         return _Served(max(self._clock() - self._held_since, 1e-3), self._has())
 
-    def _on_question(self, question: Question) -> None:
+    def _on_question(self, question: IncomingQuery) -> None:
         question.answer(_write(self._claim()))
 
     TABLE: ClassVar[dict[State, dict[Input, tuple[Callable[[Ownership], None], State]]]] = {

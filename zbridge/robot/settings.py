@@ -1,4 +1,4 @@
-"""The settings of the device side, as a configuration has them, and the plan made of them."""
+"""The settings of the robot that a gateway serves (``[device]``), and the plan made of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DevicePlan(msgspec.Struct, frozen=True):
-    """The device side: its protocol, the protocol's options, an address for each link."""
+    """How to reach one robot: its protocol, the protocol's options, an address for each link."""
 
     protocol: Protocol
     options: Any

@@ -19,6 +19,8 @@ class Backlog:
         self._entries: deque[tuple[int, float]] = deque()
         """For each write: the bytes written up to its end, and when."""
         self._written = 0
+        self.since: float | None = None
+        """When the oldest byte was written that is not known to be acknowledged; None where there is none."""
 
     def __repr__(self) -> str:
         return f"<Backlog of {len(self._entries)} writes>"
@@ -29,14 +31,12 @@ class Backlog:
         if len(self._entries) >= ENTRIES:
             _, now = self._entries.pop()
         self._entries.append((self._written, now))
+        if self.since is None:
+            self.since = now
 
     def settle(self, outstanding: int) -> None:
         """Remove the acknowledged writes: all but the last ``outstanding`` bytes."""
         acknowledged = self._written - outstanding
         while self._entries and self._entries[0][0] <= acknowledged:
             self._entries.popleft()
-
-    @property
-    def since(self) -> float | None:
-        """When the oldest unacknowledged byte was written; None: all is acknowledged."""
-        return self._entries[0][1] if self._entries else None
+        self.since = self._entries[0][1] if self._entries else None

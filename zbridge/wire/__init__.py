@@ -1,7 +1,7 @@
-"""Legacy messages as bytes: declared once, coded by what the declaration says, cut from a bounded buffer.
+"""Legacy messages as bytes: one declaration a message, compiled to a binary or a text codec; frames cut from a stream.
 
-Sans-IO. Knows no protocol: the messages are declared in ``gateways/<protocol>/messages.py``.
-The binary and the text codec read the same declarations.
+Sans-IO. Knows no protocol: a protocol declares its messages in its own package. ``fields`` has the wire types of
+declarations, ``binary`` and ``text`` the codecs, ``frames`` the bounded buffer of an incomplete frame.
 """
 
 from zbridge.wire.binary import BinaryCodec

@@ -34,9 +34,8 @@ Encode = Callable[[Any], bytes]
 class BinaryCodec(Generic[M]):
     """Turns the bytes of one message class into messages and back.
 
-    ``decode(data, start)`` reads the body ``data[start:]`` whole; it raises ProtocolError where the bytes
-    are too few, too many or lie about a count. ``encode(message)`` raises EncodeError for values the
-    wire types cannot carry.
+    ``decode(data, start)`` reads the whole body ``data[start:]``; it raises ProtocolError for too few or too many bytes
+    and for a count that exceeds them. ``encode(message)`` raises EncodeError for values outside the wire types.
     """
 
     decode: Callable[[bytes, int], M]
@@ -100,7 +99,7 @@ class BinaryCodec(Generic[M]):
 
 
 class _Step:
-    """One field of a message whose length is not fixed."""
+    """One field of a message of variable length."""
 
     def __init__(self, field: Field, behind: Sequence[Field]) -> None:
         self.name = field.name
@@ -174,7 +173,7 @@ def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
 
     def decode(data: bytes, position: int) -> tuple[str, int]:
         raw, end = decode_bytes(data, position)
-        # A byte that is not ASCII shows as \xNN: people see the rest of the text, and nobody's session ends.
+        # A byte that is not ASCII becomes \xNN: the rest stays readable, and no session ends for it.
         return raw.decode("ascii", "backslashreplace"), end
 
     def encode(value: str) -> bytes:

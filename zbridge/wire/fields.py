@@ -5,10 +5,9 @@
         y: F32
         heading_deg: F32
 
-The last field may be declared ``Blob | None = None``: then it may be missing. A message may define ``check()``,
-which raises ProtocolError for decoded values that do not go together. Where a protocol has a dialect of text whose
-numbers are others than the binary ones, a field says so: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a
-codec makes the bytes.
+The last field may be missing if it is declared ``Blob | None = None``. A message may define ``check()``, which raises
+ProtocolError for decoded values that contradict each other. A field whose text form differs from its binary form names
+both: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a codec makes the bytes.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ class Message(msgspec.Struct, frozen=True, gc=False):
     byte_order: ClassVar[str] = "<"
 
     def check(self) -> None:
-        """Raise ProtocolError where decoded values do not go together."""
+        """Raise ProtocolError where decoded values contradict each other."""
 
 
 class Scalar(msgspec.Struct, frozen=True):
@@ -58,11 +57,11 @@ class CountedArray(msgspec.Struct, frozen=True):
 
 
 class Remainder(msgspec.Struct, frozen=True):
-    """All bytes that are left of the body."""
+    """All remaining bytes of the body."""
 
 
 class Filling(msgspec.Struct, frozen=True):
-    """As many items of one little-endian dtype as the fields around it leave room for."""
+    """Items of one little-endian dtype that fill the room the other fields leave."""
 
     dtype: str
 
@@ -108,7 +107,7 @@ class Field(msgspec.Struct, frozen=True):
 
 
 def declared_fields(message: type[Message]) -> list[Field]:
-    """Read the fields of a declaration; raise TypeError where one has no wire type."""
+    """Return the fields of a declaration; raise TypeError where one has no wire type."""
     hints = get_type_hints(message, include_extras=True)
     return [_field(field.name, hints[field.name]) for field in msgspec.structs.fields(message)]
 

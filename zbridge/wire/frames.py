@@ -7,19 +7,19 @@ from collections.abc import Callable, Iterator
 from zbridge.errors import ProtocolError
 
 FrameEnd = Callable[[bytes, int], int]
-"""``frame_end(data, start)``: the offset just behind the frame that begins at ``start``, as far as ``data`` tells.
+"""``frame_end(data, start)``: the offset behind the frame that begins at ``start``; always greater than ``start``.
 
-An offset beyond ``len(data)`` says that at least so many bytes are needed. It is always greater than
-``start``. Raises ProtocolError where no frame can begin like this.
+An offset beyond ``len(data)`` means that at least so many bytes are needed. Raises ProtocolError for bytes that cannot
+begin a frame.
 """
 
 
 _JOINED = 1024
-"""Bytes that are joined to an incomplete frame at least, where its end is not known yet."""
+"""Least bytes that are joined to an incomplete frame while its end is unknown."""
 
 
 class FrameBuffer:
-    """Keeps the incomplete frame between reads; never holds more than ``limit`` bytes of it."""
+    """Keeps the incomplete frame between reads: at most ``limit`` bytes."""
 
     __slots__ = ("_frame_end", "_limit", "_needed", "_rest")
 
@@ -36,9 +36,9 @@ class FrameBuffer:
         return f"<FrameBuffer {len(self._rest)} of {self._needed} bytes, limit {self._limit}>"
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Yield every frame that ``data`` completes; raise ProtocolError at a frame that cannot be.
+        """Yield every frame that ``data`` completes; raise ProtocolError at a broken or too large frame.
 
-        The frames before a broken one are yielded first. After an error the buffer is of no further use.
+        The frames before it are yielded first. After an error the buffer must not be used any more.
         """
         start = 0
         while self._rest:

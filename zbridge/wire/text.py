@@ -1,8 +1,7 @@
 """The text codec: the declarations of :mod:`zbridge.wire.fields` as numbers between separators. Sans-IO.
 
-A field is every match of ``-?[0-9]*\\.?[0-9]+``, everything else separates. Written are integers, floats with six
-decimals and never an exponent, truth as 1 or 0. A message may hold one array; it takes the fields that the others
-leave.
+Read: a field is every match of ``-?[0-9]*\\.?[0-9]+``; all other bytes separate. Written: integers, floats with six
+decimals and never an exponent, truth as 1 or 0. A message may have one array, which takes the fields the others leave.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ _NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
 _DIGITS = b"0123456789"
 _UNCLIPPED = 2**63 - 2
-"""The largest number of a row that numpy has not made of a larger one."""
+"""The largest number of a row that is surely not a larger one, clipped by numpy."""
 _MOST = 2**31 - 1
-"""The largest number of an array: what readers in the field can hold."""
+"""The largest number of an array: deployed readers hold 32 bits."""
 
 
 class TextCodec(Generic[M]):
     """Turns the fields of one message class, without its id, into messages and back.
 
-    ``decode(body)`` raises ProtocolError where fields are missing, too many, no numbers or out of their range;
-    ``encode(message)`` gives ``v|v|...|v`` and raises EncodeError for values that text cannot carry.
+    ``decode(body)`` raises ProtocolError where fields are missing, too many, no numbers or out of range;
+    ``encode(message)`` returns ``v|v|...|v`` and raises EncodeError for values that have no form in text.
     """
 
     def __init__(self, message: type[M]) -> None:
@@ -44,7 +43,7 @@ class TextCodec(Generic[M]):
         self._array = next((place for place, field in enumerate(self._fields) if field.array), None)
 
     def decode(self, body: bytes) -> M:
-        """Read the fields of a message: what stands between its id and the terminator."""
+        """Read the fields of a message: the bytes between its id and the terminator."""
         if self._array is not None:
             values = self._with_array(body, self._array)
         else:
@@ -74,7 +73,7 @@ class TextCodec(Generic[M]):
             raise ProtocolError(f"{self._name}.{field.name} = {number[:_QUOTED]!r}: {error}") from error
 
     def _with_array(self, body: bytes, place: int) -> list[Any]:
-        """Read a message with an array: whole by numpy, for it is nearly all of the message."""
+        """Read a message with an array: numpy reads all fields, since the array is nearly all of the message."""
         numbers = _integers(body)
         behind = len(self._fields) - place - 1
         if len(numbers) < place + behind:
@@ -115,7 +114,7 @@ def _coder(field: Field) -> tuple[Callable[[bytes], Any], Callable[[Any], bytes]
 
 
 def _kind(field: Field) -> Whole | Decimal | None:
-    """Say what a field is in text; None for truth, and for an array."""
+    """Return the text type of a field; None for truth, and for an array."""
     if field.text is not None or not isinstance(field.wire, Scalar):
         return field.text
     code = field.wire.code
@@ -170,7 +169,7 @@ def _write_array(values: Any) -> bytes:
 
 
 def _integers(body: bytes) -> Ints:
-    """Read a row of integers; where numpy would read otherwise than we do, the slow way, number by number."""
+    """Read a row of integers by numpy; number by number where numpy would read something else."""
     bars = body.translate(None, _DIGITS)
     if bars != b"|" * len(bars):
         return _integers_one_by_one(body)

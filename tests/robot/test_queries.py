@@ -5,18 +5,18 @@ import asyncio
 import pytest
 
 from tests.clock import jumping
-from zbridge.bus.fake import FakeQuestion
+from zbridge.bus.fake import FakeQuery
 from zbridge.errors import Refused
 from zbridge.fleet import topics
-from zbridge.robot.pending_queries import WAITING, PendingQueries
+from zbridge.robot.queries import WAITING, PendingQueries
 
 
 def questions() -> PendingQueries:
     return PendingQueries(asyncio.get_running_loop(), answer_s=2.0)
 
 
-def question() -> FakeQuestion:
-    return FakeQuestion("fleet/r1/@rpc/map")
+def question() -> FakeQuery:
+    return FakeQuery("fleet/r1/@rpc/map")
 
 
 @jumping

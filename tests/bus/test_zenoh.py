@@ -11,9 +11,8 @@ import pytest
 import zenoh
 
 from tests.e2e.conftest import free_port
-from zbridge.bus import BusSettings, Lane, Look, Question
-from zbridge.bus import zenohbus as module
-from zbridge.bus.zenohbus import ZenohBus, open_zenoh, zenoh_config
+from zbridge.bus import BusSettings, IncomingQuery, Lane, Look
+from zbridge.bus.zenoh import ZenohBus, declared, incoming, open_zenoh, publishers, session, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
@@ -118,7 +117,7 @@ async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key
 async def test_a_question_knows_what_was_asked_and_is_answered_on_a_concrete_key(bus: ZenohBus) -> None:
     asked = list[tuple[str, str]]()
 
-    def answer(question: Question) -> None:
+    def answer(question: IncomingQuery) -> None:
         asked.append((question.asked, question.key))
         question.answer(b"yes")
 
@@ -165,7 +164,7 @@ async def test_an_error_reply_is_a_map_of_code_and_reason(bus: ZenohBus) -> None
     ],
 )
 def test_an_error_reply_of_anybody_is_read(payload: bytes, kind: type[Exception], text: str | None) -> None:
-    error = module._read_error(payload)
+    error = incoming.read_error(payload)
     assert type(error) is kind
     assert text is None or str(error) == text
     assert not isinstance(error, Refused) or error.code in Code
@@ -188,7 +187,7 @@ async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> 
 async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
     bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    monkeypatch.setattr(session, "FLUSH_S", 0.01)
     go = threading.Event()
     bus._writer.put(lambda: go.wait(SOON_S))
     with pytest.raises(BusError, match=r"the bus took nothing for 0\.01 s"):
@@ -215,17 +214,17 @@ class Busy:
 
 def test_what_meets_its_own_callback_is_taken_back_again_at_once() -> None:
     entity = Busy(2)
-    declared = module._Declared(entity)
-    declared.close()
+    handle = declared.Declared(entity)
+    handle.close()
     assert entity.asked == 3 * [threading.current_thread().name]
     assert entity.undeclared.is_set()
-    declared.close()
+    handle.close()
     assert len(entity.asked) == 3, "taken back once"
 
 
 def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it() -> None:
     entity = Busy(30)
-    module._Declared(entity).close()
+    declared.Declared(entity).close()
     assert 0 < entity.asked.count(threading.current_thread().name) < 10
     assert entity.undeclared.wait(SOON_S)
     assert len(entity.asked) == 31
@@ -234,9 +233,9 @@ def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it
 def test_a_callback_that_never_ends_is_given_up_and_said_so(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "UNDECLARE_S", 0.05)
+    monkeypatch.setattr(declared, "UNDECLARE_S", 0.05)
     entity = Busy(10**9)
-    module._Declared(entity).close()
+    declared.Declared(entity).close()
     for thread in threading.enumerate():
         if thread.name == "zbridge-undeclare":
             thread.join(SOON_S)
@@ -250,7 +249,7 @@ def test_other_errors_are_not_tried_again() -> None:
             raise RuntimeError("no such thing")
 
     with pytest.raises(RuntimeError, match="no such thing"):
-        module._Declared(Broken()).close()
+        declared.Declared(Broken()).close()
 
 
 async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_back_again(bus: ZenohBus) -> None:
@@ -264,7 +263,7 @@ async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_bac
         bus.frames("k/@wire", lambda anybody: None),
     ]
     for handle in handles:
-        assert isinstance(handle, module._Declared)
+        assert isinstance(handle, declared.Declared)
         stubborn = [Busy(2) for _ in handle._entities]
         real, handle._entities = handle._entities, tuple(stubborn)
         handle.close()
@@ -277,19 +276,19 @@ async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_bac
 async def test_streams_above_the_first_ones_are_published_all_the_same_and_leave_nothing_behind(
     bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    monkeypatch.setattr(publishers, "STREAM_PUBLISHERS", 2)
     seen = Seen()
     bus.subscribe("fleet/r1/sensor/*", lambda sample: seen.take(sample.key, sample.payload))
     names = [f"s{number}" for number in range(5)]
-    publishers = [bus.publisher(f"fleet/r1/sensor/{name}", topics.SENSOR(name)) for name in names]
-    kinds = [type(publisher).__name__ for publisher in publishers]
+    streams = [bus.publisher(f"fleet/r1/sensor/{name}", topics.SENSOR(name)) for name in names]
+    kinds = [type(publisher).__name__ for publisher in streams]
     assert kinds == 2 * ["_StreamPublisher"] + 3 * ["_StreamKey"]
-    bus.put_all([(publisher, [b"1", b"2"]) for publisher in publishers])
-    publishers[-1].put(b"3")
+    bus.put_all([(publisher, [b"1", b"2"]) for publisher in streams])
+    streams[-1].put(b"3")
     await seen.until(lambda: len(seen) == 11)
     expected = {(f"fleet/r1/sensor/{name}", payload) for name in names for payload in (b"1", b"2")}
     assert set(seen) == expected | {("fleet/r1/sensor/s4", b"3")}
-    for publisher in publishers:
+    for publisher in streams:
         publisher.close()
         publisher.close()
         assert publisher.closed  # type: ignore[attr-defined]
@@ -313,12 +312,12 @@ async def test_what_waits_to_be_written_without_loss_is_written_before_its_key_i
 
 
 async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "PUBLISHERS", 2)
+    monkeypatch.setattr(publishers, "STREAM_PUBLISHERS", 2)
     for number in range(1000):
         bus.publisher(f"fleet/r1/sensor/s{number}", topics.SENSOR(f"s{number}")).close()
         bus.publisher(f"fleet/r1/state{number}", topics.STATUS).close()
     assert len(bus._handles) < 200
-    assert len(bus._published) == 2
+    assert len(bus._publishers.stream_keys) == 2
 
 
 async def test_what_a_sort_drops_never_comes_to_the_event_loop(bus: ZenohBus) -> None:
@@ -341,7 +340,7 @@ async def test_a_question_that_a_sort_drops_ends_without_an_answer(bus: ZenohBus
 
 
 async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "QUESTIONS_HZ", 2.0)
+    monkeypatch.setattr(incoming, "QUERIES_HZ", 2.0)
     metrics = Metrics()
     bus = await open_zenoh(ALONE, metrics)
     bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))

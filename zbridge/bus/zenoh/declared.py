@@ -1,0 +1,67 @@
+"""Takes back what was declared on a Zenoh session.
+
+Zenoh refuses to undeclare an entity whose callback runs at that moment ("Already borrowed"), so that is tried again: a
+few times at once, then by a thread of its own.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any
+
+log = logging.getLogger("zbridge.bus")
+
+UNDECLARE_S = 1.0
+"""Longest time for which undeclaring an entity is tried while its callback runs on."""
+_TRIES_AT_ONCE, _PAUSE_S = 4, 0.0005
+"""Tries of the calling thread, which may be the event loop's, and the pause between two tries, seconds."""
+
+
+class Declared:
+    """Zenoh entities that are undeclared together. :meth:`close` is idempotent."""
+
+    def __init__(self, *entities: Any) -> None:
+        self._entities = entities
+
+    @property
+    def closed(self) -> bool:
+        """Whether the entities were taken back."""
+        return not self._entities
+
+    def close(self) -> None:
+        """Undeclare the entities."""
+        entities, self._entities = self._entities, ()
+        for entity in entities:
+            _undeclare_soon(entity)
+
+
+def _undeclare_soon(entity: Any) -> None:
+    """Undeclare an entity, here within 2 ms or else by a thread of its own within :data:`UNDECLARE_S`."""
+    for attempt in range(_TRIES_AT_ONCE):
+        if attempt:
+            time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    threading.Thread(target=_undeclare_later, args=(entity,), name="zbridge-undeclare", daemon=True).start()
+
+
+def _undeclare_later(entity: Any) -> None:
+    give_up_at = time.monotonic() + UNDECLARE_S
+    while time.monotonic() < give_up_at:
+        time.sleep(_PAUSE_S)
+        if _undeclare(entity):
+            return
+    log.error("%s was not taken back: Already borrowed for %g s", type(entity).__name__, UNDECLARE_S)
+
+
+def _undeclare(entity: Any) -> bool:
+    """Undeclare an entity; False where its own callback runs and it must be tried again."""
+    try:
+        entity.undeclare()
+    except RuntimeError as error:
+        if "borrowed" not in str(error):
+            raise
+        return False
+    return True

@@ -1,0 +1,170 @@
+"""What comes in from Zenoh: samples, queries, changes of liveliness, and replies to our own queries.
+
+The functions that ``*_callback`` return run on Zenoh's threads. They choose a lane, copy what the event loop needs and
+put it into the inbox.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+
+from zbridge.bus.inbox import Source
+from zbridge.bus.interface import Answer, Lane, Look, Sample, Sort
+from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.publishers import reply_and_drop
+from zbridge.errors import BusError, PayloadError, Refused, refusal
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.messages import Denied
+from zbridge.fleet.topics import is_concrete
+from zbridge.metrics import Count
+from zbridge.protocol.rate_limit import RateLimit
+
+QUERIES_HZ = 500.0
+"""Queries a second that one queryable answers."""
+REPLIES = 10_000
+"""Most replies to one query."""
+_REPLIES_OF_EACH = 16
+"""Most replies of one session to a query for one key."""
+_DENIED = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(Denied))
+
+
+def lane_callback(lane: Lane, source: Source) -> Callable[[Any], None]:
+    """Make the callback of what comes by one lane."""
+
+    def store(raw: Any) -> None:
+        source.put(raw, lane)
+
+    return store
+
+
+def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None]:
+    """Make the callback of samples that are sorted before the event loop hears of them."""
+
+    def store(sample: zenoh.Sample) -> None:
+        attachment, payload = sample.attachment, sample.payload
+        shown = attachment.to_bytes() if attachment is not None else None
+        size = len(payload) + (len(shown) if shown is not None else 0)
+        key = str(sample.key_expr)
+        lane = sort(key, shown, size, payload.to_bytes)
+        if lane is Lane.STOP:
+            source.fold(Sample(key, b"", shown), lane)  # its payload says nothing
+        elif lane is not None:
+            source.put(Sample(key, payload.to_bytes(), shown), lane, size)
+
+    return store
+
+
+def query_callback(sort: Sort, source: Source, unanswered: Count) -> Callable[[zenoh.Query], None]:
+    """Make the callback of queries that are sorted before the event loop hears of them."""
+
+    def store(query: zenoh.Query) -> None:
+        payload = query.payload
+        shown = payload.to_bytes() if payload is not None else None
+        size = len(shown) if shown is not None else 0
+        lane = sort(str(query.key_expr), shown, size, bytes)
+        if lane is None:
+            unanswered.value += 1
+            query.drop()  # type: ignore[no-untyped-call]
+        else:
+            source.put(query, lane, size)
+
+    return store
+
+
+def rate_limited(lane: Lane, clock: Callable[[], float]) -> Sort:
+    """Sort so many queries a second into a lane; those above get no answer."""
+    limit = RateLimit(QUERIES_HZ)
+
+    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        return lane if limit.take(clock()) else None
+
+    return sort
+
+
+def read_sample(raw: zenoh.Sample) -> Sample:
+    """Copy a sample."""
+    attachment = raw.attachment
+    return Sample(str(raw.key_expr), raw.payload.to_bytes(), attachment.to_bytes() if attachment is not None else None)
+
+
+def read_change(raw: zenoh.Sample) -> tuple[str, bool]:
+    """Read the key of a liveliness token, and whether the token came (True) or went."""
+    return str(raw.key_expr), raw.kind == zenoh.SampleKind.PUT
+
+
+class ZenohQuery:
+    """A query to this session (:class:`zbridge.bus.IncomingQuery`); a writer thread answers it."""
+
+    def __init__(self, query: zenoh.Query, key: str, writer: Writer) -> None:
+        self.asked = str(query.key_expr)
+        self.key = key if is_concrete(key) else self.asked
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.attachment = query.attachment.to_bytes() if query.attachment is not None else None
+        self._query = query
+        self._writer = writer
+
+    def __repr__(self) -> str:
+        return f"<ZenohQuery {self.asked}>"
+
+    def answer(self, payload: bytes) -> None:
+        """Reply with a payload."""
+        self._writer.put(lambda: reply_and_drop(self._query, self.key, payload, None))
+
+    def refuse(self, refusal: Refused) -> None:
+        """Reply with an error: its code, and its text."""
+        denied = payloads.encode(Denied(code=refusal.code, reason=str(refusal)))
+        self._writer.put(lambda: self._refuse(denied))
+
+    def _refuse(self, denied: bytes) -> None:
+        try:
+            self._query.reply_err(denied, encoding=_DENIED)
+        finally:
+            self._query.drop()  # type: ignore[no-untyped-call]
+
+
+class Replies(list[zenoh.Reply]):
+    """The replies to one query of ours, within bounds; taken on Zenoh's threads.
+
+    A flood of one session's replies must not hide another's. A session that answers for one key has little to say; one
+    that answers for many may answer for a whole fleet.
+    """
+
+    def __init__(self, key_expr: str, dropped: Count) -> None:
+        super().__init__()
+        self._dropped = dropped
+        self._of_each = REPLIES if "*" in key_expr else _REPLIES_OF_EACH
+        self._counts: Counter[str | None] = Counter()
+
+    def take(self, reply: zenoh.Reply) -> None:
+        """Keep a reply while there is room; count it as dropped otherwise."""
+        replier = _replier(reply)
+        if len(self) < REPLIES and self._counts[replier] < self._of_each:
+            self._counts[replier] += 1
+            self.append(reply)
+        else:
+            self._dropped.value += 1
+
+
+def read_reply(reply: zenoh.Reply) -> Answer:
+    """Read a reply: what was answered, or why it was refused."""
+    if reply.ok is not None:
+        return Answer(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), replier=_replier(reply))
+    error = read_error(reply.err.payload.to_bytes() if reply.err is not None else b"no answer")
+    return Answer("", b"", error, _replier(reply))
+
+
+def read_error(payload: bytes) -> Refused | BusError:
+    """Read an error reply: a refusal has a code, anything else is a text of the bus's own."""
+    try:
+        denied = payloads.decode(Denied, payload)
+    except PayloadError:
+        return BusError(payload.decode("utf-8", "replace"))
+    return refusal(denied.code, denied.reason)
+
+
+def _replier(reply: zenoh.Reply) -> str | None:
+    return str(reply.replier_id.zid) if reply.replier_id is not None else None

@@ -1,0 +1,198 @@
+"""Publishers of the classes of delivery: plain, stream and state.
+
+A put that may block is carried out by a writer thread. A stream has a plain and an express publisher: the last message
+of a batch is express, which makes the whole batch leave at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import msgspec
+import zenoh
+import zenoh.ext
+
+from zbridge.bus.interface import Batch, Publisher
+from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.declared import Declared
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
+
+STREAM_PUBLISHERS = 300
+"""Different stream keys that get publishers: Zenoh keeps 1.5 kB of each for ever, here and in every router, and finds
+others more slowly. Later ones are declared as keys only: that takes 0.5 us more for each message."""
+
+
+class Publishers:
+    """Makes the publishers of one session.
+
+    states: writes states and answers. streams: writes streams. lossless: streams block instead of being dropped.
+    """
+
+    def __init__(self, session: zenoh.Session, states: Writer, streams: Writer, *, lossless: bool) -> None:
+        self._session = session
+        self._states = states
+        self._streams = streams
+        self._lossless = lossless
+        self.stream_keys: set[str] = set()
+        """Stream keys that ever got publishers."""
+
+    def __repr__(self) -> str:
+        return f"<Publishers {len(self.stream_keys)} of {STREAM_PUBLISHERS} stream keys>"
+
+    def make(self, key: str, topic: Topic) -> Publisher:
+        """Declare ``key`` with the delivery of ``topic``."""
+        qos, options = topic.qos, _options(topic)
+        if qos.keeps_last:
+            return _StatePublisher(self._session, key, options, self._states)
+        if topic.delivery is Delivery.STREAM:
+            known = len(self.stream_keys) < STREAM_PUBLISHERS or key in self.stream_keys
+            if known:
+                self.stream_keys.add(key)
+            kind = _StreamPublisher if known else _StreamKey
+            return kind(self._session, key, options, self._streams, blocks=self._lossless)
+        plain = self._session.declare_publisher(key, express=qos.express, **options)
+        blocks = qos.congestion is Congestion.BLOCK
+        return PlainPublisher(key, plain, self._states if blocks else None)
+
+    def put_all(self, batch: Batch) -> bool:
+        """Publish stream messages, those of a key in order; False asks to pause the source."""
+        return self._streams.put(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
+
+
+class PlainPublisher(Declared):
+    """Writes a key directly, or by a writer thread where a full queue blocks."""
+
+    def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None) -> None:
+        super().__init__(publisher)
+        self.key = key
+        self._put = publisher.put
+        self._writer = writer
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        """Publish one message."""
+        if self._writer is not None:
+            return self._writer.put(lambda: self._put(payload, attachment=attachment))
+        self._put(payload, attachment=attachment)
+        return True
+
+
+class _StreamPublisher(Declared):
+    """Writes a stream key, plain or express."""
+
+    put_plain: Callable[..., object]
+    put_express: Callable[..., object]
+
+    def __init__(
+        self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer, *, blocks: bool
+    ) -> None:
+        self.key = key
+        self._writer = writer
+        self._blocks = blocks
+        if blocks:
+            options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
+        super().__init__(*self._declare(session, key, options))
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
+        plain = session.declare_publisher(key, **options)
+        express = session.declare_publisher(key, express=True, **options)
+        self.put_plain, self.put_express = plain.put, express.put
+        return plain, express
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        return self._writer.put(partial(self.put_express, payload, attachment=attachment))
+
+    def close(self) -> None:
+        if self._blocks:  # what waits to be written is not lost
+            self._writer.put(super().close)
+        else:
+            super().close()
+
+
+class _StreamKey(_StreamPublisher):
+    """Writes a stream key that Zenoh is to forget when it is closed."""
+
+    def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
+        expression = session.declare_keyexpr(key)
+        self.put_plain = partial(session.put, expression, **options)
+        self.put_express = partial(session.put, expression, express=True, **options)
+        return (_Undeclared(lambda: session.undeclare(expression)),)
+
+
+class _Undeclared(msgspec.Struct):
+    """Something that is undeclared by a call."""
+
+    undeclare: Callable[[], object]
+
+
+class _StatePublisher(Declared):
+    """Writes a state key: cached for late joiners, and answered to a plain get."""
+
+    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
+        self.key = key
+        self._writer = writer
+        self._last: bytes | None = None
+        self._encoding = options["encoding"]
+        self._publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            key,
+            cache=zenoh.ext.CacheConfig(1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
+            publisher_detection=True,
+            **options,
+        )
+        super().__init__(session.declare_queryable(key, self._reply), self._publisher)
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        self._last = payload
+        return self._writer.replace(
+            self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 256
+        )
+
+    def _reply(self, query: zenoh.Query) -> None:
+        last = self._last
+        if last is None:
+            query.drop()  # type: ignore[no-untyped-call]
+        else:
+            self._writer.put(lambda: reply_and_drop(query, self.key, last, self._encoding))
+
+
+def reply_and_drop(query: zenoh.Query, key: str, payload: bytes, encoding: zenoh.Encoding | None) -> None:
+    """Answer a query, and end it; on a writer thread."""
+    try:
+        query.reply(key, payload, encoding=encoding, express=True)
+    finally:
+        query.drop()  # type: ignore[no-untyped-call]
+
+
+def _put_batch(batch: Batch) -> None:
+    streams: list[tuple[Any, list[bytes]]] = list(batch)
+    last = streams[-1][1].pop()
+    for publisher, waiting in streams:
+        put = publisher.put_plain
+        for payload in waiting:
+            put(payload)
+    streams[-1][0].put_express(last)
+
+
+def _options(topic: Topic) -> dict[str, Any]:
+    qos: QoS = topic.qos
+    encoding = zenoh.Encoding(payloads.ENCODING).with_schema(payloads.schema(topic.message))
+    return {
+        "encoding": encoding,
+        "priority": _PRIORITIES[qos.priority],
+        "congestion_control": _CONGESTIONS[qos.congestion],
+    }
+
+
+_PRIORITIES = {
+    Priority.DATA: zenoh.Priority.DATA,
+    Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
+    Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
+}
+_CONGESTIONS = {
+    Congestion.DROP: zenoh.CongestionControl.DROP,
+    Congestion.BLOCK: zenoh.CongestionControl.BLOCK,
+}

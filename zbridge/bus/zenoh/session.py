@@ -1,0 +1,326 @@
+"""The Zenoh session of one process: its configuration, what is declared on it, and how it is left."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import zenoh
+import zenoh.ext
+
+from zbridge.bus.inbox import Inbox
+from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort, Tls
+from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.incoming import (
+    Replies,
+    ZenohQuery,
+    lane_callback,
+    query_callback,
+    rate_limited,
+    read_change,
+    read_reply,
+    read_sample,
+    sorted_callback,
+)
+from zbridge.bus.zenoh.publishers import PlainPublisher, Publishers
+from zbridge.errors import BusError
+from zbridge.fleet.topics import SizeBounds, Topic
+from zbridge.metrics import Metrics
+
+H = TypeVar("H", bound=Handle)
+
+PATIENCE_US = 20_000
+"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
+LEAVE_S = 0.4
+"""Longest time leaving the bus takes."""
+FLUSH_S = 2.0
+"""Longest time for which :meth:`ZenohBus.flush` waits."""
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+_TIDY = 64
+"""Handles that are kept before closed ones are forgotten."""
+_INGRESS = ("ingress",)
+_BOUNDED = ("put", "delete", "query")
+_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
+"""Where in Zenoh's source an error comes from: of no use to the reader of an error."""
+
+
+def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
+    values: dict[str, Any] = {
+        "mode": settings.effective_mode,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast,
+        "open/return_conditions/connect_scouted": wait_for_peers,
+        # A pool of 28 MB in every process, for payloads a robot does not have.
+        "transport/shared_memory/enabled": False,
+        # A stream is dropped when the bus stands still, not when a thread of it is late by a millisecond.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
+    }
+    if settings.listen:
+        values["listen/endpoints"] = settings.listen
+    if bounds:
+        values["low_pass_filter"] = _size_filters(bounds)
+    if settings.effective_mode == "client":
+        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+    if settings.tls is not None:
+        values |= _tls_values(settings.tls)
+    config = zenoh.Config()
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key} = {value!r}: {_ORIGIN.sub('', str(error))}") from error
+    return config
+
+
+def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
+    """Have Zenoh drop what comes in and is larger than its key allows."""
+    return [
+        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
+        for number, (key_exprs, most_bytes) in enumerate(bounds)
+    ]
+
+
+def _tls_values(tls: Tls) -> dict[str, Any]:
+    values: dict[str, Any] = {"transport/link/tls/root_ca_certificate": tls.ca}
+    if tls.certificate and tls.key:
+        values["transport/link/tls/enable_mtls"] = True
+        for side in ("listen", "connect"):
+            values[f"transport/link/tls/{side}_certificate"] = tls.certificate
+            values[f"transport/link/tls/{side}_private_key"] = tls.key
+    return values
+
+
+async def open_zenoh(
+    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+) -> ZenohBus:
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds)
+    try:
+        session = await asyncio.to_thread(zenoh.open, config)
+    except zenoh.ZError as error:
+        raise BusError(_ORIGIN.sub("", str(error))) from error
+    return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
+
+
+class ZenohBus:
+    """The bus over one Zenoh session."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        loop: asyncio.AbstractEventLoop,
+        metrics: Metrics,
+        *,
+        stream: str = "drop",
+    ) -> None:
+        self._session = session
+        self._loop = loop
+        self._inbox = Inbox(loop, metrics)
+        self._replies_dropped = metrics.count("bus_replies_dropped")
+        self._unanswered = metrics.count("bus_unanswered")
+        self._relief: list[Callable[[], None]] = []
+        lossless = stream == "block"
+        self._writer = Writer("states", metrics, lossless=lossless, relieved=self._relieve)
+        self._streams = Writer("streams", metrics, lossless=lossless, relieved=self._relieve)
+        self._publishers = Publishers(session, self._writer, self._streams, lossless=lossless)
+        self.put_all = self._publishers.put_all
+        self._handles: list[Handle] = []
+        self._tidy_at = _TIDY
+
+    def __repr__(self) -> str:
+        return f"<ZenohBus {self._session.zid()}>"
+
+    @property
+    def zid(self) -> str:
+        """The id of the Zenoh session."""
+        return str(self._session.zid())
+
+    def publisher(self, key: str, topic: Topic) -> Publisher:
+        """Declare that ``key`` will be written."""
+        return self._keep(self._publishers.make(key, topic))
+
+    def on_relief(self, handler: Callable[[], None]) -> None:
+        """Call ``handler`` when a paused source may go on."""
+        self._relief.append(handler)
+
+    def subscribe(
+        self,
+        key_expr: str,
+        handler: Callable[[Sample], None],
+        *,
+        lane: Lane | Sort = Lane.OTHER,
+        history: bool = False,
+    ) -> Handle:
+        """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
+
+        Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
+        """
+        if isinstance(lane, Lane):
+            source = self._inbox.source(handler, read_sample)
+            store = lane_callback(lane, source)
+        else:
+            source = self._inbox.source(handler)
+            store = sorted_callback(lane, source)
+        if not history:
+            return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
+        config = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        return self._keep(
+            Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
+        )
+
+    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
+        writer = self._writer
+        source = self._inbox.source(handler, lambda raw: ZenohQuery(raw, key, writer))
+        store = query_callback(
+            rate_limited(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
+        )
+        return self._keep(Declared(self._session.declare_queryable(key, store)))
+
+    async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
+        replies = await self._collect(
+            key_expr,
+            lambda handler: self._session.get(
+                key_expr,
+                handler,
+                payload=payload,
+                timeout=timeout_s,
+                priority=zenoh.Priority.REAL_TIME,
+                express=True,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            ),
+            timeout_s,
+        )
+        return [read_reply(reply) for reply in replies]
+
+    def attend(self) -> None:
+        """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
+        self._inbox.attend()
+
+    def announce(self, key: str) -> Handle:
+        """Declare a liveliness token."""
+        return self._keep(Declared(self._session.liveliness().declare_token(key)))
+
+    async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
+        """List the liveliness tokens that exist."""
+        replies = await self._collect(
+            key_expr, lambda handler: self._session.liveliness().get(key_expr, handler, timeout=timeout_s), timeout_s
+        )
+        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+    def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
+        """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
+        store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
+        return self._keep(Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
+
+    async def flush(self) -> None:
+        """Wait until all queued states and answers are handed to Zenoh (streams excluded).
+
+        Raises BusError after :data:`FLUSH_S` seconds.
+        """
+        loop = self._loop
+        written: asyncio.Future[None] = loop.create_future()
+
+        def tell() -> None:
+            if not written.done():
+                written.set_result(None)
+
+        def ring() -> None:
+            loop.call_soon_threadsafe(tell)
+
+        self._writer.put(ring)
+        try:
+            async with asyncio.timeout(FLUSH_S):
+                await written
+        except TimeoutError:
+            raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
+
+    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
+        loop = self._loop
+        plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+
+        def changed(status: zenoh.MatchingStatus) -> None:
+            loop.call_soon_threadsafe(listened, status.matching)
+
+        self._keep(Declared(plain.declare_matching_listener(changed)))
+        return self._keep(PlainPublisher(key, plain, None))
+
+    def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
+        """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""
+        return self.frames(key, handler)
+
+    def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
+        """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
+        loop, info = self._loop, self._session.info
+
+        def changed(_: zenoh.TransportEvent) -> None:
+            loop.call_soon_threadsafe(lambda: handler(bool(info.transports())))
+
+        return self._keep(Declared(info.declare_transport_events_listener(changed, history=True)))
+
+    async def close(self) -> bool:
+        """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
+        handles, self._handles = self._handles, []
+        left = threading.Event()
+
+        def leave() -> None:
+            self._leave(handles)
+            left.set()
+
+        threading.Thread(target=leave, name="zbridge-leave", daemon=True).start()
+        deadline = self._loop.time() + LEAVE_S
+        while not left.is_set() and self._loop.time() < deadline:  # noqa: ASYNC110 - a thread, not a task
+            await asyncio.sleep(0.005)
+        return left.is_set()
+
+    def _leave(self, handles: list[Handle]) -> None:
+        for writer in (self._streams, self._writer):
+            writer.stop(LEAVE_S / 4)
+        with contextlib.suppress(zenoh.ZError):
+            for handle in reversed(handles):
+                handle.close()
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def _relieve(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            for handler in self._relief:
+                self._loop.call_soon_threadsafe(handler)
+
+    def _keep(self, handle: H) -> H:
+        """Remember a handle that is to be closed at the end; forget closed ones now and then, so that none add up."""
+        self._handles.append(handle)
+        if len(self._handles) >= self._tidy_at:
+            self._handles = [kept for kept in self._handles if not getattr(kept, "closed", False)]
+            self._tidy_at = 2 * len(self._handles) + _TIDY
+        return handle
+
+    async def _collect(self, key_expr: str, start: Callable[[Any], Any], timeout_s: float) -> list[Any]:
+        """Run a get and collect its replies. Zenoh drops the handler after the last reply, which ends the wait."""
+        loop, replies = self._loop, Replies(key_expr, self._replies_dropped)
+        done = loop.create_future()
+
+        def finish() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        handler = zenoh.handlers.Callback(replies.take, lambda: loop.call_soon_threadsafe(finish))
+        try:
+            await asyncio.to_thread(start, handler)
+        except zenoh.ZError as error:
+            raise BusError(_ORIGIN.sub("", str(error))) from error
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
+                await done
+        return list(replies)

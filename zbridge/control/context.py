@@ -1,0 +1,32 @@
+"""What the parts that serve one robot share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+
+from zbridge.bus import Bus
+from zbridge.conditions import Conditions
+from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.metrics import Metrics
+from zbridge.protocol.plugin import Robot
+
+
+class RobotContext(msgspec.Struct, frozen=True):
+    """One robot, and how its parts reach the bus, its links, the counters and the time.
+
+    publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
+    clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
+    """
+
+    robot: Robot
+    keys: KeySpace
+    bus: Bus
+    metrics: Metrics
+    conditions: Conditions
+    publish: Callable[[Topic, FleetMessage], object]
+    pump: Callable[[], object]
+    clock: Callable[[], float]
+    clock_ns: Callable[[], int]

@@ -1,0 +1,224 @@
+"""Enforces what the authority of one robot decides: stops in time, ``control``, the audit log, counters.
+
+Theory of operation. The authority decides and has no clock; the enforcer carries out. A command of the holder's passes
+three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is told,
+:meth:`Enforcer.moved` after it was told. Whoever calls a method of the authority calls :meth:`Enforcer.settle` after
+it: that sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms
+the timer. The timer stands at the authority's deadline or before it: commands mostly postpone the deadline, and an
+early wake-up is harmless. Before anything is written to the robot :meth:`Enforcer.keep_time` does what is due, since
+the process may have been frozen past its deadline.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+from zbridge.bus import Sample
+from zbridge.control.audit_log import Audit
+from zbridge.control.authority import Authority
+from zbridge.control.context import RobotContext
+from zbridge.control.events import Event, EventKind
+from zbridge.control.gate import CommandGate, Sieve
+from zbridge.control.motion_limits import MotionLimits
+from zbridge.control.standstill import Standstill
+from zbridge.errors import Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
+from zbridge.protocol.session import State
+
+_CONTROL_S = 0.05
+"""Least time between two publications of ``control`` while refusals come in."""
+
+
+class Enforcer:
+    """Carries out the decisions of one robot's authority. limits: None where drives are not limited."""
+
+    def __init__(
+        self,
+        context: RobotContext,
+        authority: Authority,
+        standstill: Standstill,
+        audit: Audit,
+        limits: MotionLimits | None = None,
+    ) -> None:
+        self.authority = authority
+        self.gate = CommandGate(authority, context.keys, context.clock)
+        """Sorts commands on the bus's threads."""
+        self._context = context
+        self._clock = context.clock
+        self._standstill = standstill
+        self._audit = audit
+        self._limits = limits
+        self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at = math.inf
+        self._control_due: asyncio.TimerHandle | None = None
+        self._refused = context.metrics.count("refused")
+        self._same_stops = context.metrics.count("stops_folded")
+        self._slowed = context.metrics.count("drives_slowed")
+
+    def __repr__(self) -> str:
+        return f"<Enforcer {self._context.keys.robot} {self.authority!r}>"
+
+    # A command of the holder's
+
+    def admit(self, sample: Sample, now: float) -> str:
+        """Return the holder who sent a command, and renew the lease; raise Refused where nobody's lease shows it."""
+        who = self.authority.admit(sample.attachment, sample.key, sample.payload, now)
+        if self.authority.eventful:
+            self.settle()
+        return who
+
+    def require_motion(self) -> None:
+        """Raise Refused where the holder must send neutral before the robot moves."""
+        self.authority.require_motion()
+
+    def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
+        """Return what the robot may be told of a motion, within the limits; raise Refused where it may not move."""
+        self.authority.require_motion()
+        if self._limits is None or not isinstance(command, Drive):
+            return command
+        limited = self._limits.limit(command, now)
+        self._slowed.value += limited is not command and limited != command
+        return limited
+
+    def moved(self, path: str, command: Drive | Motor, now: float, *, moving: bool) -> None:
+        """Note that the robot was told to move, or to be at rest.
+
+        Raises Refused where the link had just begun to take again: then a stop went instead of the motion.
+        """
+        authority = self.authority
+        if moving:
+            authority.require_motion()
+        authority.applied(path, now, moving=moving)
+        if isinstance(command, Drive):
+            if self._limits is not None:
+                self._limits.sent(command, now)
+            if not moving and not authority.driven:
+                self._standstill.neutral(now)
+
+    def commanded(self, command: FleetMessage) -> None:
+        """Note that the robot was told something that may move it: a mode, or what nobody here can read."""
+        if isinstance(command, Mode):
+            self.authority.mode_chosen(autonomous=command.mode == "autonomous")
+        elif isinstance(command, Raw):
+            self.authority.sent_opaque()
+
+    def refuse(self, command: str, refusal: Refused, who: str | None) -> None:
+        """Count a refusal, for ``control``; :meth:`settle` shows it."""
+        self.authority.refuse(command, refusal, who)
+
+    # Stops
+
+    def stop(self, reason: str) -> None:
+        """Stop the robot at once and for a second, and end the lease."""
+        self.authority.stop(reason)
+        self.settle()
+
+    def stop_commanded(self) -> None:
+        """Obey a stop from the bus, which anybody may send; the gate folds those that follow at once."""
+        self.stop("stop")
+        self.gate.stopped()
+
+    def hold_back(self, reason: str, *, stops: bool) -> None:
+        """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
+        self.authority.hold_back(reason, stops=stops)
+        self.settle()
+
+    def bus_lost(self) -> None:
+        """End the lease: its holder cannot be heard any more."""
+        self.authority.bus_lost()
+        self.settle()
+
+    # What follows from a decision, and from time going by
+
+    def settle(self) -> None:
+        """Carry out what the authority decided, and arm the timer for its next deadline."""
+        if self.authority.eventful:
+            self._settle_events()
+        deadline = self.authority.deadline()
+        if deadline is not None and deadline < self._timer_at:
+            self._arm(deadline)
+
+    def keep_time(self) -> None:
+        """Do what is due, before anything is written: the loop may come back late, from a process that was frozen."""
+        if self._clock() >= self._timer_at:
+            self._on_time()
+
+    def watch_sieve(self, command: str, sieve: Sieve) -> None:
+        """Show with every :meth:`beat` what a gate refused by itself."""
+        self._sieves[command] = sieve
+
+    def beat(self) -> None:
+        """Publish ``control``, and write down what was folded. To be called once a second."""
+        self._count_kept_back()
+        self.report()
+        self._audit.flush()
+
+    def report(self) -> None:
+        """Publish ``control`` now."""
+        if self._control_due is not None:
+            self._control_due.cancel()
+            self._control_due = None
+        self._context.publish(topics.CONTROL, self.authority.report(self._clock()))
+
+    def close(self) -> None:
+        """Let no timer fire any more."""
+        for timer in (self._timer, self._control_due):
+            if timer is not None:
+                timer.cancel()
+
+    def _settle_events(self) -> None:
+        changed = False
+        while events := self.authority.events():
+            for event in events:
+                changed = changed or event.what is not EventKind.REFUSED
+                self._carry_out(event)
+            if self._control_due is None:
+                self._control_due = self._loop.call_later(_CONTROL_S, self.report)
+        if changed:
+            self.report()
+
+    def _carry_out(self, event: Event) -> None:
+        if event.what is EventKind.REFUSED:
+            self._refused.value += 1
+        else:
+            if event.what is not EventKind.ACQUIRED and self._limits is not None:
+                self._limits.stands()
+            self._context.metrics.count("control", what=event.what.value).value += 1
+        if event.stops:
+            self._send_stop()
+        self._audit.write(event)
+
+    def _send_stop(self) -> None:
+        session = self._context.robot.driving
+        if session is None or session.state is not State.ESTABLISHED:
+            return
+        try:
+            self._standstill.stop()
+        except Refused as refusal:
+            self.authority.refuse("stop", refusal)
+
+    def _count_kept_back(self) -> None:
+        """Show what the gates refused by themselves since the last time: an entry for each code, with its count."""
+        for command, sieve in self._sieves.items():
+            for refusal, count in sieve.kept_back():
+                self.authority.refuse(command, refusal, count=count)
+                self._refused.value += count - 1  # settling counts one
+        self._same_stops.value = self.gate.same_stops
+        self.settle()
+
+    def _arm(self, deadline: float) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer_at = deadline
+        self._timer = self._loop.call_at(deadline, self._on_time)
+
+    def _on_time(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer, self._timer_at = None, math.inf
+        self.authority.expire(self._clock())
+        self.settle()

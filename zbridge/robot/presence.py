@@ -1,0 +1,128 @@
+"""What the state of a robot's links means: whether the robot is there, what ``status`` says, when motion must end."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from typing import Any
+
+from zbridge.control.context import RobotContext
+from zbridge.control.enforcer import Enforcer
+from zbridge.control.standstill import Standstill
+from zbridge.errors import Refused
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Status
+from zbridge.protocol.session import Session, State
+from zbridge.robot.commands import LINK_BLOCKED, Commands
+from zbridge.robot.connection import Links
+from zbridge.robot.queries import PendingQueries
+
+log = logging.getLogger("zbridge.robot.device")
+
+
+class Presence:
+    """Follows the sessions of one robot. protocol: the name that ``status`` shows."""
+
+    def __init__(
+        self,
+        context: RobotContext,
+        protocol: str,
+        links: Links,
+        enforcer: Enforcer,
+        standstill: Standstill,
+        commands: Commands,
+        pending: PendingQueries,
+    ) -> None:
+        self._context = context
+        self._protocol = protocol
+        self._links = links
+        self._enforcer = enforcer
+        self._standstill = standstill
+        self._commands = commands
+        self._pending = pending
+        self._greeted: Session[Any] | None = None
+        self._busy: str | None = None
+        self._doubtful: str | None = None
+        self._shown_doubts: tuple[str, ...] = ()
+        self._leaving = False
+        self._lost = context.metrics.count("commands_lost")
+        self._stalls = context.metrics.count("link_stalls")
+
+    def __repr__(self) -> str:
+        return f"<Presence {self._context.keys.robot} {self._links.first.state}>"
+
+    @property
+    def reached(self) -> bool:
+        """Whether the robot was ever reached."""
+        return self._greeted is not None
+
+    def leave(self) -> None:
+        """Note that the gateway takes leave of the robot: the end of its session holds nothing back."""
+        self._leaving = True
+
+    def session_changed(self, session: Session[Any]) -> None:
+        """Act on a change of the session that drives: lost, established, busy, in doubt."""
+        if session is not self._context.robot.driving:
+            return
+        busy, self._busy = self._busy, session.busy
+        doubtful, self._doubtful = self._doubtful, session.doubtful
+        if session.over:
+            self._on_lost(session)
+        elif session.state is State.ESTABLISHED and session is not self._greeted:
+            self._on_established(session)
+        elif busy != self._busy:
+            self._enforcer.hold_back(self._busy or "no longer busy", stops=True)
+        if self._doubtful and not doubtful:
+            self._enforcer.hold_back(self._doubtful, stops=True)
+        if session.doubts != self._shown_doubts and not session.over and self._links.first.state == "established":
+            self.publish_status()
+
+    def stalled(self, name: str, stalled: bool) -> None:
+        """Drive no robot whose first link takes nothing: it would obey late, or lose its stop with the rest."""
+        if name != self._links.first.name:
+            return
+        self._commands.blocked = stalled
+        self._context.conditions.set("link", f"{LINK_BLOCKED}: it is not driven" if stalled else None)
+        if stalled:
+            self._stalls.value += 1
+            log.warning("%s: %s", self._context.keys.robot, LINK_BLOCKED)
+        else:
+            self._enforcer.hold_back("the robot's link took nothing", stops=True)
+
+    def publish_status(self) -> None:
+        """Publish ``status`` as it is now."""
+        context, first = self._context, self._links.first
+        session = context.robot.driving
+        agreed = session if session is not None and first.state == "established" else None
+        self._shown_doubts = agreed.doubts if agreed is not None else ()
+        reasons = (first.reason, *self._shown_doubts, *context.conditions.texts)
+        context.publish(
+            topics.STATUS,
+            Status(
+                stamp_ns=context.clock_ns(),
+                state=first.state,
+                reason="; ".join(filter(None, reasons)) or None,
+                protocol=self._protocol,
+                dialect=context.robot.dialect,
+                version=(agreed.version or None) if agreed is not None else None,
+                features=agreed.features if agreed is not None else (),
+                links=tuple(connection.status() for connection in self._links),
+            ),
+        )
+
+    def _on_lost(self, session: Session[Any]) -> None:
+        self._commands.blocked = False
+        self._context.conditions.set("link", None)
+        if session.version is not None:
+            self._lost.value += len(session.outbox)
+            if not self._leaving:
+                self._enforcer.hold_back("robot lost", stops=False)
+            self._pending.refuse_all("the robot was lost")
+
+    def _on_established(self, session: Session[Any]) -> None:
+        """Stop the robot, whoever drove it before, and show what there is to show at once."""
+        self._greeted = session
+        with contextlib.suppress(Refused):  # the condition says so on status
+            self._standstill.stop()
+        for topic, message in self._context.robot.begun(self._context.clock_ns()):
+            self._context.publish(topic, message)

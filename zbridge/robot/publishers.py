@@ -1,0 +1,72 @@
+"""The publishers of one robot, made on first use. Those of names that the robot chooses are bounded in number."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from zbridge.bus import Bus, Publisher
+from zbridge.conditions import Conditions
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.robot.names import NAMES, NameBudget
+
+
+class RobotPublishers:
+    """Publishes on the keys of one robot. ``clock``: seconds."""
+
+    def __init__(self, bus: Bus, keys: KeySpace, conditions: Conditions, clock: Callable[[], float]) -> None:
+        self.known: dict[str, Publisher] = {}
+        """The publishers there are, by path."""
+        self._bus = bus
+        self._keys = keys
+        self._conditions = conditions
+        self._clock = clock
+        self._names = NameBudget()
+
+    def __len__(self) -> int:
+        return len(self.known)
+
+    def __repr__(self) -> str:
+        return f"<RobotPublishers {self._keys.robot} {len(self)}, {self._names!r}>"
+
+    def publish(self, topic: Topic, message: FleetMessage) -> None:
+        """Publish a message; drop it where the robot has too many names."""
+        publisher = self.get(topic)
+        if publisher is not None:
+            publisher.put(payloads.encode(message))
+
+    def get(self, topic: Topic) -> Publisher | None:
+        """Return the publisher of a topic; None where the robot has too many names."""
+        path = topic.path
+        publisher = self.known.get(path)
+        if publisher is None:
+            if _is_named(path) and not self._names.admit(path, self._clock()):
+                self._show_names()
+                return None
+            publisher = self.known[path] = self._bus.publisher(self._keys.key(path), topic)
+        return publisher
+
+    def forget_names(self) -> None:
+        """Give up the names of a connection that has ended."""
+        for path in [path for path in self.known if _is_named(path)]:
+            self.known.pop(path).close()
+
+    def expire(self) -> None:
+        """Begin a new hour of names where it is time. To be called once a second."""
+        self._names.expire(self._clock())
+        self._show_names()
+
+    def close(self) -> None:
+        """Give up every key."""
+        for publisher in self.known.values():
+            publisher.close()
+
+    def _show_names(self) -> None:
+        text = f"more than {NAMES} different names within an hour: the others are not published"
+        self._conditions.set("names", text if self._names.over else None)
+
+
+def _is_named(path: str) -> bool:
+    """Tell a topic of a family, whose last chunk the robot chooses: ``sensor/front``."""
+    return "/" in path

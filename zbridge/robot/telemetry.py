@@ -1,0 +1,115 @@
+"""The way out: what one robot sent, translated and published.
+
+Theory of operation. A read from the robot's socket gives many messages. The payloads of one read are gathered by
+stream, and given to the bus in one call; states are put one by one. Where the bus is slower than the robot, a lossy
+stream drops the oldest, and a lossless bus asks to pause: then the links read nothing until the bus is relieved. Every
+:data:`ATTEND_EVERY` messages the commands that wait are served, so that a long read delays no stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from typing import Any
+
+from zbridge.bus import Handle
+from zbridge.control.context import RobotContext
+from zbridge.errors import ProtocolError, Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.topics import Delivery, Topic
+from zbridge.protocol.plugin import Translate
+from zbridge.robot.connection import Connection, Links
+from zbridge.robot.publishers import RobotPublishers
+from zbridge.robot.queries import PendingQueries
+
+log = logging.getLogger("zbridge.robot.telemetry")
+
+ATTEND_EVERY = 64
+"""Messages of a read between two looks at the commands that wait."""
+
+
+class Telemetry:
+    """Publishes what one robot sent. pending: queries that what is published may answer."""
+
+    def __init__(
+        self, context: RobotContext, publishers: RobotPublishers, pending: PendingQueries, links: Links
+    ) -> None:
+        self._context = context
+        self._bus = context.bus
+        self._clock_ns = context.clock_ns
+        self._publishers = publishers
+        self._pending = pending
+        self._links = links
+        self._translators: dict[type, Translate] = {}
+        self._published = context.metrics.count("published")
+        self._untranslatable = context.metrics.count("untranslatable")
+        self._unnamed = context.metrics.count("names_dropped")
+
+    def __repr__(self) -> str:
+        return f"<Telemetry {self._context.keys.robot} {self._publishers!r}>"
+
+    def serve(self) -> list[Handle]:
+        """Publish on demand what is only published while somebody listens; read again when the bus is relieved."""
+        self._bus.on_relief(self._links.resume)
+        for connection in self._links:
+            for direction in ("in", "out"):
+                self._watch_frames(connection, direction)
+        return [self._watch_listeners(topic) for topic in self._context.robot.on_demand]
+
+    def deliver(self, messages: list[Any]) -> None:
+        """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
+        stamp_ns = self._clock_ns()
+        encode, translators, waiting = payloads.encode, self._translators, self._pending.waiting
+        publishers, known = self._publishers, self._publishers.known
+        streams: dict[str, list[bytes]] = {}
+        flowing, states = True, 0
+        for number, message in enumerate(messages, 1):
+            if not number % ATTEND_EVERY:
+                self._bus.attend()
+            translate = translators.get(type(message)) or self._translator(type(message))
+            try:
+                for topic, telemetry in translate(message, stamp_ns):
+                    payload = encode(telemetry)
+                    stream = streams.get(topic.path)
+                    if stream is not None:
+                        stream.append(payload)
+                    elif (publisher := known.get(topic.path) or publishers.get(topic)) is None:
+                        self._unnamed.value += 1
+                    elif topic.delivery is Delivery.STREAM:
+                        streams[topic.path] = [payload]
+                    else:
+                        flowing = publisher.put(payload) and flowing
+                        states += 1
+                    if waiting:
+                        self._pending.answer(topic, payload)
+            except ProtocolError as error:
+                self._untranslatable.value += 1
+                log.debug("%s: %s", self._context.keys.robot, error)
+        self._published.value += states + sum(map(len, streams.values()))
+        if streams:
+            flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
+        if not flowing:
+            self._links.pause()
+
+    def _translator(self, kind: type) -> Translate:
+        translate = self._translators[kind] = self._context.robot.translator(kind)
+        return translate
+
+    def _watch_frames(self, connection: Connection, direction: str) -> None:
+        """Publish the raw frames of one direction while somebody listens."""
+
+        def listened(anybody: bool) -> None:
+            connection.watch(direction, publisher.put if anybody else None)
+
+        key = self._context.keys.key(f"@wire/{connection.name}/{direction}")
+        publisher = self._bus.frames(key, listened)
+
+    def _watch_listeners(self, topic: Topic) -> Handle:
+        """Tell the robot whether anybody listens to a topic."""
+
+        def changed(anybody: bool) -> None:
+            with contextlib.suppress(Refused):
+                self._context.robot.listened(topic, anybody)
+                self._context.pump()
+
+        return self._bus.watch_listeners(self._context.keys.key(topic.path), changed)

@@ -5,8 +5,6 @@ seconds since the first packet, transport, ``source port->destination port``, th
 payload in hex, or the name of a connection event (``SYN``, ``SYN+ACK``, ``FIN``).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path

@@ -1,12 +1,13 @@
 """An event loop whose clock jumps: what waits for a time is next, and nobody really waits."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import selectors
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import AbstractAsyncContextManager
 from typing import Any
+
+import pytest
 
 
 class _Jumping(selectors.DefaultSelector):
@@ -38,7 +39,7 @@ class JumpingLoop(asyncio.SelectorEventLoop):
 
 
 def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
-    """Run an async test on a :class:`JumpingLoop`."""
+    """Run one async test of a module on a :class:`JumpingLoop`; ``pytest.mark.jumping`` does so for all of them."""
 
     @functools.wraps(test)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -46,3 +47,15 @@ def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., Non
             runner.run(test(*args, **kwargs))
 
     return run
+
+
+def scene_of(context: Callable[..., AbstractAsyncContextManager[Any]]) -> Any:
+    """Make a fixture of a context; ``@pytest.mark.scene(...)`` at a test gives the context's arguments."""
+
+    @pytest.fixture
+    async def scene(request: pytest.FixtureRequest) -> AsyncIterator[Any]:
+        mark = request.node.get_closest_marker("scene") or pytest.mark.scene.mark
+        async with context(*mark.args, **mark.kwargs) as made:
+            yield made
+
+    return scene

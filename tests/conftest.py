@@ -1,6 +1,36 @@
-"""How hypothesis runs here: a machine that is busy with other tests is no failure."""
+"""Marks by folder, and how hypothesis runs here: a machine that is busy with other tests is no failure."""
 
+import asyncio
+from collections.abc import Callable
+from fnmatch import fnmatch
+
+import pytest
 from hypothesis import HealthCheck, settings
 
-settings.register_profile("zbridge", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("zbridge")
+from tests.clock import JumpingLoop
+
+REAL = ("tests/e2e/*", "tests/gateways/*/conformance/*")
+"""Where tests take real sockets and real time: scenes on Zenoh, and the judges against plain sockets."""
+
+PROFILES = {"zbridge": 100, "quick": 20}
+for profile, examples in PROFILES.items():
+    settings.register_profile(
+        profile, deadline=None, max_examples=examples, suppress_health_check=[HealthCheck.too_slow]
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    settings.load_profile("quick" if config.getoption("markexpr") == "not e2e" else "zbridge")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        path = item.path.relative_to(item.config.rootpath).as_posix()
+        if any(fnmatch(path, pattern) for pattern in REAL):
+            item.add_marker("e2e")
+
+
+def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    if item.get_closest_marker("jumping"):
+        return {"jumping": JumpingLoop}
+    return {"real": asyncio.new_event_loop}

@@ -1,7 +1,5 @@
 """Conditions: what status tells people of a robot that is served all the same."""
 
-from __future__ import annotations
-
 from zbridge.conditions import Conditions
 
 

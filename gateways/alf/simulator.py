@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import VehicleSession
+from gateways.alf.session import VehicleRole
 from gateways.alf.translate import DRIVE, LASER
 from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
@@ -142,7 +142,7 @@ class Simulator:
         return lambda: Accepted(lambda link: self._admit(link, parts))
 
     def _admit(self, link: Link, parts: set[str]) -> Conversation:
-        session = VehicleSession(self._dialect)
+        session = VehicleRole(self._dialect)
         session.name = f"hq {link.peer}"
         conversation = Conversation(session, self._loop, deliver=self._deliver)
         log.info("%s: connected for %s", link.peer, " and ".join(sorted(parts)))

@@ -24,7 +24,7 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ControllerSession
+from gateways.wc2ec.session import ControllerRole
 from zbridge.protocol import EncodeError, Refused, Simulation, State
 from zbridge.simulation.world import Body, cast
 from zbridge.transport.conversation import Accepted, Conversation
@@ -132,7 +132,7 @@ class Simulator:
             await self._live()
 
     def _admit(self, link: Link) -> Conversation:
-        session = ControllerSession(self._dialect, values=VALUES)
+        session = ControllerRole(self._dialect, values=VALUES)
         session.name = f"controller {link.peer}"
         conversation = Conversation(session, self._loop, deliver=self._deliver)
         conversation.ended.add_done_callback(lambda _: self._peers.discard(conversation))

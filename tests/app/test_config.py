@@ -25,11 +25,7 @@ connect = ["tcp://127.0.0.1:11001"]
 
 
 def minimal(**tables: Any) -> dict[str, Any]:
-    return {
-        "robot": {"name": "r1"},
-        "device": {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:11001"]},
-        **tables,
-    }
+    return {"robot": {"name": "r1"}, "device": {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:11001"]}, **tables}
 
 
 def device(**fields: Any) -> dict[str, Any]:
@@ -259,10 +255,7 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (serving(hq(rate_hz=math.nan)), "hq[0].rate_hz = nan: expected"),
     (serving(hq(allow="10.0.0.0/8")), "hq[0].allow = '10.0.0.0/8': expected `array`"),
     (serving(hq(allow=["10.0.0.0/8", 5])), "hq[0].allow[1] = 5: expected `str`"),
-    (
-        serving(hq(allow=["10.0.0.0/8", "home"])),
-        "hq[0].allow[1] = 'home': expected a network like '192.168.1.0/24': ",
-    ),
+    (serving(hq(allow=["10.0.0.0/8", "home"])), "hq[0].allow[1] = 'home': expected a network like '192.168.1.0/24': "),
     (serving(hq(allow=["10.0.0.1/8"])), "hq[0].allow[0] = '10.0.0.1/8': expected a network like '192.168.1.0/24': "),
     (serving(hq(options=5)), "hq[0].options = 5: expected `object`"),
     (serving(hq(options={"version": "1.1"})), "hq[0].options.version = '1.1': unknown key; expected one of versions, "),

@@ -26,13 +26,7 @@ NOWHERE = "tcp://127.0.0.1:1"
 
 def configured(**control: Any) -> Gateway:
     return Gateway(
-        plan(
-            {
-                "robot": {"name": "r1"},
-                "device": {"protocol": "tcpudp", "connect": [NOWHERE]},
-                "control": control,
-            }
-        )
+        plan({"robot": {"name": "r1"}, "device": {"protocol": "tcpudp", "connect": [NOWHERE]}, "control": control})
     )
 
 
@@ -100,9 +94,7 @@ async def test_every_lease_has_an_id_and_a_token_of_its_own(monkeypatch: pytest.
 
 
 @jumping
-async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_the_audit_log_is_a_file_where_the_configuration_names_one(monkeypatch, tmp_path) -> None:
     file = tmp_path / "log" / "r1.jsonl"
     async with serving(configured(audit=str(file)), monkeypatch) as bus:
         held = Holder.of(await asked(bus, "acquire", who="hq"))
@@ -115,9 +107,7 @@ async def test_the_audit_log_is_a_file_where_the_configuration_names_one(
 
 
 @jumping
-async def test_the_audit_log_is_rotated_as_the_configuration_says(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_the_audit_log_is_rotated_as_the_configuration_says(monkeypatch, tmp_path) -> None:
     gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=0)
     async with serving(gateway, monkeypatch) as bus:
         for number in range(25):
@@ -128,9 +118,7 @@ async def test_the_audit_log_is_rotated_as_the_configuration_says(
 
 
 @jumping
-async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(monkeypatch, tmp_path) -> None:
     gateway = configured(audit=str(tmp_path / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=1)
     async with serving(gateway, monkeypatch) as bus:
         for number in range(50):
@@ -139,9 +127,7 @@ async def test_the_audit_log_keeps_what_is_young_as_the_configuration_says(
 
 
 @jumping
-async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_ended(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+async def test_what_was_only_counted_is_in_the_audit_log_when_the_gateway_has_ended(monkeypatch, tmp_path) -> None:
     file = tmp_path / "r1.jsonl"
     async with serving(configured(audit=str(file)), monkeypatch) as bus:
         for _ in range(10):
@@ -159,9 +145,7 @@ async def test_an_audit_log_that_cannot_be_written_keeps_the_gateway_from_starti
 
 
 @jumping
-async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log(monkeypatch, caplog) -> None:
     monkeypatch.setattr("zbridge.robot.device.Device.reached", True)
     text = "another gateway serves this robot too: beef"
     async with serving(configured(), monkeypatch) as bus:
@@ -187,9 +171,7 @@ async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log
 
 
 @jumping
-async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(monkeypatch, caplog) -> None:
     async with serving(configured(), monkeypatch) as bus:
         bus.join("beef").answer(
             "fleet/r1/@rpc/claim/gateway",

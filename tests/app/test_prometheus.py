@@ -78,9 +78,7 @@ async def test_a_request_that_is_too_long_is_left_without_answer(address: Addres
         assert b"200 OK" in await asked(address, b"GET / HTTP/1.0\r\n\r\n")
 
 
-async def test_a_client_that_sends_nothing_is_left(
-    address: Address, metrics: Metrics, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_client_that_sends_nothing_is_left(address, metrics, monkeypatch) -> None:
     monkeypatch.setattr(exporter, "REQUEST_S", 0.05)
     async with serve_metrics(address, metrics):
         assert await asked(address, b"GET /metr") == b""
@@ -102,9 +100,7 @@ async def connected(address: Address) -> socket.socket:
     return client
 
 
-async def test_few_clients_are_served_at_a_time_and_the_next_when_one_has_gone(
-    address: Address, metrics: Metrics, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_few_clients_are_served_at_a_time_and_the_next_when_one_has_gone(address, metrics, monkeypatch) -> None:
     monkeypatch.setattr(exporter, "REQUEST_S", 60.0)
     async with serve_metrics(address, metrics):
         silent = [await connected(address) for _ in range(exporter.CLIENTS)]
@@ -147,9 +143,7 @@ async def test_the_page_is_gone_with_the_context(address: Address, metrics: Metr
         await asyncio.open_connection(address.host, address.port)
 
 
-async def test_without_the_address_the_context_is_entered_all_the_same(
-    metrics: Metrics, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_without_the_address_the_context_is_entered_all_the_same(metrics, caplog) -> None:
     entered = False
     with socket.socket() as taken, caplog.at_level(logging.ERROR):
         taken.bind(("127.0.0.1", 0))

@@ -7,11 +7,12 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.clock import jumping
 from zbridge.bus import Answer, IncomingQuery, Lane, Sample, Sort
 from zbridge.bus.fake import FakeBus, FakeQuery, matches, meet
 from zbridge.errors import NotReady
 from zbridge.fleet import topics
+
+pytestmark = pytest.mark.jumping
 
 MATCHES = [
     ("a/b/c", "a/b/c", True),
@@ -68,9 +69,7 @@ def test_a_key_expression_matches_as_zenoh_itself_says(key_expr: str, key: str) 
     assert matches(str(canonical), key) is canonical.includes(zenoh.KeyExpr(key))
 
 
-@given(
-    *2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)],
-)
+@given(*2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)])
 def test_two_key_expressions_meet_as_zenoh_itself_says(one: str, other: str) -> None:
     first, second = zenoh.KeyExpr.autocanonize(one), zenoh.KeyExpr.autocanonize(other)
     assert meet(str(first), str(second)) is first.intersects(second)
@@ -84,7 +83,6 @@ def test_what_is_put_on_an_expression_reaches_whoever_it_meets_with_the_expressi
     assert [sample.key for sample in seen] == ["fleet/*/@cmd/stop", "fleet/r1/@cmd/*"]
 
 
-@jumping
 async def test_a_question_knows_what_was_asked_and_which_key_it_answers() -> None:
     bus, asked = FakeBus(), list[tuple[str, str]]()
     for key in ("fleet/r1/@rpc/control/acquire/*", "fleet/r1/@rpc/control/renew"):
@@ -135,7 +133,6 @@ def test_a_latecomer_gets_last_values_of_states_only() -> None:
     assert without == []
 
 
-@jumping
 async def test_a_query_gets_last_values_until_their_publisher_goes() -> None:
     bus = FakeBus()
     publisher = bus.publisher("fleet/r1/status", topics.STATUS)
@@ -145,7 +142,6 @@ async def test_a_query_gets_last_values_until_their_publisher_goes() -> None:
     assert await bus.ask("fleet/*/status") == []
 
 
-@jumping
 async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> None:
     bus = FakeBus()
 
@@ -163,7 +159,6 @@ async def test_a_query_is_answered_or_refused_by_whoever_answers_its_key() -> No
     assert await bus.ask("fleet/r2/@rpc/map") == []
 
 
-@jumping
 async def test_tokens_are_seen_while_they_last() -> None:
     bus = FakeBus()
     handle = bus.announce("fleet/r1/@alive/gateway")
@@ -192,7 +187,6 @@ def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_those_th
     assert len(seen) == 3
 
 
-@jumping
 async def test_who_watches_tokens_is_told_when_a_session_leaves_and_not_after_leaving_itself() -> None:
     bus = FakeBus()
     other, third = bus.join("2"), bus.join("3")
@@ -207,7 +201,6 @@ async def test_who_watches_tokens_is_told_when_a_session_leaves_and_not_after_le
     assert left == [("fleet/r1/@alive/hq", True)]
 
 
-@jumping
 async def test_what_was_put_is_with_the_bus_at_once() -> None:
     bus = FakeBus()
     bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE).put(b"1")
@@ -224,7 +217,6 @@ def test_a_sample_comes_by_whatever_lane(lane: Lane | Sort) -> None:
     assert seen == [Sample("fleet/r1/@cmd/drive", b"1", b"token")]
 
 
-@jumping
 async def test_a_session_that_leaves_takes_back_what_it_declared_and_nothing_else() -> None:
     bus = FakeBus()
     other = bus.join("2")
@@ -266,7 +258,6 @@ def test_a_full_bus_asks_for_a_pause_and_relieves_it() -> None:
     assert bus.put_all([])
 
 
-@jumping
 async def test_frames_are_wanted_only_while_somebody_listens() -> None:
     bus = FakeBus()
     told: list[bool] = []

@@ -58,11 +58,7 @@ async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_th
     elsewhere.close()
     first.close()
     await seen.until(lambda: len(seen) == 3)
-    assert seen == [
-        ("fleet/r1/@alive/first", True),
-        ("fleet/r1/@alive/second", True),
-        ("fleet/r1/@alive/first", False),
-    ]
+    assert seen == [("fleet/r1/@alive/first", True), ("fleet/r1/@alive/second", True), ("fleet/r1/@alive/first", False)]
     handle.close()
     handle.close()
     again = Seen()
@@ -108,10 +104,7 @@ async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key
     bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
     await bus.ask("fleet/r1/@rpc/control/renew", b"proof")
     await bus.ask("fleet/*/@rpc/control/renew", b"proof")
-    assert chosen == [
-        (b"proof", "fleet/r1/@rpc/control/renew", b""),
-        (b"proof", "fleet/*/@rpc/control/renew", b""),
-    ]
+    assert chosen == [(b"proof", "fleet/r1/@rpc/control/renew", b""), (b"proof", "fleet/*/@rpc/control/renew", b"")]
 
 
 async def test_a_question_knows_what_was_asked_and_is_answered_on_a_concrete_key(bus: ZenohBus) -> None:
@@ -184,9 +177,7 @@ async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> 
     await seen.until(lambda: seen == [b"mode"])
 
 
-async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(
-    bus: ZenohBus, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(bus, monkeypatch) -> None:
     monkeypatch.setattr(session, "FLUSH_S", 0.01)
     go = threading.Event()
     bus._writer.put(lambda: go.wait(SOON_S))
@@ -230,9 +221,7 @@ def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it
     assert len(entity.asked) == 31
 
 
-def test_a_callback_that_never_ends_is_given_up_and_said_so(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_callback_that_never_ends_is_given_up_and_said_so(caplog, monkeypatch) -> None:
     monkeypatch.setattr(declared, "UNDECLARE_S", 0.05)
     entity = Busy(10**9)
     declared.Declared(entity).close()

@@ -1,7 +1,5 @@
 """The keyboard: motion only while a key repeats, whatever is typed and however the terminal delivers it."""
 
-from __future__ import annotations
-
 import string
 
 import pytest
@@ -139,10 +137,7 @@ def test_holding_plus_moves_nothing() -> None:
 
 # Any keys at any times
 
-presses = st.lists(
-    st.tuples(st.floats(0.0, 2.0), st.sampled_from([*DIRECTIONS, "+", "-", *OTHERS])),
-    max_size=40,
-)
+presses = st.lists(st.tuples(st.floats(0.0, 2.0), st.sampled_from([*DIRECTIONS, "+", "-", *OTHERS])), max_size=40)
 
 
 def meant(history: list[tuple[float, str]], now: float) -> str | None:

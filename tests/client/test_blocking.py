@@ -183,9 +183,7 @@ def test_a_bus_that_cannot_be_opened_is_an_error_and_leaves_no_thread(monkeypatc
     assert set(threading.enumerate()) <= before
 
 
-def test_clients_can_follow_each_other_and_live_beside_each_other(
-    opened: list[tuple[World, BusSettings]],
-) -> None:
+def test_clients_can_follow_each_other_and_live_beside_each_other(opened: list[tuple[World, BusSettings]]) -> None:
     with zbridge.blocking.connect() as one, zbridge.blocking.connect() as two:
         assert one["r1"].ask_pose() == two["r1"].ask_pose() == POSE
     with zbridge.blocking.connect() as three:

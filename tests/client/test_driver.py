@@ -17,7 +17,6 @@ import msgpack
 import pytest
 
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
-from tests.clock import jumping
 from tests.proofs import lease, proof
 from zbridge.bus import Answer, Handle, IncomingQuery, Publisher, Sample
 from zbridge.bus.fake import FakeBus, FakeQuery
@@ -39,6 +38,8 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Drive, Lease, Mode, Motor, Raw
 from zbridge.fleet.topics import Congestion, Topic
+
+pytestmark = pytest.mark.jumping
 
 ME = "ann@here"
 MINE = "operator.ann%40here.mine"
@@ -102,7 +103,6 @@ async def driving(**wishes: Any) -> AsyncIterator[tuple[World, Driver]]:
 # Getting the lease
 
 
-@jumping
 async def test_the_lease_is_held_while_the_context_lasts() -> None:
     world = World()
     assert world.gateway.control.state == "free"
@@ -116,7 +116,6 @@ async def test_the_lease_is_held_while_the_context_lasts() -> None:
     assert repr(drive) == "<Driver of r1 lost>"
 
 
-@jumping
 async def test_who_is_user_at_host_unless_said_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(getpass, "getuser", lambda: "ann")
     monkeypatch.setattr(socket, "gethostname", lambda: "here")
@@ -135,7 +134,6 @@ def test_a_user_without_a_name_has_one_nevertheless(error: Exception, monkeypatc
     assert default_who() == f"somebody@{socket.gethostname()}"
 
 
-@jumping
 async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
     world = World()
     async with world.robot.control(ME):
@@ -145,7 +143,6 @@ async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
     assert tokens(world.bus) == []
 
 
-@jumping
 async def test_the_token_is_there_before_the_lease_is_asked_for() -> None:
     world = World(served=False)
     there: list[list[str]] = []
@@ -155,7 +152,6 @@ async def test_the_token_is_there_before_the_lease_is_asked_for() -> None:
         assert there == [[MINE]]
 
 
-@jumping
 async def test_the_lease_is_asked_for_in_the_programs_own_name() -> None:
     world = World()
     async with world.robot.control(ME):
@@ -169,7 +165,6 @@ async def test_the_lease_is_asked_for_in_the_programs_own_name() -> None:
     ]
 
 
-@jumping
 async def test_a_name_that_is_not_ones_own_is_refused_at_once() -> None:
     world = World()
     with pytest.raises(Malformed, match=r"^r1: who = 'op2': expected 'op1', or that and '\.suffix'$"):
@@ -177,7 +172,6 @@ async def test_a_name_that_is_not_ones_own_is_refused_at_once() -> None:
     assert tokens(world.bus) == []
 
 
-@jumping
 async def test_a_gateway_that_comes_later_is_waited_for() -> None:
     world = World(served=False)
     world.loop.call_later(4.0, world.gateway.serve)
@@ -188,7 +182,6 @@ async def test_a_gateway_that_comes_later_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize(("wishes", "wait_s"), [({}, 5.0), ({"wait_s": 1.5}, 1.5)])
-@jumping
 async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[str, float], wait_s: float) -> None:
     world = World(served=False)
     asked_at = world.loop.time()
@@ -199,7 +192,6 @@ async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[s
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-@jumping
 async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told() -> None:
     world = World()
     world.gateway.leases.refuse_all("gateway stopped")
@@ -213,7 +205,6 @@ async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told
         assert world.gateway.control.holder == ME
 
 
-@jumping
 async def test_a_program_that_does_not_wait_asks_once() -> None:
     world = World()
     async with world.robot.control(ME, wait_s=0.0):
@@ -221,7 +212,6 @@ async def test_a_program_that_does_not_wait_asks_once() -> None:
     assert len(world.gateway.questions("acquire")) == 1
 
 
-@jumping
 async def test_held_names_the_holder_at_once() -> None:
     async with driving(priority=2) as (world, drive):
         asked_at = world.loop.time()
@@ -234,7 +224,6 @@ async def test_held_names_the_holder_at_once() -> None:
         assert drive.loss is None
 
 
-@jumping
 async def test_the_lease_is_free_for_the_next_one() -> None:
     world = World()
     async with world.robot.control(ME):
@@ -253,7 +242,6 @@ async def test_the_lease_is_free_for_the_next_one() -> None:
         ({"deadman_s": math.nan}, r"^r1: deadman_s = nan: expected at least 0\.01$"),
     ],
 )
-@jumping
 async def test_a_bad_wish_is_refused_at_once_with_the_reason(wishes: dict[str, Any], reason: str) -> None:
     world = World()
     asked_at = world.loop.time()
@@ -264,7 +252,6 @@ async def test_a_bad_wish_is_refused_at_once_with_the_reason(wishes: dict[str, A
     assert tokens(world.bus) == []
 
 
-@jumping
 async def test_wishes_reach_the_authority() -> None:
     async with driving(lease_s=1.0, deadman_s=0.3) as (world, drive):
         assert world.gateway.control.expires_in_s == pytest.approx(1.0)
@@ -277,7 +264,6 @@ async def test_wishes_reach_the_authority() -> None:
         assert drive.loss is None
 
 
-@jumping
 async def test_motion_lasts_half_a_second_by_default() -> None:
     async with driving() as (world, drive):
         await drive(forward=0.5)
@@ -287,7 +273,6 @@ async def test_motion_lasts_half_a_second_by_default() -> None:
         assert world.machine.stops == 1
 
 
-@jumping
 async def test_a_cancelled_wait_for_the_lease_leaves_nothing_behind() -> None:
     world = World(served=False)
     waiting = asyncio.create_task(world.robot.control(ME).__aenter__())
@@ -303,7 +288,6 @@ async def test_a_cancelled_wait_for_the_lease_leaves_nothing_behind() -> None:
 # Commands
 
 
-@jumping
 async def test_commands_reach_the_robot_with_proofs_and_rising_numbers() -> None:
     async with driving() as (world, drive):
         sent: list[Sample] = []
@@ -324,11 +308,7 @@ async def test_commands_reach_the_robot_with_proofs_and_rising_numbers() -> None
         ]
         held = lease(1)
         assert [msgpack.unpackb(sample.attachment or b"") for sample in sent] == [
-            {
-                "lease": held.lease,
-                "seq": number,
-                "proof": proof(held.token, sample.key, number, sample.payload),
-            }
+            {"lease": held.lease, "seq": number, "proof": proof(held.token, sample.key, number, sample.payload)}
             for number, sample in enumerate(sent, 1)
         ]
         assert not any(held.token in (sample.attachment or b"") + sample.payload for sample in sent)
@@ -336,7 +316,6 @@ async def test_commands_reach_the_robot_with_proofs_and_rising_numbers() -> None
 
 @pytest.mark.parametrize("name", ["forward", "left", "turn"])
 @pytest.mark.parametrize("value", [1.001, -1.001, math.inf, -math.inf, math.nan])
-@jumping
 async def test_what_is_no_fraction_of_full_scale_is_a_value_error_and_is_not_sent(name: str, value: float) -> None:
     async with driving() as (world, drive):
         for work in (drive(**{name: value}), drive.during(1.0, **{name: value})):
@@ -346,14 +325,12 @@ async def test_what_is_no_fraction_of_full_scale_is_a_value_error_and_is_not_sen
         assert drive.loss is None
 
 
-@jumping
 async def test_full_scale_is_allowed() -> None:
     async with driving() as (world, drive):
         await drive(forward=1.0, left=-1.0, turn=1)
         assert world.gateway.driven == [Drive(forward=1.0, left=-1.0, turn=1.0)]
 
 
-@jumping
 async def test_an_unknown_mode_is_a_value_error_and_is_not_sent() -> None:
     async with driving() as (world, drive):
         with pytest.raises(ValueError, match=r"^mode = 'fast': expected 'none', 'manual' or 'autonomous'$"):
@@ -361,7 +338,6 @@ async def test_an_unknown_mode_is_a_value_error_and_is_not_sent() -> None:
         assert world.machine.commands == []
 
 
-@jumping
 async def test_during_repeats_for_its_time_and_then_stands() -> None:
     async with driving(deadman_s=0.2) as (world, drive):
         began = world.loop.time()
@@ -374,14 +350,12 @@ async def test_during_repeats_for_its_time_and_then_stands() -> None:
         assert world.machine.stops == 0, "commanded anew before the deadman"
 
 
-@jumping
 async def test_during_no_time_only_stands() -> None:
     async with driving() as (world, drive):
         await drive.during(0.0, forward=0.5)
         assert world.gateway.driven == [Drive()]
 
 
-@jumping
 async def test_during_ends_where_the_lease_is_lost() -> None:
     async with driving() as (world, drive):
         world.loop.call_later(1.0, world.gateway.give, "bob@there")
@@ -422,7 +396,6 @@ class _Queued:
         return True
 
 
-@jumping
 async def test_no_command_overtakes_another_however_they_are_given() -> None:
     world = World(FakeBus())
     robot = Fleet(SlowBus("slow", world.bus._shared))["r1"]
@@ -430,11 +403,7 @@ async def test_no_command_overtakes_another_however_they_are_given() -> None:
         await drive.mode("manual")
         await drive(forward=0.5)
         await asyncio.gather(
-            drive.motor("arm", 1.0),
-            drive(forward=0.25),
-            drive.raw("tcpudp", 7),
-            drive.mode("none"),
-            drive(),
+            drive.motor("arm", 1.0), drive(forward=0.25), drive.raw("tcpudp", 7), drive.mode("none"), drive()
         )
         assert [name for name, _ in world.machine.commands] == [
             "mode",
@@ -448,7 +417,6 @@ async def test_no_command_overtakes_another_however_they_are_given() -> None:
         assert world.gateway.control.refusals == ()
 
 
-@jumping
 async def test_commands_of_a_new_lease_are_taken_although_they_count_anew() -> None:
     world = World()
     for _ in range(2):
@@ -462,7 +430,6 @@ async def test_commands_of_a_new_lease_are_taken_although_they_count_anew() -> N
 # Keeping the lease
 
 
-@jumping
 async def test_an_idle_program_keeps_its_lease() -> None:
     async with driving() as (world, drive):
         least_s = math.inf
@@ -476,7 +443,6 @@ async def test_an_idle_program_keeps_its_lease() -> None:
         assert 50 <= len(world.gateway.questions("renew")) <= 70
 
 
-@jumping
 async def test_a_short_lease_is_renewed_more_often() -> None:
     async with driving(lease_s=0.3) as (world, drive):
         await asyncio.sleep(10.0)
@@ -484,7 +450,6 @@ async def test_a_short_lease_is_renewed_more_often() -> None:
         assert world.gateway.control.state == "held"
 
 
-@jumping
 async def test_one_answer_that_does_not_come_costs_nothing() -> None:
     async with driving() as (world, drive):
         world.gateway.leases.refuse_all("not now")
@@ -496,7 +461,6 @@ async def test_one_answer_that_does_not_come_costs_nothing() -> None:
         assert world.gateway.control.state == "held"
 
 
-@jumping
 async def test_a_malformed_answer_does_not_end_the_renewals() -> None:
     async with driving() as (world, drive):
         nonsense = world.garble(topics.RPC_RENEW)
@@ -527,7 +491,6 @@ async def lost(world: World, drive: Driver, within_s: float) -> str:
     return str(drive.loss)
 
 
-@jumping
 async def test_a_stop_ends_the_lease_and_the_program_hears_of_it() -> None:
     async with driving() as (world, drive):
         await drive(forward=0.5)
@@ -535,7 +498,6 @@ async def test_a_stop_ends_the_lease_and_the_program_hears_of_it() -> None:
         assert await lost(world, drive, 0.1) == "r1: the lease has ended (stop)"
 
 
-@jumping
 async def test_a_takeover_names_the_new_holder() -> None:
     async with driving() as (world, drive):
         await drive(forward=0.5)
@@ -547,7 +509,6 @@ async def test_a_takeover_names_the_new_holder() -> None:
             assert world.machine.stops == 1
 
 
-@jumping
 async def test_a_loss_has_the_holder_and_a_code_for_programs() -> None:
     async with driving() as (world, drive):
         async with world.others.control("bob@there", takeover=True):
@@ -559,27 +520,23 @@ async def test_a_loss_has_the_holder_and_a_code_for_programs() -> None:
         await asyncio.sleep(0)
 
 
-@jumping
 async def test_a_higher_priority_is_given_the_robot_and_named() -> None:
     async with driving(priority=1) as (world, drive), world.others.control("bob@there", priority=2):
         assert "held by bob@there" in await lost(world, drive, 0.1)
 
 
-@jumping
 async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_as_soon() -> None:
     async with driving() as (world, drive), world.others.control(ME, takeover=True) as other:
         assert "taken over by ann@here" in await lost(world, drive, 0.1)
         assert other.loss is None
 
 
-@jumping
 async def test_a_takeover_by_a_program_of_the_same_name_is_a_loss_and_no_refusal() -> None:
     async with driving() as (world, drive), world.others.control(ME, takeover=True):
         with pytest.raises(LeaseLost):
             await drive.during(1.0, forward=0.5)
 
 
-@jumping
 async def test_the_refusals_of_a_program_of_the_same_name_that_lost_its_lease_are_not_raised() -> None:
     async with driving() as (world, first), world.others.control(ME, takeover=True) as second:
         with contextlib.suppress(Refused):
@@ -589,7 +546,6 @@ async def test_the_refusals_of_a_program_of_the_same_name_that_lost_its_lease_ar
         assert world.gateway.driven == [Drive(forward=0.25)]
 
 
-@jumping
 async def test_a_lease_that_ran_out_is_noticed() -> None:
     async with driving() as (world, drive):
         world.gateway.authority.expire(world.loop.time() + 10 * LEASE_S)
@@ -597,7 +553,6 @@ async def test_a_lease_that_ran_out_is_noticed() -> None:
         assert await lost(world, drive, 0.1) == "r1: the lease has ended (lease expired)"
 
 
-@jumping
 async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_out() -> None:
     async with driving() as (world, drive):
         await asyncio.sleep(10.0)
@@ -610,7 +565,6 @@ async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_ou
             await drive(forward=0.5)
 
 
-@jumping
 async def test_a_gateway_that_starts_anew_knows_nothing_of_the_lease() -> None:
     async with driving() as (world, drive):
         await world.gateway.vanish()
@@ -621,7 +575,6 @@ async def test_a_gateway_that_starts_anew_knows_nothing_of_the_lease() -> None:
         assert again.driven == []
 
 
-@jumping
 async def test_what_others_do_to_control_is_no_loss() -> None:
     async with driving() as (world, drive):
         world.gateway.put(topics.CONTROL, b"\xc1")
@@ -634,7 +587,6 @@ async def test_what_others_do_to_control_is_no_loss() -> None:
         assert len(world.gateway.driven) == 1
 
 
-@jumping
 async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -> None:
     async with driving() as (world, drive):
         heard: list[bytes] = []
@@ -655,7 +607,6 @@ async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -
         assert len(world.gateway.driven) == 1
 
 
-@jumping
 async def test_whoever_repeats_our_commands_makes_us_neither_raise_nor_stop() -> None:
     async with driving() as (world, drive):
         overheard: list[Sample] = []
@@ -673,7 +624,6 @@ async def test_whoever_repeats_our_commands_makes_us_neither_raise_nor_stop() ->
         assert len(world.gateway.driven) == 4
 
 
-@jumping
 async def test_what_a_listener_says_it_refused_in_our_name_is_nothing_to_us() -> None:
     async with driving() as (world, drive):
         for refusal in (NotReady("offline"), LeaseLost("gone"), Held("held by bob"), NeutralFirst("stop")):
@@ -688,7 +638,6 @@ async def test_what_a_listener_says_it_refused_in_our_name_is_nothing_to_us() ->
         await world.others.stop()
 
 
-@jumping
 async def test_after_a_loss_nothing_is_asked_or_declared_any_more() -> None:
     async with driving() as (world, drive):
         await world.others.stop()
@@ -700,7 +649,6 @@ async def test_after_a_loss_nothing_is_asked_or_declared_any_more() -> None:
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-@jumping
 async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
     """It never waits for anything but its own commands."""
     async with driving() as (world, drive):
@@ -713,7 +661,6 @@ async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
         assert sent < 10
 
 
-@jumping
 async def test_the_traceback_of_a_loss_does_not_grow_with_every_command() -> None:
     async with driving() as (world, drive):
         await world.others.stop()
@@ -729,7 +676,6 @@ async def test_the_traceback_of_a_loss_does_not_grow_with_every_command() -> Non
 
 
 @every_command
-@jumping
 async def test_a_refusal_is_raised_by_the_next_command(command: Command) -> None:
     async with driving() as (world, drive):
         await world.refused(drive)
@@ -739,7 +685,6 @@ async def test_a_refusal_is_raised_by_the_next_command(command: Command) -> None
         assert drive.loss is None
 
 
-@jumping
 async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> None:
     async with driving() as (world, drive):
         for _ in range(3):
@@ -752,7 +697,6 @@ async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> Non
             await drive()
 
 
-@jumping
 async def test_a_refusal_that_others_pushed_out_of_sight_is_raised_when_it_happens_again() -> None:
     async with driving() as (world, drive):
         for _ in range(3):
@@ -768,7 +712,6 @@ async def test_a_refusal_that_others_pushed_out_of_sight_is_raised_when_it_happe
             await drive()
 
 
-@jumping
 async def test_a_neutral_is_sent_although_a_refusal_is_raised() -> None:
     async with driving() as (world, drive):
         await drive(forward=0.5)
@@ -789,7 +732,6 @@ async def test_a_neutral_is_sent_although_a_refusal_is_raised() -> None:
         ("raw/tcpudp", lambda drive: drive.raw("tcpudp", 7)),
     ],
 )
-@jumping
 async def test_the_refusal_says_which_command_it_was(command: str, work: Command) -> None:
     async with driving() as (world, drive):
         world.machine.refusal = REFUSED
@@ -799,7 +741,6 @@ async def test_the_refusal_says_which_command_it_was(command: str, work: Command
             await drive()
 
 
-@jumping
 async def test_what_the_robot_left_out_of_a_command_is_raised_too() -> None:
     async with driving() as (world, drive):
         world.machine.left_out = "light: this robot has none"
@@ -810,7 +751,6 @@ async def test_what_the_robot_left_out_of_a_command_is_raised_too() -> None:
             await drive()
 
 
-@jumping
 async def test_a_light_left_out_of_a_neutral_is_raised() -> None:
     async with driving() as (world, drive):
         world.machine.left_out = "light: this robot has none"
@@ -824,7 +764,6 @@ async def test_a_light_left_out_of_a_neutral_is_raised() -> None:
     ("command", "who"),
     [("drive", "bob@there"), ("drive", None), ("acquire", ME), ("stop", ME), ("light", None), ("camera", ME)],
 )
-@jumping
 async def test_what_was_not_our_command_is_not_our_refusal(command: str, who: str | None) -> None:
     async with driving() as (world, drive):
         world.gateway.refuse(command, REFUSED, who)
@@ -834,7 +773,6 @@ async def test_what_was_not_our_command_is_not_our_refusal(command: str, who: st
         assert len(world.gateway.driven) == 1
 
 
-@jumping
 async def test_refusals_of_before_the_lease_are_not_raised() -> None:
     world = World()
     world.gateway.refuse("drive", REFUSED, ME)
@@ -849,7 +787,6 @@ async def test_refusals_of_before_the_lease_are_not_raised() -> None:
             await drive()
 
 
-@jumping
 async def test_during_ends_with_the_refusal_of_its_commands() -> None:
     async with driving() as (world, drive):
         world.machine.refusal = REFUSED
@@ -859,7 +796,6 @@ async def test_during_ends_with_the_refusal_of_its_commands() -> None:
         assert world.loop.time() - began < 0.2
 
 
-@jumping
 async def test_motion_after_the_deadman_is_refused_and_neutral_makes_it_possible() -> None:
     async with driving(deadman_s=0.2) as (world, drive):
         await drive(forward=0.5)
@@ -886,7 +822,6 @@ async def test_motion_after_the_deadman_is_refused_and_neutral_makes_it_possible
         (Malformed("Drive: expected a map"), Malformed),
     ],
 )
-@jumping
 async def test_a_refusal_is_raised_as_the_class_of_its_code(refusal: Refused, kind: type[Refused]) -> None:
     async with driving() as (world, drive):
         world.gateway.authority.refuse("drive", refusal, ME)
@@ -908,10 +843,7 @@ async def test_a_refusal_is_raised_as_the_class_of_its_code(refusal: Refused, ki
         (Lease(ok=False), Unsupported, "r1: no reason given"),
     ],
 )
-@jumping
-async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words(
-    answer: Lease, kind: type[Refused], text: str
-) -> None:
+async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words(answer, kind, text) -> None:
     world = World(served=False)
     world.bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: question.answer(payloads.encode(answer)))
     with pytest.raises(kind, match=re.escape(text)) as raised:
@@ -921,7 +853,6 @@ async def test_a_lease_that_is_denied_is_raised_by_its_code_and_not_by_its_words
 
 
 @pytest.mark.parametrize("code", [Code.RATE, Code.NOT_READY, Code.CLOSING])
-@jumping
 async def test_a_lease_that_cannot_be_given_for_now_is_asked_for_again(code: Code) -> None:
     world = World(served=False)
     asked: list[IncomingQuery] = []
@@ -945,7 +876,6 @@ class Wrong(Exception):
 
 
 @pytest.mark.parametrize("error", [Wrong, KeyboardInterrupt, SystemExit, asyncio.CancelledError])
-@jumping
 async def test_the_lease_is_given_back_when_the_program_raises(error: type[BaseException]) -> None:
     world = World()
 
@@ -963,7 +893,6 @@ async def test_the_lease_is_given_back_when_the_program_raises(error: type[BaseE
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-@jumping
 async def test_a_robot_that_stands_is_given_back_without_a_stop() -> None:
     async with driving() as (world, drive):
         await drive(forward=0.5)
@@ -972,14 +901,12 @@ async def test_a_robot_that_stands_is_given_back_without_a_stop() -> None:
     assert world.machine.stops == 0
 
 
-@jumping
 async def test_a_malformed_answer_to_the_release_is_no_error_of_the_program() -> None:
     async with driving() as (world, _):
         world.garble(topics.RPC_RELEASE)
     assert world.gateway.control.state == "free"
 
 
-@jumping
 async def test_a_cancelled_program_gives_the_lease_back() -> None:
     world = World()
 
@@ -999,7 +926,6 @@ async def test_a_cancelled_program_gives_the_lease_back() -> None:
     assert tokens(world.bus) == []
 
 
-@jumping
 async def test_nothing_runs_on_when_the_lease_was_given_back() -> None:
     world = World()
     before = asyncio.all_tasks()
@@ -1029,7 +955,6 @@ class SlowToAsk(FakeBus):
         self.publishers -= 1
 
 
-@jumping
 async def test_a_program_cancelled_while_it_gives_the_lease_back_has_given_it_back() -> None:
     world = World()
     bus = SlowToAsk("slow", world.bus._shared)
@@ -1048,7 +973,6 @@ async def test_a_program_cancelled_while_it_gives_the_lease_back_has_given_it_ba
     assert len(world.gateway.questions("release")) == 1
 
 
-@jumping
 async def test_what_was_declared_for_commands_is_taken_back() -> None:
     world = World()
     bus = SlowToAsk("slow", world.bus._shared)
@@ -1060,7 +984,6 @@ async def test_what_was_declared_for_commands_is_taken_back() -> None:
 
 
 @every_command
-@jumping
 async def test_a_driver_is_of_no_use_after_its_context(command: Command) -> None:
     async with driving() as (world, drive):
         pass
@@ -1069,7 +992,6 @@ async def test_a_driver_is_of_no_use_after_its_context(command: Command) -> None
     assert world.machine.commands == []
 
 
-@jumping
 async def test_a_gateway_that_is_gone_is_not_waited_for_in_vain() -> None:
     async with driving() as (world, _):
         await world.gateway.vanish()

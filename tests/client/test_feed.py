@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tests.client import Gateway, settle, subscriptions
-from tests.clock import jumping
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Feed, Fleet, Robot
 from zbridge.client.feed import WAITING
@@ -36,6 +35,8 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 
+pytestmark = pytest.mark.jumping
+
 SCAN = Scan(
     angle_min=-0.5,
     angle_increment=0.5,
@@ -45,13 +46,7 @@ SCAN = Scan(
 )
 MAP = Map(rows=2, columns=3, cell=0.1, origin=(-1.0, 2.0), cells=np.array([[0, 1, 2], [2, 1, 0]], np.uint8))
 SCANNER = Scanner(
-    angle_min=0.0,
-    angle_max=1.0,
-    angle_increment=0.1,
-    time_increment_s=0.0,
-    range_min=0.1,
-    range_max=4.0,
-    points=11,
+    angle_min=0.0, angle_max=1.0, angle_increment=0.1, time_increment_s=0.0, range_min=0.1, range_max=4.0, points=11
 )
 STREAMS: list[tuple[Topic, FleetMessage]] = [
     (topics.SCAN, SCAN),
@@ -101,7 +96,6 @@ async def reading(feed: Feed[Any]) -> tuple[Any, asyncio.Task[Any]]:
 
 
 @pytest.mark.parametrize(("topic", "message"), STREAMS + STATES, ids=NAMES)
-@jumping
 async def test_every_feed_gives_the_message_of_its_key(topic: Topic, message: FleetMessage) -> None:
     world = World()
     messages, first = await reading(world.feed(topic))
@@ -112,7 +106,6 @@ async def test_every_feed_gives_the_message_of_its_key(topic: Topic, message: Fl
     await messages.aclose()
 
 
-@jumping
 async def test_ranges_are_a_float32_array_with_nan_for_the_invalid() -> None:
     world = World()
     messages, first = await reading(world.robot.scan)
@@ -123,7 +116,6 @@ async def test_ranges_are_a_float32_array_with_nan_for_the_invalid() -> None:
     await messages.aclose()
 
 
-@jumping
 async def test_cells_are_a_uint8_array_of_rows_and_columns() -> None:
     world = World()
     world.gateway.publish(topics.MAP, MAP)
@@ -133,7 +125,6 @@ async def test_cells_are_a_uint8_array_of_rows_and_columns() -> None:
         np.testing.assert_array_equal(cells, MAP.cells)
 
 
-@jumping
 async def test_one_sensor_all_sensors_and_raw_messages() -> None:
     world = World()
     one, first = await reading(world.robot.sensor("front left"))
@@ -153,7 +144,6 @@ async def test_one_sensor_all_sensors_and_raw_messages() -> None:
         await messages.aclose()
 
 
-@jumping
 async def test_messages_come_in_order_and_only_those_of_this_robot() -> None:
     world = World()
     other = Gateway(world.bus, "r2")
@@ -165,7 +155,6 @@ async def test_messages_come_in_order_and_only_those_of_this_robot() -> None:
     await messages.aclose()
 
 
-@jumping
 async def test_a_state_gives_its_last_value_first_and_then_what_comes() -> None:
     world = World()
     world.gateway.publish(topics.LIDAR, Switch(on=False))
@@ -177,7 +166,6 @@ async def test_a_state_gives_its_last_value_first_and_then_what_comes() -> None:
     await messages.aclose()
 
 
-@jumping
 async def test_a_stream_gives_nothing_of_what_was_before() -> None:
     world = World()
     world.gateway.publish(topics.POSE, at(1))
@@ -187,7 +175,6 @@ async def test_a_stream_gives_nothing_of_what_was_before() -> None:
     await messages.aclose()
 
 
-@jumping
 async def test_a_slow_program_gets_the_newest_and_is_told_how_many_it_lost() -> None:
     world = World()
     feed = world.robot.pose
@@ -203,7 +190,6 @@ async def test_a_slow_program_gets_the_newest_and_is_told_how_many_it_lost() -> 
     await messages.aclose()
 
 
-@jumping
 async def test_every_iteration_has_a_queue_of_its_own() -> None:
     world = World()
     feed = world.robot.pose
@@ -219,7 +205,6 @@ async def test_every_iteration_has_a_queue_of_its_own() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", b"\x80", payloads.encode(Text(text="no pose"))])
-@jumping
 async def test_what_is_malformed_is_left_out_and_counted(payload: bytes) -> None:
     world = World()
     feed = world.robot.pose
@@ -233,7 +218,6 @@ async def test_what_is_malformed_is_left_out_and_counted(payload: bytes) -> None
     await messages.aclose()
 
 
-@jumping
 async def test_a_map_whose_cells_do_not_fill_it_is_malformed() -> None:
     world = World()
     messages, first = await reading(world.robot.map)
@@ -260,7 +244,6 @@ async def iterate(feed: Feed[Any], how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["break", "return", "exception", "cancelled"])
-@jumping
 async def test_the_subscription_ends_with_the_iteration(how: str) -> None:
     world = World()
     feed = world.robot.pose
@@ -277,7 +260,6 @@ async def test_the_subscription_ends_with_the_iteration(how: str) -> None:
     assert subscriptions(world.bus, feed.key_expr) == 0
 
 
-@jumping
 async def test_the_subscription_ends_where_the_waiting_is_cancelled() -> None:
     world = World()
     feed = world.robot.pose
@@ -286,7 +268,6 @@ async def test_the_subscription_ends_where_the_waiting_is_cancelled() -> None:
     assert subscriptions(world.bus, feed.key_expr) == 0
 
 
-@jumping
 async def test_a_feed_can_be_iterated_again() -> None:
     world = World()
     feed = world.robot.lidar
@@ -299,7 +280,6 @@ async def test_a_feed_can_be_iterated_again() -> None:
         assert subscriptions(world.bus, feed.key_expr) == 0
 
 
-@jumping
 async def test_nothing_is_subscribed_before_somebody_iterates() -> None:
     world = World()
     assert repr(world.robot.pose) == "<Feed fleet/r1/pose>"
@@ -307,10 +287,7 @@ async def test_nothing_is_subscribed_before_somebody_iterates() -> None:
 
 
 @pytest.mark.parametrize(("topic", "message"), STATES, ids=NAMES[len(STREAMS) :])
-@jumping
-async def test_last_is_none_before_a_state_was_published_and_then_its_value(
-    topic: Topic, message: FleetMessage
-) -> None:
+async def test_last_is_none_before_a_state_was_published_and_then_its_value(topic, message) -> None:
     world = World()
     assert await world.feed(topic).last() is None
     world.gateway.publish(topic, message)
@@ -318,14 +295,12 @@ async def test_last_is_none_before_a_state_was_published_and_then_its_value(
     assert subscriptions(world.bus, world.feed(topic).key_expr) == 0
 
 
-@jumping
 async def test_last_is_none_where_the_question_is_refused() -> None:
     world = World()
     world.bus.answer("fleet/r1/map", lambda question: question.refuse(NotReady("no map")))
     assert await world.robot.map.last() is None
 
 
-@jumping
 async def test_last_is_none_again_when_the_robots_gateway_is_gone() -> None:
     world = World()
     world.gateway.publish(topics.LIDAR, Switch(on=True))
@@ -333,7 +308,6 @@ async def test_last_is_none_again_when_the_robots_gateway_is_gone() -> None:
     assert await world.robot.lidar.last() is None
 
 
-@jumping
 async def test_only_states_have_a_last_value() -> None:
     robot = World().robot
     assert {name for name in NAMES if hasattr(getattr(robot, name), "last")} == {topic.path for topic, _ in STATES}

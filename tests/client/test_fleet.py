@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from tests.client import Gateway, settle, subscriptions, tokens
-from tests.clock import jumping
 from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
@@ -33,6 +32,8 @@ from zbridge.fleet.messages import (
     Text,
 )
 from zbridge.fleet.topics import Topic
+
+pytestmark = pytest.mark.jumping
 
 POSE = Pose(x=1.0, y=2.0, heading=0.5)
 MAP = Map(rows=1, columns=2, cell=0.1, origin=(0.0, 0.0), cells=np.array([[1, 2]], np.uint8))
@@ -63,7 +64,6 @@ class World:
 # Which robots there are
 
 
-@jumping
 async def test_robots_lists_what_has_a_gateway_or_a_status() -> None:
     world = World("r2", "r1")
     world.bus.announce("fleet/starting/@alive/gateway")
@@ -76,20 +76,17 @@ async def test_robots_lists_what_has_a_gateway_or_a_status() -> None:
     assert list(await world.fleet.robots()) == ["old", "r1", "r2", "starting"], "in order of their names"
 
 
-@jumping
 async def test_a_status_nobody_can_read_counts_as_none() -> None:
     world = World("r1", "r2")
     world.gateway.put(topics.STATUS, b"\xc1")
     assert await world.fleet.robots() == {"r1": None, "r2": Status(state="established")}
 
 
-@jumping
 async def test_without_robots_the_list_is_empty() -> None:
     assert await World().fleet.robots() == {}
     assert await World().fleet.stop() == {}
 
 
-@jumping
 async def test_a_realm_sees_its_own_robots_only() -> None:
     world = World("r1")
     other = Fleet(world.bus.join("other"), "lab")
@@ -99,7 +96,6 @@ async def test_a_realm_sees_its_own_robots_only() -> None:
     assert world.gateway.machine.stops == 0
 
 
-@jumping
 async def test_fleet_and_robots_print_what_they_are() -> None:
     world = World()
     assert repr(world.fleet) == "<Fleet fleet>"
@@ -117,10 +113,7 @@ async def test_fleet_and_robots_print_what_they_are() -> None:
     [(topics.RPC_POSE, POSE, lambda robot: robot.ask_pose()), (topics.RPC_MAP, MAP, lambda robot: robot.ask_map())],
     ids=["pose", "map"],
 )
-@jumping
-async def test_questions_are_answered_refused_or_not_answered(
-    topic: Topic, message: FleetMessage, ask: Callable[[Robot], Any]
-) -> None:
+async def test_questions_are_answered_refused_or_not_answered(topic, message, ask) -> None:
     world = World()
     with pytest.raises(BusError, match=r"^r1: no gateway answered"):
         await ask(world.robot)
@@ -142,7 +135,6 @@ async def test_questions_are_answered_refused_or_not_answered(
         await ask(world.robot)
 
 
-@jumping
 async def test_an_asked_maps_cells_are_an_array_of_rows_and_columns() -> None:
     world = World()
     world.bus.answer("fleet/r1/@rpc/map", lambda question: question.answer(payloads.encode(MAP)))
@@ -168,7 +160,6 @@ async def test_an_asked_maps_cells_are_an_array_of_rows_and_columns() -> None:
         ),
     ],
 )
-@jumping
 async def test_commands_that_need_no_lease(path: str, message: FleetMessage, work: Callable[[Robot], Any]) -> None:
     world = World("r1")
     await work(world.robot)
@@ -183,7 +174,6 @@ async def test_commands_that_need_no_lease(path: str, message: FleetMessage, wor
 # The stop
 
 
-@jumping
 async def test_a_stop_returns_when_the_gateway_has_confirmed_it() -> None:
     world = World("r1")
     async with world.robot.control("ann@here") as drive:
@@ -201,7 +191,6 @@ async def test_a_stop_returns_when_the_gateway_has_confirmed_it() -> None:
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-@jumping
 async def test_a_robot_that_is_free_or_stopped_is_stopped_too() -> None:
     world = World("r1")
     await world.robot.stop()
@@ -211,7 +200,6 @@ async def test_a_robot_that_is_free_or_stopped_is_stopped_too() -> None:
     assert world.gateway.machine.stops > stops
 
 
-@jumping
 async def test_a_stop_that_is_lost_is_sent_again() -> None:
     world = World()
     heard: list[Sample] = []
@@ -229,7 +217,6 @@ async def test_a_stop_that_is_lost_is_sent_again() -> None:
     assert 5 <= len(heard) <= 6
 
 
-@jumping
 async def test_what_was_stopped_before_is_no_confirmation() -> None:
     world = World()
     world.bus.publisher("fleet/r1/control", topics.CONTROL).put(payloads.encode(Control(state="stopped")))
@@ -238,7 +225,6 @@ async def test_what_was_stopped_before_is_no_confirmation() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", payloads.encode(Control(state="held", holder="ann@here"))])
-@jumping
 async def test_anything_else_on_control_is_no_confirmation(payload: bytes) -> None:
     world = World()
     publisher = world.bus.publisher("fleet/r1/control", topics.TEXT)
@@ -247,7 +233,6 @@ async def test_anything_else_on_control_is_no_confirmation(payload: bytes) -> No
         await world.robot.stop()
 
 
-@jumping
 async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so() -> None:
     world = World()
     asked_at = world.loop.time()
@@ -258,7 +243,6 @@ async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so() -> None:
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-@jumping
 async def test_who_tells_that_a_listener_refused_a_stop_makes_no_stop_fail() -> None:
     world = World("r1")
 
@@ -272,7 +256,6 @@ async def test_who_tells_that_a_listener_refused_a_stop_makes_no_stop_fail() -> 
     assert world.gateway.control.refusals[0].command == "stop"
 
 
-@jumping
 async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_time() -> None:
     world = World("r1")
     world.gateway.machine.unstoppable = "this version knows no stop"
@@ -282,7 +265,6 @@ async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_t
     assert world.gateway.control.state == "stopped", "nobody drives it any more, whatever it does"
 
 
-@jumping
 async def test_a_refusal_of_long_ago_is_none_of_this_stop() -> None:
     world = World("r1")
     world.gateway.machine.unstoppable = "not now"
@@ -292,7 +274,6 @@ async def test_a_refusal_of_long_ago_is_none_of_this_stop() -> None:
     assert world.gateway.machine.stops >= 1
 
 
-@jumping
 async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so() -> None:
     world = World("r1")
     world.gateway.publish(topics.STATUS, Status(state="connecting", reason="no route to host"))
@@ -305,7 +286,6 @@ async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so() -> None
 
 
 @pytest.mark.parametrize("topic", [topics.CONTROL, topics.STATUS], ids=["control", "status"])
-@jumping
 async def test_a_stop_is_sent_although_a_state_cannot_be_read(topic: Topic) -> None:
     world = World("r1")
     world.gateway.put(topic, b"\xc1")
@@ -322,7 +302,6 @@ class SlowToAsk(FakeBus):
         return await super().ask(key_expr, payload, timeout_s=timeout_s)
 
 
-@jumping
 async def test_a_stop_is_sent_before_anything_is_asked() -> None:
     world = World("r1")
     stopping = asyncio.create_task(Fleet(SlowToAsk("slow", world.bus._shared))["r1"].stop())
@@ -332,7 +311,6 @@ async def test_a_stop_is_sent_before_anything_is_asked() -> None:
     await stopping
 
 
-@jumping
 async def test_all_robots_are_stopped_at_once_and_each_has_its_outcome() -> None:
     world = World("r1", "r2", "r3")
     world.gateways["r2"].machine.unstoppable = "no"
@@ -351,7 +329,6 @@ async def test_all_robots_are_stopped_at_once_and_each_has_its_outcome() -> None
     assert [gateway.machine.stops > 0 for gateway in world.gateways.values()] == [True, False, True]
 
 
-@jumping
 async def test_one_robots_unreadable_status_leaves_every_robot_its_stop_and_outcome() -> None:
     world = World("r1", "r2")
     world.gateway.put(topics.STATUS, b"\xc1")
@@ -362,7 +339,6 @@ async def test_one_robots_unreadable_status_leaves_every_robot_its_stop_and_outc
     assert all(gateway.machine.stops > 0 for gateway in world.gateways.values())
 
 
-@jumping
 async def test_only_the_named_robots_are_stopped() -> None:
     world = World("r1", "r2", "r3")
     outcomes = await world.fleet.stop(name for name in ("r3", "r1", "r3"))
@@ -371,14 +347,12 @@ async def test_only_the_named_robots_are_stopped() -> None:
     assert [gateway.machine.stops > 0 for gateway in world.gateways.values()] == [True, False, True]
 
 
-@jumping
 async def test_a_single_name_is_one_robot_to_stop() -> None:
     world = World("r1", "r2")
     assert await world.fleet.stop("r1") == {"r1": None}
     assert world.gateways["r2"].machine.stops == 0
 
 
-@jumping
 async def test_a_program_can_stop_what_it_drives_and_take_it_again() -> None:
     world = World("r1")
     async with world.robot.control("ann@here"):
@@ -388,7 +362,6 @@ async def test_a_program_can_stop_what_it_drives_and_take_it_again() -> None:
     assert len(world.gateway.driven) == 1
 
 
-@jumping
 async def test_several_robots_are_driven_at_once() -> None:
     world = World("r1", "r2")
     async with world.fleet["r1"].control("ann@here") as one, world.fleet["r2"].control("ann@here") as two:

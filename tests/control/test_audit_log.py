@@ -59,38 +59,20 @@ def refused(who: str | None = "ann", command: str = "drive", reason: str = "offl
 # Lines
 
 WRITTEN = [
-    (
-        Event(EventKind.ACQUIRED, "ann", priority=0),
-        {"event": "acquired", "who": "ann", "priority": 0},
-    ),
-    (
-        Event(EventKind.TAKEN_OVER, "bob", priority=-3),
-        {"event": "taken over", "who": "bob", "priority": -3},
-    ),
+    (Event(EventKind.ACQUIRED, "ann", priority=0), {"event": "acquired", "who": "ann", "priority": 0}),
+    (Event(EventKind.TAKEN_OVER, "bob", priority=-3), {"event": "taken over", "who": "bob", "priority": -3}),
     (
         Event(EventKind.ENDED, "ann", "taken over by bob", stops=True),
         {"event": "ended", "who": "ann", "reason": "taken over by bob", "stops": True},
     ),
-    (
-        Event(EventKind.RELEASED, "ann", "released"),
-        {"event": "released", "who": "ann", "reason": "released"},
-    ),
+    (Event(EventKind.RELEASED, "ann", "released"), {"event": "released", "who": "ann", "reason": "released"}),
     (
         Event(EventKind.STOPPED, "ann", "deadman", stops=True),
         {"event": "stopped", "who": "ann", "reason": "deadman", "stops": True},
     ),
-    (
-        Event(EventKind.STOPPED, None, "stop", stops=True),
-        {"event": "stopped", "reason": "stop", "stops": True},
-    ),
-    (
-        refused(),
-        {"event": "refused", "who": "ann", "command": "drive", "reason": "offline"},
-    ),
-    (
-        refused(None),
-        {"event": "refused", "command": "drive", "reason": "offline"},
-    ),
+    (Event(EventKind.STOPPED, None, "stop", stops=True), {"event": "stopped", "reason": "stop", "stops": True}),
+    (refused(), {"event": "refused", "who": "ann", "command": "drive", "reason": "offline"}),
+    (refused(None), {"event": "refused", "command": "drive", "reason": "offline"}),
 ]
 
 
@@ -304,9 +286,7 @@ FLOODS = [one_name, random_names, stops, varied_refusals, comings_and_goings]
 
 
 @pytest.mark.parametrize("flood", FLOODS)
-def test_a_flood_pushes_nothing_out_that_was_there_before(
-    tmp_path: Path, metrics: Metrics, flood: Callable[[], list[Event]], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flood_pushes_nothing_out_that_was_there_before(tmp_path, metrics, flood, caplog) -> None:
     caplog.set_level(logging.INFO)
     file = opened(tmp_path / "audit.jsonl", metrics, file_bytes=100_000, files=1)
     audit = Audit("r1", file.write)
@@ -614,9 +594,7 @@ def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_aga
     assert errors == [f"the audit log is not written: No space left on device ({path})"]
 
 
-def test_a_disk_that_stays_full_keeps_nobody_from_ending_and_what_is_lost_is_counted(
-    tmp_path: Path, metrics: Metrics, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disk_that_stays_full_keeps_nobody_from_ending_and_what_is_lost_is_counted(tmp_path, metrics, capfd) -> None:
     path = tmp_path / "audit.jsonl"
     path.symlink_to("/dev/full")
     file = opened(path, metrics)
@@ -650,9 +628,7 @@ def test_a_line_that_was_half_written_is_finished(tmp_path: Path, told: Told, mo
     assert path.read_text() == "a whole line\nand another\n"
 
 
-def test_a_pipe_that_nobody_reads_is_waited_for_by_nobody(
-    tmp_path: Path, metrics: Metrics, told: Told, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_pipe_that_nobody_reads_is_waited_for_by_nobody(tmp_path, metrics, told, caplog) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     file = opened(path, metrics, tell=told.tell)
@@ -664,9 +640,7 @@ def test_a_pipe_that_nobody_reads_is_waited_for_by_nobody(
     assert [record.levelname for record in caplog.records] == ["ERROR"]
 
 
-def test_a_pipe_is_written_when_somebody_reads_it_and_again_when_somebody_else_does(
-    tmp_path: Path, metrics: Metrics, told: Told
-) -> None:
+def test_a_pipe_is_written_when_somebody_reads_it_and_again_when_somebody_else_does(tmp_path, metrics, told) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
     file = opened(path, metrics, tell=told.tell)
@@ -717,9 +691,7 @@ def test_what_is_given_up_at_the_end_is_counted(disk: Disk, metrics: Metrics, mo
     assert len(written) + metrics.count("audit_dropped").value >= len(lines)
 
 
-def test_a_disk_that_never_moves_again_does_not_keep_the_gateway_from_ending(
-    disk: Disk, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_never_moves_again_does_not_keep_the_gateway_from_ending(disk, monkeypatch) -> None:
     monkeypatch.setattr("zbridge.control.audit_log.CLOSE_S", 0.001)
     disk.stand_still()
     with closing(disk, within_s=2.0) as failed:

@@ -260,9 +260,7 @@ WHY_NOT = [
 
 @pytest.mark.parametrize(("state", "given", "reason", "code"), WHY_NOT)
 @pytest.mark.parametrize("asks", [renew, release])
-def test_nobody_else_renews_or_releases(
-    state: str, given: Given, reason: str, code: str, asks: Callable[[Given], Does]
-) -> None:
+def test_nobody_else_renews_or_releases(state, given, reason, code, asks) -> None:
     authority = STATES[state]()
     before = repr(authority), authority.moving, authority.deadline()
     holder, left_s = ("ann", LEASE_S) if state in HELD else (None, None)
@@ -548,9 +546,7 @@ def test_whatever_order_its_fields_have_and_however_long_they_are_written_an_att
 
 
 @pytest.mark.parametrize(("state", "given", "reason", "code"), WHY_NOT)
-def test_a_command_with_another_lease_is_refused_with_the_reason(
-    state: str, given: Given, reason: str, code: str
-) -> None:
+def test_a_command_with_another_lease_is_refused_with_the_reason(state, given, reason, code) -> None:
     how = refused(STATES[state](), attach(given, SEQ + 1))
     assert (str(how), how.code) == (reason, code)
     assert how.holder == ("ann" if how.code == "held" else None)
@@ -584,9 +580,7 @@ ALTERED = {
 
 
 @pytest.mark.parametrize(("attachment", "key", "payload"), ALTERED.values(), ids=ALTERED)
-def test_what_was_overheard_and_altered_is_refused_and_costs_the_holder_nothing(
-    attachment: bytes, key: str, payload: bytes
-) -> None:
+def test_what_was_overheard_and_altered_is_refused_and_costs_the_holder_nothing(attachment, key, payload) -> None:
     authority = held()
     with pytest.raises(Malformed, match=r"^wrong proof$") as how:
         authority.admit(attachment, key, payload, NOW)
@@ -1039,10 +1033,7 @@ def test_a_bounded_number_of_ended_leases_is_remembered() -> None:
     assert (how.who, str(how)) == (None, f"held by client {ENDED + 2} (priority 0)"), "refused all the same"
     for number, given in enumerate(remembered, 2):
         how = refused(authority, attach(given, 9))
-        assert (how.who, str(how)) == (
-            f"client {number}",
-            f"the lease has ended (taken over by client {number + 1})",
-        )
+        assert (how.who, str(how)) == (f"client {number}", f"the lease has ended (taken over by client {number + 1})")
     assert admit(attach(current, 0))(authority) == f"client {ENDED + 2}"
 
 

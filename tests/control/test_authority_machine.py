@@ -440,5 +440,8 @@ def attach(given: Given, seq: int) -> bytes:
 
 def test_over_any_course_of_events_the_robot_moves_only_for_its_one_driver() -> None:
     run_state_machine_as_test(
-        Driving, settings=settings(max_examples=400, stateful_step_count=50, deadline=None, print_blob=False)
+        Driving,
+        settings=settings(
+            max_examples=4 * settings().max_examples, stateful_step_count=50, deadline=None, print_blob=False
+        ),
     )

@@ -67,9 +67,7 @@ def strange() -> bytes:
 
 @pytest.mark.parametrize("key", [DRIVE, MODE, "fleet/r1/@cmd/motor/left", "fleet/r1/@cmd/raw/tcpudp"])
 @pytest.mark.parametrize("attachment", [None, b"", b"no proof", bytes(100), bytes(200), strange()])
-def test_of_what_cannot_be_a_proof_a_few_a_second_are_shown_and_the_others_counted(
-    attachment: bytes | None, key: str
-) -> None:
+def test_of_what_cannot_be_a_proof_a_few_a_second_are_shown_and_the_others_counted(attachment, key) -> None:
     rig = Rig()
     lanes = rig.flood(attachment, key)
     assert lanes.count(Lane.OTHER) == SHOWN_HZ

@@ -41,9 +41,7 @@ def test_without_limits_everything_passes_unchanged(course: list[tuple[float, Dr
 
 
 @given(rates, slews, courses)
-def test_neutral_is_never_refused_and_never_changed(
-    rate_hz: float, slew_per_s: float, course: list[tuple[float, Drive]]
-) -> None:
+def test_neutral_is_never_refused_and_never_changed(rate_hz, slew_per_s, course) -> None:
     limits, now = MotionLimits(rate_hz, slew_per_s), 0.0
     for wait_s, drive in course:
         now += wait_s
@@ -56,9 +54,7 @@ def test_neutral_is_never_refused_and_never_changed(
 
 
 @given(rates, courses)
-def test_no_more_than_the_rate_and_a_burst_of_two_passes_in_any_time(
-    rate_hz: float, course: list[tuple[float, Drive]]
-) -> None:
+def test_no_more_than_the_rate_and_a_burst_of_two_passes_in_any_time(rate_hz, course) -> None:
     limits, now = MotionLimits(rate_hz=rate_hz), 0.0
     times = []
     for wait_s, drive in course:
@@ -131,9 +127,7 @@ def test_growth_is_bounded_and_slowing_down_is_not(slew_per_s: float, course: li
 
 
 @given(slews, st.lists(st.tuples(st.floats(0, STEP_S), drives), min_size=1, max_size=30))
-def test_over_any_course_growth_is_bounded_by_the_time_it_took(
-    slew_per_s: float, course: list[tuple[float, Drive]]
-) -> None:
+def test_over_any_course_growth_is_bounded_by_the_time_it_took(slew_per_s, course) -> None:
     limits, now = MotionLimits(slew_per_s=slew_per_s), 0.0
     limits.sent(NEUTRAL, now)
     taken = [(now, NEUTRAL)]
@@ -183,7 +177,7 @@ def test_a_long_silence_allows_no_jump() -> None:
 def test_a_robot_that_was_stopped_begins_from_standing() -> None:
     limits = MotionLimits(slew_per_s=1.0)
     limits.sent(Drive(forward=1.0, left=-1.0, turn=1.0), 0.0)
-    limits.stands()
+    limits.at_rest()
     assert limits.limit(Drive(forward=1.0, left=-1.0, turn=1.0), 0.125) == Drive(forward=0.125, left=-0.125, turn=0.125)
 
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 
-from tests.clock import jumping
+import pytest
+
 from tests.robot.test_device import NEUTRAL, Rig, established, serving
 from zbridge.transport.link import STALLED_S
+
+pytestmark = pytest.mark.jumping
 
 STOP = bytes.fromhex("02000000 02 0d")
 """Packet 13 to client id 2 (tcpudp.md, "Framing"): length 2, id, packet id."""
@@ -30,7 +33,6 @@ async def drive_for(rig: Rig, seconds: float) -> None:
         await asyncio.sleep(0.1)
 
 
-@jumping
 async def test_a_robot_that_nobody_drives_gets_a_stop_a_second_for_ever() -> None:
     async with established(idle_stop_s=1.0) as rig:
         await asyncio.sleep(0.5)
@@ -43,7 +45,6 @@ async def test_a_robot_that_nobody_drives_gets_a_stop_a_second_for_ever() -> Non
         assert all(0.9 <= gap <= 1.1 for gap in gaps)
 
 
-@jumping
 async def test_while_somebody_drives_no_stop_is_put_in_between() -> None:
     async with established(idle_stop_s=1.0) as rig:
         rig.hold()
@@ -53,7 +54,6 @@ async def test_while_somebody_drives_no_stop_is_put_in_between() -> None:
         assert all(map(is_move, rig.written()))
 
 
-@jumping
 async def test_after_neutral_and_the_deadman_stops_go_on_although_the_lease_is_held() -> None:
     for end in ("neutral", "deadman"):
         async with established(idle_stop_s=1.0, deadman_s=0.5) as rig:
@@ -68,7 +68,6 @@ async def test_after_neutral_and_the_deadman_stops_go_on_although_the_lease_is_h
             assert 19 <= rig.written().count(STOP) <= 21
 
 
-@jumping
 async def test_a_robot_in_autonomous_mode_is_left_alone_until_another_mode() -> None:
     async with established(idle_stop_s=1.0) as rig:
         rig.hold()
@@ -82,7 +81,6 @@ async def test_a_robot_in_autonomous_mode_is_left_alone_until_another_mode() -> 
         assert 9 <= rig.written().count(STOP) <= 11
 
 
-@jumping
 async def test_neutral_ends_autonomous_mode_and_the_stop_after_it_is_the_pair() -> None:
     """tcpudp.md, "Translation": once the gateway sent mode 3, every stop is 1, 13."""
     async with established(idle_stop_s=1.0) as rig:
@@ -96,7 +94,6 @@ async def test_neutral_ends_autonomous_mode_and_the_stop_after_it_is_the_pair() 
         assert rig.written()[:4] == [MODE_NONE, STOP, MODE_NONE, STOP]
 
 
-@jumping
 async def test_whoever_only_chats_does_not_drive() -> None:
     async with established(idle_stop_s=1.0) as rig:
         rig.hold()
@@ -107,7 +104,6 @@ async def test_whoever_only_chats_does_not_drive() -> None:
         assert rig.written().count(STOP) >= 9
 
 
-@jumping
 async def test_a_stop_drops_the_raw_packets_that_wait() -> None:
     """Whatever they do to the robot: after its stop nothing of the lease that ended may come."""
     async with established(idle_stop_s=1.0) as rig:
@@ -120,7 +116,6 @@ async def test_a_stop_drops_the_raw_packets_that_wait() -> None:
         assert set(rig.written()) == {STOP}
 
 
-@jumping
 async def test_a_gateway_that_ends_while_the_link_takes_nothing_leaves_the_stop_to_the_kernel() -> None:
     async with established(deadman_s=5.0) as rig:
         rig.hold()
@@ -132,7 +127,6 @@ async def test_a_gateway_that_ends_while_the_link_takes_nothing_leaves_the_stop_
     assert not any(map(is_move, rig.written()))
 
 
-@jumping
 async def test_the_drive_that_finds_the_link_open_again_is_no_motion_but_refused() -> None:
     async with established(deadman_s=5.0, idle_stop_s=1.0) as rig:
         rig.hold()
@@ -149,7 +143,6 @@ async def test_the_drive_that_finds_the_link_open_again_is_no_motion_but_refused
         assert "the robot's link took nothing: send a neutral drive first" in reasons
 
 
-@jumping
 async def test_nothing_is_asked_of_a_robot_whose_link_takes_nothing() -> None:
     async with established() as rig:
         rig.hold()
@@ -160,14 +153,12 @@ async def test_nothing_is_asked_of_a_robot_whose_link_takes_nothing() -> None:
         assert str(answer.error) == "the robot's link takes nothing"
 
 
-@jumping
 async def test_idle_stops_can_be_turned_off() -> None:
     async with established(idle_stop_s=0.0) as rig:
         await asyncio.sleep(60.0)
         assert rig.written() == []
 
 
-@jumping
 async def test_a_robot_that_cannot_be_sent_its_stop_is_said_to_be_so() -> None:
     async with serving(idle_stop_s=1.0) as rig:
         await rig.establish(NO_JOYSTICK)
@@ -179,7 +170,6 @@ async def test_a_robot_that_cannot_be_sent_its_stop_is_said_to_be_so() -> None:
         assert await rig.refusals() == []  # nobody asked for it: nothing was refused
 
 
-@jumping
 async def test_before_the_robot_is_established_and_after_it_is_lost_nothing_is_sent() -> None:
     async with serving(idle_stop_s=1.0) as rig:
         await asyncio.sleep(3.0)
@@ -195,7 +185,6 @@ async def test_before_the_robot_is_established_and_after_it_is_lost_nothing_is_s
 # A link that takes nothing
 
 
-@jumping
 async def test_nothing_is_driven_while_the_link_takes_nothing_and_the_stop_goes_first_when_it_does() -> None:
     async with established(deadman_s=5.0, idle_stop_s=1.0) as rig:
         rig.hold()
@@ -224,7 +213,6 @@ async def test_nothing_is_driven_while_the_link_takes_nothing_and_the_stop_goes_
         assert any(map(is_move, rig.written()))
 
 
-@jumping
 async def test_a_link_that_is_slow_but_not_silent_is_driven() -> None:
     async with established(deadman_s=5.0) as rig:
         rig.hold()
@@ -234,7 +222,6 @@ async def test_a_link_that_is_slow_but_not_silent_is_driven() -> None:
         assert rig.last("status")["reason"] is None
 
 
-@jumping
 async def test_a_link_is_looked_at_again_without_anything_to_write() -> None:
     """What was written last is not acknowledged: nothing wakes the gateway but its own look."""
     async with established() as rig:
@@ -253,7 +240,6 @@ async def test_a_link_is_looked_at_again_without_anything_to_write() -> None:
         assert rig.written()[:1] == [STOP]
 
 
-@jumping
 async def test_what_is_no_drive_is_refused_while_the_link_takes_nothing() -> None:
     async with established() as rig:
         rig.hold()
@@ -264,7 +250,6 @@ async def test_what_is_no_drive_is_refused_while_the_link_takes_nothing() -> Non
         assert ("mode", "the robot's link takes nothing", 1) in await rig.refusals()
 
 
-@jumping
 async def test_a_link_that_is_lost_while_it_takes_nothing_leaves_no_trace() -> None:
     async with established(deadman_s=5.0) as rig:
         rig.hold()

@@ -29,17 +29,7 @@ from typing import Any
 import msgpack
 import zenoh
 
-from tests.e2e.loss import (
-    SCALE,
-    STOP,
-    Frame,
-    Scene,
-    commander,
-    configuration,
-    kill,
-    query,
-    start,
-)
+from tests.e2e.loss import SCALE, STOP, Frame, Scene, commander, configuration, kill, query, start
 from tests.proofs import Holder
 
 NAMES = ("anna", "bert")

@@ -5,8 +5,6 @@ connection; any other ends it, and it prints what it received and what was viola
 arguments of :class:`FragileRobot`, and ``times``, as a JSON object.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sys

@@ -6,8 +6,6 @@ Each line on stdin is a push of the stick, after letting go of it; the end of st
 a value of its own. Only the standard library: such a process must be there at once.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -4,8 +4,6 @@
 what was violated as one JSON object. It says more often than deployed robots where it is: tests are short.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -14,11 +12,11 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from gateways.alf import fragile as alf
+from gateways.alf.conformance import fragile_robot as alf
 from gateways.alf.conformance import parser as alf_parser
-from gateways.tcpudp import fragile as tcpudp
+from gateways.tcpudp.conformance import fragile_robot as tcpudp
 from gateways.tcpudp.conformance import parser as tcpudp_parser
-from gateways.wc2ec import fragile as wc2ec
+from gateways.wc2ec.conformance import fragile_robot as wc2ec
 
 SEED = 1
 ROBOTS: dict[str, Callable[[], Any]] = {

@@ -634,10 +634,7 @@ def _last_motion(frames: list[Frame]) -> Frame:
     return motions[first]
 
 
-_PARTS: dict[str, Callable[[str], None]] = {
-    "router": be_router,
-    "watch": lambda processor: be_watch(int(processor)),
-}
+_PARTS: dict[str, Callable[[str], None]] = {"router": be_router, "watch": lambda processor: be_watch(int(processor))}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """How much time this machine kept from what was measured on it. Without that, a limit on time fails on a busy one."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterable

@@ -5,8 +5,6 @@ fraction of full scale) for each change of what it last obeyed. A line on stdin,
 what it noted as one JSON object. ROBOT is a name of :data:`ROBOTS`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

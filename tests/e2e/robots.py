@@ -1,7 +1,5 @@
 """A scripted robot of the TCP/UDP package protocol for end-to-end tests: plain sockets, bytes written by hand."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

@@ -298,9 +298,7 @@ def test_end_from_the_vehicle_is_answered_shown_and_the_next_connection_begins_w
     until(lambda: HALF["text"] in [message for _, message in vehicle.connections[1]], what="drive again")
 
 
-def test_sigterm_stops_the_vehicle_says_end_on_both_links_and_nothing_behind_it(
-    bench: Bench, servers: list[Server]
-) -> None:
+def test_sigterm_stops_the_vehicle_says_end_on_both_links_and_nothing_behind_it(bench, servers) -> None:
     wheels, laser = Server("binary"), Server("binary")
     servers += [wheels, laser]
     process = gateway(bench, [wheels.port, laser.port], dialect="binary")
@@ -341,9 +339,7 @@ with zenoh.open(config) as session:
 
 
 @pytest.mark.parametrize("dialect", ["text", "binary"])
-def test_driver_killed_the_vehicle_gets_speed_0_within_the_deadman(
-    bench: Bench, servers: list[Server], dialect: str
-) -> None:
+def test_driver_killed_the_vehicle_gets_speed_0_within_the_deadman(bench, servers, dialect) -> None:
     vehicle = Server(dialect)
     servers.append(vehicle)
     gateway(bench, [vehicle.port], dialect=dialect, more=f"[control]\ndeadman_s = {DEADMAN_S}\n")

@@ -107,9 +107,7 @@ def halves(bench: Bench, tmp_path: Path) -> Iterator[Halves]:
         yield Halves(bench, stack, tmp_path)
 
 
-def test_of_two_that_meet_the_one_that_has_the_robot_keeps_it(
-    bench: Bench, halves: Halves, robot: ScriptedRobot
-) -> None:
+def test_of_two_that_meet_the_one_that_has_the_robot_keeps_it(bench, halves, robot) -> None:
     second = halves.gateway(free_port())  # it serves the robot for longer, and never reaches it
     until(halves.far.tokens, what="a gateway that serves the robot")
     first = bench.gateway("r1", robot.port)

@@ -1,7 +1,5 @@
 """Floods on a real bus: the robot obeys its holder and every stop, others are answered, nothing grows."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.benchmarks.flooder import KINDS

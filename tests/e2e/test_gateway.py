@@ -165,9 +165,7 @@ def refusals(bench: Bench) -> dict[str, Any]:
     return {entry["reason"]: entry for entry in bench.fleet.last("r1/control").get("refusals", [])}
 
 
-def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman(
-    bench: Bench, robot: ScriptedRobot
-) -> None:
+def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman(bench, robot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
     with driving(bench, robot, "operator.1") as driver:
@@ -182,9 +180,7 @@ def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
 
-def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(
-    bench: Bench, robot: ScriptedRobot
-) -> None:
+def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(bench, robot) -> None:
     bench.gateway("r1", robot.port, DEADMAN)
     until(lambda: established(bench))
     with driving(bench, robot, "operator.1") as driver:
@@ -198,9 +194,7 @@ def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
 
-def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhile(
-    bench: Bench, robot: ScriptedRobot
-) -> None:
+def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhile(bench, robot) -> None:
     gateway = bench.gateway("r1", robot.port, DEADMAN)
     until(lambda: established(bench))
     with driving(bench, robot):
@@ -215,9 +209,7 @@ def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhil
     assert not [at for at, _ in robot.packets(11) if at > stop_at]
 
 
-def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_on_its_own(
-    bench: Bench, robot: ScriptedRobot
-) -> None:
+def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_on_its_own(bench, robot) -> None:
     bench.gateway("r1", robot.port, "[control]\nlease_s = 0.6\n")
     until(lambda: established(bench))
     bench.fleet.hold("r1")
@@ -258,9 +250,7 @@ def test_of_two_programs_the_holder_drives_until_the_other_takes_over(bench: Ben
     other.close()
 
 
-def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_was_expected(
-    bench: Bench, robot: ScriptedRobot
-) -> None:
+def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_was_expected(bench, robot) -> None:
     bench.gateway("r1", robot.port)
     until(lambda: established(bench))
     (error,) = bench.fleet.get("fleet/r1/@rpc/control/acquire/me", priority=1)

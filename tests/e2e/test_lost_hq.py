@@ -23,9 +23,7 @@ def _assert_stopped(program: str, ways: list[str], repetitions: int) -> None:
         ("wc2ec-holds", ["killed", "hq-killed", "hq-frozen"], 1),
     ],
 )
-def test_a_robot_whose_hq_program_or_its_listener_is_lost_is_stopped(
-    program: str, ways: list[str], repetitions: int
-) -> None:
+def test_a_robot_whose_hq_program_or_its_listener_is_lost_is_stopped(program, ways, repetitions) -> None:
     _assert_stopped(program, ways, repetitions)
 
 

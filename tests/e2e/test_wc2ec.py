@@ -352,9 +352,7 @@ with zenoh.open(config) as session:
 
 
 @pytest.mark.parametrize("what", ["drive", "motor/left"])
-def test_driver_killed_the_motors_are_set_to_0_within_the_deadman(
-    bench: Bench, robots: list[Webots], what: str
-) -> None:
+def test_driver_killed_the_motors_are_set_to_0_within_the_deadman(bench: Bench, robots: list[Webots], what) -> None:
     webots = car(robots)
     gateway(bench, webots.port, more=f"[control]\ndeadman_s = {DEADMAN_S}\n")
     established(bench)
@@ -465,9 +463,7 @@ def test_a_simulator_that_ends_and_is_started_again_is_found(bench: Bench) -> No
     established(bench)
 
 
-def test_an_unknown_command_ends_the_link_with_its_bytes_in_the_reason_and_it_reconnects(
-    bench: Bench, robots: list[Webots]
-) -> None:
+def test_an_unknown_command_ends_the_link_with_its_bytes_in_the_reason_and_it_reconnects(bench, robots) -> None:
     webots = car(robots)
     gateway(bench, webots.port)
     established(bench)

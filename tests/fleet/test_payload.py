@@ -132,10 +132,7 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
         Acquire(who="hq 1", priority=3, lease_s=2.0, deadman_s=0.5, alive="operator.1"),
         {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"},
     ),
-    (
-        Authorization(lease=LEASE, seq=7, proof=PROOF),
-        {"seq": 7, "lease": LEASE, "proof": PROOF},
-    ),
+    (Authorization(lease=LEASE, seq=7, proof=PROOF), {"seq": 7, "lease": LEASE, "proof": PROOF}),
     (
         Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="hq 1"),
         {
@@ -424,9 +421,7 @@ def test_unknown_fields_are_ignored() -> None:
         (Lease, {"ok": True, "lease": LEASE, "token": TOKEN[:16]}, "token"),
     ],
 )
-def test_a_wrong_field_is_a_payload_error_that_names_it(
-    kind: type[FleetMessage], fields: dict[str, Any], named: str
-) -> None:
+def test_a_wrong_field_is_a_payload_error_that_names_it(kind, fields, named) -> None:
     with pytest.raises(PayloadError, match=f"{kind.__name__}.*{named}"):
         decode(kind, msgpack.packb(fields))
 

@@ -73,12 +73,7 @@ def test_other_paths_are_not(path: str) -> None:
 
 def test_a_stream_may_be_dropped_and_keeps_nothing() -> None:
     qos = topics.SCAN.qos
-    assert (qos.priority, qos.congestion, qos.express, qos.keeps_last) == (
-        Priority.DATA,
-        Congestion.DROP,
-        False,
-        False,
-    )
+    assert (qos.priority, qos.congestion, qos.express, qos.keeps_last) == (Priority.DATA, Congestion.DROP, False, False)
 
 
 def test_a_state_blocks_and_keeps_its_last_value() -> None:

@@ -1,7 +1,5 @@
 """What the listeners of a process follow of a robot: one subscription and one decoding for all of them."""
 
-from __future__ import annotations
-
 import pytest
 
 from zbridge.bus.fake import FakeBus

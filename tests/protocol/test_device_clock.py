@@ -168,9 +168,7 @@ def test_the_error_in_milliseconds(delay: Delay, most_ms: float, drift: str) -> 
     gap=st.integers(1, 10),
     late_s=st.lists(st.floats(0, 9), min_size=16, max_size=16),
 )
-def test_the_stated_error_holds_for_any_delays(
-    spread_us: int, drift_ppm: float, good: list[float], gap: int, late_s: list[float]
-) -> None:
+def test_the_stated_error_holds_for_any_delays(spread_us, drift_ppm, good, gap, late_s) -> None:
     """A packet a second; one of ``gap`` is anywhere within ``spread_us`` of the least delay, the others are later."""
     packets = []
     for second in range(200):
@@ -192,9 +190,7 @@ def test_the_stated_error_holds_for_any_delays(
     delays_s=st.lists(st.one_of(st.floats(0, 0.05), st.floats(0, 0.9)), min_size=1, max_size=200),
     period_ms=st.integers(1, 500),
 )
-def test_early_stamps_are_as_good_as_the_best_packet_so_far(
-    drift_ppm: float, delays_s: list[float], period_ms: int
-) -> None:
+def test_early_stamps_are_as_good_as_the_best_packet_so_far(drift_ppm, delays_s, period_ms) -> None:
     clock = DeviceClock()
     best_s = math.inf
     for i, delay_s in enumerate(delays_s):
@@ -212,9 +208,7 @@ def test_early_stamps_are_as_good_as_the_best_packet_so_far(
     steps_ms=st.lists(st.integers(0, 3000), min_size=100, max_size=100),
     drift_ppm=st.floats(-400, 400),
 )
-def test_stamps_never_go_back_and_equal_counters_have_equal_stamps(
-    delays_s: list[float], steps_ms: list[int], drift_ppm: float
-) -> None:
+def test_stamps_never_go_back_and_equal_counters_have_equal_stamps(delays_s, steps_ms, drift_ppm) -> None:
     clock = DeviceClock()
     device_ms, free_at, last, before = 0, 0.0, 0, -1
     for delay_s, step_ms in zip(delays_s, steps_ms, strict=False):
@@ -461,9 +455,7 @@ def test_what_is_no_counter_is_stamped_with_its_arrival(wrap_ms: int | None) -> 
 
 
 absurd = st.one_of(
-    st.integers(-5, 5000),
-    st.integers(),
-    st.sampled_from([0, U32 - 1, U32, 2**63, 2**64, 10**400, -(10**400)]),
+    st.integers(-5, 5000), st.integers(), st.sampled_from([0, U32 - 1, U32, 2**63, 2**64, 10**400, -(10**400)])
 )
 
 

@@ -38,9 +38,7 @@ def test_a_version_list_yields_its_dotted_numbers(listed: str, versions: tuple[s
         (("2.0", "1.9.9"), ("1.9.9", "2.0"), "2.0"),
     ],
 )
-def test_the_highest_common_version_is_agreed_on(
-    ours: tuple[str, ...], theirs: tuple[str, ...], version: str | None
-) -> None:
+def test_the_highest_common_version_is_agreed_on(ours, theirs, version) -> None:
     assert agree(ours, theirs) == version
 
 

@@ -1,7 +1,5 @@
 """How often something may happen."""
 
-from __future__ import annotations
-
 import math
 
 from zbridge.protocol.rate_limit import RateLimit

@@ -17,7 +17,7 @@ import pytest
 import zenoh
 
 from gateways.tcpudp.translate import Options, TcpUdpRobot
-from tests.clock import JumpingLoop, jumping
+from tests.clock import JumpingLoop, scene_of
 from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.address import Address
 from zbridge.bus import Handle, IncomingQuery, Lane, Sample
@@ -36,6 +36,8 @@ from zbridge.robot.device import HEARTBEAT_S, Device
 from zbridge.robot.telemetry import ATTEND_EVERY
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
+
+pytestmark = pytest.mark.jumping
 
 ADDRESS = Address("robot.test", 11001)
 LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
@@ -59,15 +61,7 @@ NEUTRAL: dict[str, Any] = {}
 FOREVER_S = 1e6
 """A lease that no test outlives."""
 NEED_A_LEASE = {"drive", "motor", "mode", "raw"}
-DENIED = {
-    "ok": False,
-    "lease": None,
-    "token": None,
-    "expires_in_s": None,
-    "holder": None,
-    "reason": None,
-    "code": None,
-}
+DENIED = {"ok": False, "lease": None, "token": None, "expires_in_s": None, "holder": None, "reason": None, "code": None}
 STRANGE = lease(99)
 """A lease that was never given."""
 
@@ -99,12 +93,7 @@ class OpenBus(FakeBus):
         return super().answer(key, handler, lane=lane)
 
     def subscribe(
-        self,
-        key_expr: str,
-        handler: Callable[[Sample], None],
-        *,
-        lane: Lane | Sort = Lane.OTHER,
-        history: bool = False,
+        self, key_expr: str, handler: Callable[[Sample], None], *, lane: Lane | Sort = Lane.OTHER, history: bool = False
     ) -> Handle:
         self.lanes[key_expr] = lane
         return super().subscribe(key_expr, handler, lane=lane, history=history)
@@ -295,11 +284,7 @@ def handlers(rig: Rig, key: str) -> list[Callable[[Sample], None]]:
 
 @contextlib.asynccontextmanager
 async def serving(
-    options: Options | None = None,
-    *,
-    unreachable: str | None = None,
-    hold: bool = True,
-    **more: Any,
+    options: Options | None = None, *, unreachable: str | None = None, hold: bool = True, **more: Any
 ) -> AsyncIterator[Rig]:
     """Run a device; unless told otherwise, a program holds the lease."""
     rig = Rig(options, **more)
@@ -323,10 +308,12 @@ async def established(options: Options | None = None, **more: Any) -> AsyncItera
         yield rig
 
 
+rig = scene_of(established)
+
+
 # Handshake and status
 
 
-@jumping
 async def test_the_robot_speaks_first_and_nothing_is_written_before() -> None:
     async with serving() as rig:
         await asyncio.sleep(1.0)
@@ -334,7 +321,6 @@ async def test_the_robot_speaks_first_and_nothing_is_written_before() -> None:
         assert rig.last("status")["state"] == "handshaking"
 
 
-@jumping
 async def test_the_settings_are_answered_and_the_status_shows_what_was_agreed() -> None:
     async with serving() as rig:
         rig.sends(SETTINGS)
@@ -351,7 +337,6 @@ async def test_the_settings_are_answered_and_the_status_shows_what_was_agreed() 
         ]
 
 
-@jumping
 async def test_the_settings_may_come_byte_by_byte() -> None:
     async with serving() as rig:
         for byte in SETTINGS:
@@ -360,7 +345,6 @@ async def test_the_settings_may_come_byte_by_byte() -> None:
         assert rig.link.written == [ANSWER]
 
 
-@jumping
 async def test_the_status_goes_through_every_state_in_order() -> None:
     async with serving() as rig:
         await rig.establish()
@@ -373,16 +357,13 @@ async def test_the_status_goes_through_every_state_in_order() -> None:
         assert rig.values("status")[0]["reason"] == "not yet connected"
 
 
-@jumping
-async def test_status_and_control_are_repeated_every_second() -> None:
-    async with established() as rig:
-        status, control = len(rig.values("status")), len(rig.values("control"))
-        await asyncio.sleep(3 * HEARTBEAT_S)
-        assert len(rig.values("status")) == status + 3
-        assert len(rig.values("control")) == control + 3
+async def test_status_and_control_are_repeated_every_second(rig: Rig) -> None:
+    status, control = len(rig.values("status")), len(rig.values("control"))
+    await asyncio.sleep(3 * HEARTBEAT_S)
+    assert len(rig.values("status")) == status + 3
+    assert len(rig.values("control")) == control + 3
 
 
-@jumping
 async def test_a_silent_robot_is_left_with_the_reason_that_its_connection_may_be_used_up() -> None:
     async with serving() as rig:
         await asyncio.sleep(5.1)
@@ -391,7 +372,6 @@ async def test_a_silent_robot_is_left_with_the_reason_that_its_connection_may_be
         assert rig.links[0].closed
 
 
-@jumping
 async def test_an_unreachable_robot_shows_as_offline_with_the_reason_and_is_tried_again() -> None:
     async with serving(unreachable="tcp://robot.test:11001: Connection refused") as rig:
         assert rig.last("status")["state"] == "offline"
@@ -402,7 +382,6 @@ async def test_an_unreachable_robot_shows_as_offline_with_the_reason_and_is_trie
         assert rig.last("status")["state"] == "established"
 
 
-@jumping
 async def test_attempts_to_reach_a_robot_come_ever_more_rarely() -> None:
     async with serving(unreachable="no route") as rig:
         await asyncio.sleep(60.0)
@@ -410,7 +389,6 @@ async def test_attempts_to_reach_a_robot_come_ever_more_rarely() -> None:
         assert 7 <= len(attempts) <= 14
 
 
-@jumping
 async def test_a_robot_without_a_common_version_is_told_so_and_left() -> None:
     async with serving() as rig:
         rig.sends(
@@ -426,33 +404,27 @@ async def test_a_robot_without_a_common_version_is_told_so_and_left() -> None:
         assert rig.link.closed
 
 
-@jumping
-async def test_a_broken_stream_ends_the_session_and_says_why() -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex("00000000 01 37"))
-        await rig.settle()
-        assert rig.last("status")["state"] == "offline"
-        assert "broken stream" in rig.last("status")["reason"]
-        assert rig.links[0].closed
+async def test_a_broken_stream_ends_the_session_and_says_why(rig: Rig) -> None:
+    rig.sends(bytes.fromhex("00000000 01 37"))
+    await rig.settle()
+    assert rig.last("status")["state"] == "offline"
+    assert "broken stream" in rig.last("status")["reason"]
+    assert rig.links[0].closed
 
 
-@jumping
-async def test_a_malformed_packet_costs_nothing_but_itself() -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex("03000000 01 37 00") + POSITION)
-        assert rig.last("status")["state"] == "established"
-        assert len(rig.values("pose")) == 1
-        assert rig.conversations[0].session.traffic.malformed == 1
+async def test_a_malformed_packet_costs_nothing_but_itself(rig: Rig) -> None:
+    rig.sends(bytes.fromhex("03000000 01 37 00") + POSITION)
+    assert rig.last("status")["state"] == "established"
+    assert len(rig.values("pose")) == 1
+    assert rig.conversations[0].session.traffic.malformed == 1
 
 
-@jumping
-async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_one() -> None:
-    async with established() as rig:
-        (shown,) = rig.manager.snapshots()
-        assert (shown.name, shown.peer, shown.state) == ("robot", "tcp://robot.test:11001", "established")
-        rig.goes()
-        await rig.settle()
-        assert [shown.reason for shown in rig.manager.snapshots()] == ["closed by peer"]
+async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_one(rig: Rig) -> None:
+    (shown,) = rig.manager.snapshots()
+    assert (shown.name, shown.peer, shown.state) == ("robot", "tcp://robot.test:11001", "established")
+    rig.goes()
+    await rig.settle()
+    assert [shown.reason for shown in rig.manager.snapshots()] == ["closed by peer"]
 
 
 # Telemetry: bytes of the protocol page, fields of the fleet messages
@@ -472,108 +444,86 @@ async def test_the_session_table_shows_the_live_session_and_remembers_the_lost_o
         ("02000000 01 3c", "text", {"text": "simulated lidar data", "kind": "request", "sender": None}),
     ],
 )
-@jumping
-async def test_a_packet_is_published_on_its_key(packet: str | bytes, path: str, fields: dict[str, Any]) -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex(packet) if isinstance(packet, str) else packet)
-        assert rig.last(path) == {**fields, "stamp_ns": 1234}
+async def test_a_packet_is_published_on_its_key(rig: Rig, packet, path, fields) -> None:
+    rig.sends(bytes.fromhex(packet) if isinstance(packet, str) else packet)
+    assert rig.last(path) == {**fields, "stamp_ns": 1234}
 
 
-@jumping
-async def test_a_position_is_published_in_metres_and_radians() -> None:
-    async with established() as rig:
-        rig.sends(POSITION)  # 150 cm, -50 cm, 90 degrees
-        pose = rig.last("pose")
-        assert pose["x"] == pytest.approx(1.5)
-        assert pose["y"] == pytest.approx(-0.5)
-        assert pose["heading"] == pytest.approx(math.pi)
-        assert pose["stamp_ns"] == 1234
+async def test_a_position_is_published_in_metres_and_radians(rig: Rig) -> None:
+    rig.sends(POSITION)  # 150 cm, -50 cm, 90 degrees
+    pose = rig.last("pose")
+    assert pose["x"] == pytest.approx(1.5)
+    assert pose["y"] == pytest.approx(-0.5)
+    assert pose["heading"] == pytest.approx(math.pi)
+    assert pose["stamp_ns"] == 1234
 
 
-@jumping
-async def test_a_map_is_published_with_rows_of_y() -> None:
-    async with established() as rig:
-        rig.sends(MAP)  # x 0: 0 1 2, x 1: 2 2 0, x 2: 1 0 1
-        shown = rig.last("map")
-        assert (shown["rows"], shown["columns"]) == (3, 3)
-        assert shown["cells"] == bytes([0, 2, 1, 1, 2, 0, 2, 0, 1])
-        assert shown["cell"] == pytest.approx(0.1)
-        assert shown["origin"] == pytest.approx([-0.15, -0.15])
+async def test_a_map_is_published_with_rows_of_y(rig: Rig) -> None:
+    rig.sends(MAP)  # x 0: 0 1 2, x 1: 2 2 0, x 2: 1 0 1
+    shown = rig.last("map")
+    assert (shown["rows"], shown["columns"]) == (3, 3)
+    assert shown["cells"] == bytes([0, 2, 1, 1, 2, 0, 2, 0, 1])
+    assert shown["cell"] == pytest.approx(0.1)
+    assert shown["origin"] == pytest.approx([-0.15, -0.15])
 
 
 @pytest.mark.parametrize("packet", ["06000000 01 35 00000000", "02000000 01 35"])
-@jumping
-async def test_a_robot_that_has_no_map_yet_shows_an_empty_one(packet: str) -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex(packet) + POSITION)
-        assert rig.last("status")["state"] == "established"
-        shown = rig.last("map")
-        assert (shown["rows"], shown["columns"], shown["cells"]) == (0, 0, b"")
-        assert len(rig.values("pose")) == 1
+async def test_a_robot_that_has_no_map_yet_shows_an_empty_one(rig: Rig, packet: str) -> None:
+    rig.sends(bytes.fromhex(packet) + POSITION)
+    assert rig.last("status")["state"] == "established"
+    shown = rig.last("map")
+    assert (shown["rows"], shown["columns"], shown["cells"]) == (0, 0, b"")
+    assert len(rig.values("pose")) == 1
 
 
-@jumping
-async def test_a_position_that_comes_as_packet_53_is_a_pose() -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex("0e000000 01 35 00001643 000048c2 0000b442"))
-        assert (rig.last("pose")["x"], rig.last("pose")["y"]) == pytest.approx((1.5, -0.5))
+async def test_a_position_that_comes_as_packet_53_is_a_pose(rig: Rig) -> None:
+    rig.sends(bytes.fromhex("0e000000 01 35 00001643 000048c2 0000b442"))
+    assert (rig.last("pose")["x"], rig.last("pose")["y"]) == pytest.approx((1.5, -0.5))
 
 
-@jumping
-async def test_what_came_before_a_broken_packet_is_published_before_the_robot_is_offline() -> None:
-    async with established() as rig:
-        seen: list[str] = []
-        rig.hq.subscribe("fleet/r1/pose", lambda sample: seen.append("pose"))
-        rig.hq.subscribe("fleet/r1/status", lambda sample: seen.append(msgpack.unpackb(sample.payload)["state"]))
-        rig.sends(POSITION + bytes(6))
-        await rig.settle()
-        assert seen == ["pose", "offline"]
+async def test_what_came_before_a_broken_packet_is_published_before_the_robot_is_offline(rig: Rig) -> None:
+    seen: list[str] = []
+    rig.hq.subscribe("fleet/r1/pose", lambda sample: seen.append("pose"))
+    rig.hq.subscribe("fleet/r1/status", lambda sample: seen.append(msgpack.unpackb(sample.payload)["state"]))
+    rig.sends(POSITION + bytes(6))
+    await rig.settle()
+    assert seen == ["pose", "offline"]
 
 
-@jumping
-async def test_a_latecomer_gets_the_last_map_and_status() -> None:
-    async with established() as rig:
-        rig.sends(MAP)
-        seen: list[str] = []
-        rig.bus.join("3").subscribe("fleet/r1/*", lambda sample: seen.append(sample.key), history=True)
-        assert sorted(seen) == ["fleet/r1/control", "fleet/r1/map", "fleet/r1/status"]
+async def test_a_latecomer_gets_the_last_map_and_status(rig: Rig) -> None:
+    rig.sends(MAP)
+    seen: list[str] = []
+    rig.bus.join("3").subscribe("fleet/r1/*", lambda sample: seen.append(sample.key), history=True)
+    assert sorted(seen) == ["fleet/r1/control", "fleet/r1/map", "fleet/r1/status"]
 
 
-@jumping
-async def test_stream_messages_of_one_read_are_all_published_in_order_and_counted() -> None:
-    async with established() as rig:
-        before = rig.metrics.total("published")
-        rig.sends(POSITION + BYE + POSITION)
-        assert len(rig.values("pose")) == 2
-        assert len(rig.values("text")) == 1
-        assert rig.metrics.total("published") == before + 3
+async def test_stream_messages_of_one_read_are_all_published_in_order_and_counted(rig: Rig) -> None:
+    before = rig.metrics.total("published")
+    rig.sends(POSITION + BYE + POSITION)
+    assert len(rig.values("pose")) == 2
+    assert len(rig.values("text")) == 1
+    assert rig.metrics.total("published") == before + 3
 
 
 @pytest.mark.parametrize("packet", [bytes.fromhex("06000000 01 33 01000000"), MAP, BYE, POSITION])
-@jumping
-async def test_states_and_maps_count_as_published_like_everything_else(packet: bytes) -> None:
-    async with established() as rig:
-        before = rig.metrics.total("published")
-        rig.sends(packet)
-        assert rig.metrics.total("published") == before + 1
+async def test_states_and_maps_count_as_published_like_everything_else(rig: Rig, packet: bytes) -> None:
+    before = rig.metrics.total("published")
+    rig.sends(packet)
+    assert rig.metrics.total("published") == before + 1
 
 
-@jumping
-async def test_a_malformed_packet_is_counted() -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex("03000000 01 37 00") * 3 + POSITION)
-        assert rig.metrics.total("malformed") == 3
+async def test_a_malformed_packet_is_counted(rig: Rig) -> None:
+    rig.sends(bytes.fromhex("03000000 01 37 00") * 3 + POSITION)
+    assert rig.metrics.total("malformed") == 3
 
 
-@jumping
-async def test_a_packet_without_meaning_is_counted_and_not_published() -> None:
-    async with established() as rig:
-        rig.sends(bytes.fromhex("0b000000 01 35 05000000 0000000000") + bytes.fromhex("06000000 01 33 07000000"))
-        assert rig.values("map") == []
-        assert rig.values("lidar") == []
-        assert rig.metrics.total("untranslatable") == 2
-        rig.sends(POSITION)
-        assert len(rig.values("pose")) == 1
+async def test_a_packet_without_meaning_is_counted_and_not_published(rig: Rig) -> None:
+    rig.sends(bytes.fromhex("0b000000 01 35 05000000 0000000000") + bytes.fromhex("06000000 01 33 07000000"))
+    assert rig.values("map") == []
+    assert rig.values("lidar") == []
+    assert rig.metrics.total("untranslatable") == 2
+    rig.sends(POSITION)
+    assert len(rig.values("pose")) == 1
 
 
 # Commands
@@ -597,98 +547,82 @@ async def test_a_packet_without_meaning_is_counted_and_not_published() -> None:
         ("raw/tcpudp", {"id": 21, "body": b"\x01"}, "03000000 02 15 01"),
     ],
 )
-@jumping
-async def test_a_command_becomes_its_packet(name: str, fields: dict[str, Any], packet: str | bytes) -> None:
-    async with established() as rig:
-        rig.command(name, fields)
-        assert rig.written() == [bytes.fromhex(packet) if isinstance(packet, str) else packet]
-        assert rig.metrics.total("commands") == 1
-        assert rig.metrics.total("refused") == 0
+async def test_a_command_becomes_its_packet(rig: Rig, name: str, fields: dict[str, Any], packet: str | bytes) -> None:
+    rig.command(name, fields)
+    assert rig.written() == [bytes.fromhex(packet) if isinstance(packet, str) else packet]
+    assert rig.metrics.total("commands") == 1
+    assert rig.metrics.total("refused") == 0
 
 
-@jumping
-async def test_a_drive_is_repeated_while_the_robot_moves() -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(1.1)
-        assert rig.written() == [MOVE_LEFT] * 5
+async def test_a_drive_is_repeated_while_the_robot_moves(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(1.1)
+    assert rig.written() == [MOVE_LEFT] * 5
 
 
-@jumping
-async def test_a_newer_drive_replaces_the_one_that_waits_for_the_gap() -> None:
-    async with established() as rig:
+async def test_a_newer_drive_replaces_the_one_that_waits_for_the_gap(rig: Rig) -> None:
+    rig.command("text", {"text": "hi"})
+    rig.command("drive", DRIVE_LEFT)
+    rig.command("drive", {"turn": 0.5})
+    await asyncio.sleep(0.05)
+    assert rig.written()[1:] == [TURN_LEFT]
+
+
+@pytest.mark.scene(Options(gap_s=0.02))
+async def test_the_gap_is_kept_between_any_two_packets(rig: Rig) -> None:
+    for _ in range(20):
         rig.command("text", {"text": "hi"})
-        rig.command("drive", DRIVE_LEFT)
-        rig.command("drive", {"turn": 0.5})
-        await asyncio.sleep(0.05)
-        assert rig.written()[1:] == [TURN_LEFT]
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.command("stop")
+    await asyncio.sleep(2.0)
+    times = rig.link.times
+    assert len(times) > 30
+    assert min(later - earlier for earlier, later in itertools.pairwise(times)) >= 0.02 - 1e-9
 
 
-@jumping
-async def test_the_gap_is_kept_between_any_two_packets() -> None:
-    async with established(Options(gap_s=0.02)) as rig:
-        for _ in range(20):
-            rig.command("text", {"text": "hi"})
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.command("stop")
-        await asyncio.sleep(2.0)
-        times = rig.link.times
-        assert len(times) > 30
-        assert min(later - earlier for earlier, later in itertools.pairwise(times)) >= 0.02 - 1e-9
-
-
-@jumping
-async def test_a_stop_goes_before_everything_that_waits() -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
-        for _ in range(30):
-            rig.command("text", {"text": "hi"})
-        rig.forget_written()
-        rig.command("stop")
-        await asyncio.sleep(0.0101)
-        assert rig.written() == [STOP]
+async def test_a_stop_goes_before_everything_that_waits(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    for _ in range(30):
+        rig.command("text", {"text": "hi"})
+    rig.forget_written()
+    rig.command("stop")
+    await asyncio.sleep(0.0101)
+    assert rig.written() == [STOP]
 
 
 @pytest.mark.parametrize("payload", [b"", b"stop", b"\x01", b"\xc1", b"\x90", msgpack.packb({"stamp_ns": "now"})])
-@jumping
-async def test_a_stop_stops_the_robot_whatever_its_payload(payload: bytes) -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.command("stop", payload)
-        assert rig.written() == [STOP]
-        assert rig.last("control")["state"] == "stopped"
-        assert rig.metrics.total("refused") == 0
+async def test_a_stop_stops_the_robot_whatever_its_payload(rig: Rig, payload: bytes) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.command("stop", payload)
+    assert rig.written() == [STOP]
+    assert rig.last("control")["state"] == "stopped"
+    assert rig.metrics.total("refused") == 0
 
 
-@jumping
-async def test_a_stop_leaves_before_neutral_and_motion_of_the_next_holder_that_follow_at_once() -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
-        rig.forget_written()
-        rig.command("stop")
-        rig.hold()
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", {"turn": 0.5})
-        await asyncio.sleep(0.05)
-        assert rig.written() == [STOP, TURN_LEFT]
+async def test_a_stop_leaves_before_neutral_and_motion_of_the_next_holder_that_follow_at_once(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    rig.forget_written()
+    rig.command("stop")
+    rig.hold()
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", {"turn": 0.5})
+    await asyncio.sleep(0.05)
+    assert rig.written() == [STOP, TURN_LEFT]
 
 
-@jumping
-async def test_a_stop_goes_to_a_robot_that_takes_nothing_as_soon_as_it_takes_something() -> None:
-    async with established() as rig:
-        rig.link.ready = False
-        for _ in range(80):
-            rig.command("lidar", {"on": True})
-        rig.command("stop")
-        rig.link.ready = True
-        rig.conversations[-1].writable()
-        assert rig.written() == [STOP]
+async def test_a_stop_goes_to_a_robot_that_takes_nothing_as_soon_as_it_takes_something(rig: Rig) -> None:
+    rig.link.ready = False
+    for _ in range(80):
+        rig.command("lidar", {"on": True})
+    rig.command("stop")
+    rig.link.ready = True
+    rig.conversations[-1].writable()
+    assert rig.written() == [STOP]
 
 
-@jumping
 async def test_a_stop_for_a_robot_that_cannot_be_stopped_is_refused_and_motion_is_stopped_all_the_same() -> None:
     async with serving() as rig:
         await rig.establish(PLAIN_SETTINGS)
@@ -699,168 +633,150 @@ async def test_a_stop_for_a_robot_that_cannot_be_stopped_is_refused_and_motion_i
         assert rig.written() == []
 
 
-@jumping
-async def test_a_stop_is_repeated_for_a_second_and_then_nothing_more_is_sent() -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
+async def test_a_stop_is_repeated_for_a_second_and_then_nothing_more_is_sent(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    start = rig.loop.time()
+    rig.command("stop")
+    await asyncio.sleep(5.0)
+    stops = rig.written()
+    assert set(stops) == {STOP}
+    assert 10 <= len(stops) <= 11
+    times = rig.link.times[-len(stops) :]
+    assert times[0] == start
+    assert STOP_REPEAT_S - 0.11 <= times[-1] - start <= STOP_REPEAT_S + 1e-6
+
+
+async def test_a_stop_shows_on_control_at_once(rig: Rig) -> None:
+    rig.command("stop")
+    assert rig.last("control")["state"] == "stopped"
+
+
+async def test_nobody_drives_after_a_stop_before_acquiring_anew(rig: Rig) -> None:
+    rig.command("stop")
+    await asyncio.sleep(2.0)
+    rig.forget_written()
+    for fields in (DRIVE_LEFT, NEUTRAL, DRIVE_LEFT):
+        rig.command("drive", fields)
         await asyncio.sleep(0.1)
-        rig.forget_written()
-        start = rig.loop.time()
-        rig.command("stop")
-        await asyncio.sleep(5.0)
-        stops = rig.written()
-        assert set(stops) == {STOP}
-        assert 10 <= len(stops) <= 11
-        times = rig.link.times[-len(stops) :]
-        assert times[0] == start
-        assert STOP_REPEAT_S - 0.11 <= times[-1] - start <= STOP_REPEAT_S + 1e-6
+    assert rig.written() == []
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (stop)", 3)]
+    assert rig.driver.renew() == {**DENIED, "reason": "the lease has ended (stop)", "code": "lease_ended"}
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT], "whoever acquires needs no neutral"
 
 
-@jumping
-async def test_a_stop_shows_on_control_at_once() -> None:
-    async with established() as rig:
-        rig.command("stop")
-        assert rig.last("control")["state"] == "stopped"
-
-
-@jumping
-async def test_nobody_drives_after_a_stop_before_acquiring_anew() -> None:
-    async with established() as rig:
-        rig.command("stop")
-        await asyncio.sleep(2.0)
-        rig.forget_written()
-        for fields in (DRIVE_LEFT, NEUTRAL, DRIVE_LEFT):
-            rig.command("drive", fields)
-            await asyncio.sleep(0.1)
-        assert rig.written() == []
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (stop)", 3)]
-        assert rig.driver.renew() == {**DENIED, "reason": "the lease has ended (stop)", "code": "lease_ended"}
-        rig.hold()
+async def test_a_refused_drive_does_not_end_the_stop_that_is_repeated(rig: Rig) -> None:
+    rig.command("stop")
+    for _ in range(10):
         rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT], "whoever acquires needs no neutral"
+        await asyncio.sleep(0.05)
+    assert set(rig.written()) == {STOP}
 
 
-@jumping
-async def test_a_refused_drive_does_not_end_the_stop_that_is_repeated() -> None:
-    async with established() as rig:
-        rig.command("stop")
-        for _ in range(10):
-            rig.command("drive", DRIVE_LEFT)
-            await asyncio.sleep(0.05)
-        assert set(rig.written()) == {STOP}
+@pytest.mark.scene(deadman_s=0.6)
+async def test_silence_while_moving_stops_the_robot_after_the_deadman_time(rig: Rig) -> None:
+    start = rig.loop.time()
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.59)
+    assert set(rig.written()) == {MOVE_LEFT}
+    await asyncio.sleep(3.0)
+    stops = rig.written()
+    assert set(stops) == {STOP}
+    assert 10 <= len(stops) <= 11
+    assert rig.link.times[-len(stops)] == pytest.approx(start + 0.6)
+    assert rig.link.times[-1] - rig.link.times[-len(stops)] >= STOP_REPEAT_S - 0.11
+    assert rig.control["holder"] == "driver", "the lease stays until it expires"
 
 
-@jumping
-async def test_silence_while_moving_stops_the_robot_after_the_deadman_time() -> None:
-    async with established(deadman_s=0.6) as rig:
-        start = rig.loop.time()
+@pytest.mark.scene(deadman_s=0.5)
+async def test_fresh_commands_keep_the_robot_moving(rig: Rig) -> None:
+    for _ in range(20):
         rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.59)
-        assert set(rig.written()) == {MOVE_LEFT}
-        await asyncio.sleep(3.0)
-        stops = rig.written()
-        assert set(stops) == {STOP}
-        assert 10 <= len(stops) <= 11
-        assert rig.link.times[-len(stops)] == pytest.approx(start + 0.6)
-        assert rig.link.times[-1] - rig.link.times[-len(stops)] >= STOP_REPEAT_S - 0.11
-        assert rig.control["holder"] == "driver", "the lease stays until it expires"
+        await asyncio.sleep(0.4)
+    assert set(rig.written()) == {MOVE_LEFT}
 
 
-@jumping
-async def test_fresh_commands_keep_the_robot_moving() -> None:
-    async with established(deadman_s=0.5) as rig:
-        for _ in range(20):
-            rig.command("drive", DRIVE_LEFT)
-            await asyncio.sleep(0.4)
-        assert set(rig.written()) == {MOVE_LEFT}
-
-
-@jumping
-async def test_nothing_but_the_holders_fresh_commands_keeps_the_robot_moving() -> None:
-    async with established(deadman_s=0.6) as rig:
-        other = Program(rig, "other")
-        seen = rig.driver.attachment("drive", DRIVE_LEFT)
+@pytest.mark.scene(deadman_s=0.6)
+async def test_nothing_but_the_holders_fresh_commands_keeps_the_robot_moving(rig: Rig) -> None:
+    other = Program(rig, "other")
+    seen = rig.driver.attachment("drive", DRIVE_LEFT)
+    rig.driver.put("drive", DRIVE_LEFT, seen)
+    for _ in range(4):
+        await asyncio.sleep(0.145)
+        rig.command("text", {"text": "hi"})
+        rig.command("dance")
         rig.driver.put("drive", DRIVE_LEFT, seen)
-        for _ in range(4):
-            await asyncio.sleep(0.145)
-            rig.command("text", {"text": "hi"})
-            rig.command("dance")
-            rig.driver.put("drive", DRIVE_LEFT, seen)
-            rig.driver.put("drive", DRIVE_LEFT, None)
-            rig.driver.renew()
-            rig.ask("pose")
-            other.command("drive", DRIVE_LEFT)
-            other.acquire()
-        assert STOP not in rig.written()
-        await asyncio.sleep(0.03)
-        assert STOP in rig.written()
+        rig.driver.put("drive", DRIVE_LEFT, None)
+        rig.driver.renew()
+        rig.ask("pose")
+        other.command("drive", DRIVE_LEFT)
+        other.acquire()
+    assert STOP not in rig.written()
+    await asyncio.sleep(0.03)
+    assert STOP in rig.written()
 
 
-@jumping
-async def test_a_standing_robot_is_not_stopped_by_the_deadman() -> None:
-    async with established(deadman_s=0.5) as rig:
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(5.0)
-        assert rig.control["state"] == "held"
-        assert rig.counted("stopped") == 0
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written()[-1] == MOVE_LEFT
+@pytest.mark.scene(deadman_s=0.5)
+async def test_a_standing_robot_is_not_stopped_by_the_deadman(rig: Rig) -> None:
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(5.0)
+    assert rig.control["state"] == "held"
+    assert rig.counted("stopped") == 0
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written()[-1] == MOVE_LEFT
 
 
-@jumping
-async def test_motion_after_the_deadman_needs_neutral() -> None:
-    async with established(deadman_s=0.2) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(3.0)
-        rig.forget_written()
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == []
-        ((_, reason, _),) = await rig.refusals()
-        assert "deadman" in reason
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(0.1)
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written()[-1] == MOVE_LEFT
+@pytest.mark.scene(deadman_s=0.2)
+async def test_motion_after_the_deadman_needs_neutral(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(3.0)
+    rig.forget_written()
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == []
+    ((_, reason, _),) = await rig.refusals()
+    assert "deadman" in reason
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(0.1)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written()[-1] == MOVE_LEFT
 
 
-@jumping
-async def test_the_loss_of_the_bus_stops_a_moving_robot_and_ends_the_lease() -> None:
-    async with established() as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.bus.connection(False)
-        assert rig.written() == [STOP]
-        await asyncio.sleep(2.0)
-        assert len(rig.written()) >= 9
-        rig.bus.connection(True)
-        for fields in (NEUTRAL, DRIVE_LEFT):
-            rig.command("drive", fields)
-        assert rig.written() == []
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (bus lost)", 2)]
-        rig.hold()
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+async def test_the_loss_of_the_bus_stops_a_moving_robot_and_ends_the_lease(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.bus.connection(False)
+    assert rig.written() == [STOP]
+    await asyncio.sleep(2.0)
+    assert len(rig.written()) >= 9
+    rig.bus.connection(True)
+    for fields in (NEUTRAL, DRIVE_LEFT):
+        rig.command("drive", fields)
+    assert rig.written() == []
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (bus lost)", 2)]
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
-@jumping
-async def test_the_loss_of_the_bus_ends_the_lease_of_a_standing_robot_and_sends_it_nothing() -> None:
-    async with established() as rig:
-        rig.bus.connection(False)
-        await asyncio.sleep(1.0)
-        assert rig.written() == []
-        assert (rig.control["state"], rig.control["holder"]) == ("stopped", None)
-        rig.bus.connection(True)
-        assert rig.driver.renew()["reason"] == "the lease has ended (bus lost)"
+async def test_the_loss_of_the_bus_ends_the_lease_of_a_standing_robot_and_sends_it_nothing(rig: Rig) -> None:
+    rig.bus.connection(False)
+    await asyncio.sleep(1.0)
+    assert rig.written() == []
+    assert (rig.control["state"], rig.control["holder"]) == ("stopped", None)
+    rig.bus.connection(True)
+    assert rig.driver.renew()["reason"] == "the lease has ended (bus lost)"
 
 
-@jumping
-async def test_the_loss_of_the_bus_is_nothing_to_a_robot_nobody_holds() -> None:
-    async with established(hold=False) as rig:
-        rig.bus.connection(False)
-        await asyncio.sleep(1.0)
-        assert rig.control["state"] == "free"
-        assert rig.audit_lines == []
+@pytest.mark.scene(hold=False)
+async def test_the_loss_of_the_bus_is_nothing_to_a_robot_nobody_holds(rig: Rig) -> None:
+    rig.bus.connection(False)
+    await asyncio.sleep(1.0)
+    assert rig.control["state"] == "free"
+    assert rig.audit_lines == []
 
 
 # The lease
@@ -875,86 +791,74 @@ OF_THE_HOLDER = [
 ]
 
 
-@jumping
-async def test_whoever_acquires_a_free_robot_is_given_its_lease_and_shown_as_the_holder() -> None:
-    async with established(hold=False, lease_s=3.0) as rig:
-        free = {"state": "free", "holder": None, "lease": None, "priority": None, "expires_in_s": None}
-        assert rig.control == free
-        granted = {"ok": True, "lease": bytes([1]) * 8, "token": bytes([1]) * 32, "expires_in_s": 3.0}
-        assert rig.hold(priority=4) == {**granted, "holder": "driver", "reason": None, "code": None}
-        held = {"state": "held", "holder": "driver", "lease": bytes([1]) * 8, "priority": 4, "expires_in_s": 3.0}
-        assert rig.control == held
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
-        assert (rig.counted("acquired"), rig.metrics.total("refused")) == (1, 0)
+@pytest.mark.scene(hold=False, lease_s=3.0)
+async def test_whoever_acquires_a_free_robot_is_given_its_lease_and_shown_as_the_holder(rig: Rig) -> None:
+    free = {"state": "free", "holder": None, "lease": None, "priority": None, "expires_in_s": None}
+    assert rig.control == free
+    granted = {"ok": True, "lease": bytes([1]) * 8, "token": bytes([1]) * 32, "expires_in_s": 3.0}
+    assert rig.hold(priority=4) == {**granted, "holder": "driver", "reason": None, "code": None}
+    held = {"state": "held", "holder": "driver", "lease": bytes([1]) * 8, "priority": 4, "expires_in_s": 3.0}
+    assert rig.control == held
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
+    assert (rig.counted("acquired"), rig.metrics.total("refused")) == (1, 0)
 
 
-@jumping
-async def test_control_counts_the_time_that_is_left_down_and_never_shows_the_token() -> None:
-    async with established(lease_s=5.0) as rig:
-        rig.hold("takeover")
-        assert rig.driver.held is not None
-        start = rig.loop.time()
-        await asyncio.sleep(3 * HEARTBEAT_S)
-        left = rig.control["expires_in_s"]
-        assert 5.0 - 3 * HEARTBEAT_S <= left < 5.0 - 2 * HEARTBEAT_S + 1e-6
-        assert rig.loop.time() == pytest.approx(start + 3.0)
-        token = rig.driver.held.token
-        rig.command("drive", DRIVE_LEFT)
-        rig.command("stop")
-        assert not any(token in payload for payload in rig.bus.values("fleet/r1/*"))
-        assert not any(token in (sample.attachment or b"") for sample in rig.bus._shared.history)
-        assert len(rig.bus.values("fleet/*/@cmd/**")) == 2, "commands were looked at as well"
-
-
-@pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
-@jumping
-async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(
-    name: str, fields: dict[str, Any]
-) -> None:
-    async with established(hold=False) as rig:
-        rig.command(name, fields)
-        assert rig.written() == []
-        assert rig.metrics.total("refused") == 1
-        assert await rig.refused() == [(None, name, "no lease: acquire first", 1)]
-        assert rig.counted("stopped") == 0
+@pytest.mark.scene(lease_s=5.0)
+async def test_control_counts_the_time_that_is_left_down_and_never_shows_the_token(rig: Rig) -> None:
+    rig.hold("takeover")
+    assert rig.driver.held is not None
+    start = rig.loop.time()
+    await asyncio.sleep(3 * HEARTBEAT_S)
+    left = rig.control["expires_in_s"]
+    assert 5.0 - 3 * HEARTBEAT_S <= left < 5.0 - 2 * HEARTBEAT_S + 1e-6
+    assert rig.loop.time() == pytest.approx(start + 3.0)
+    token = rig.driver.held.token
+    rig.command("drive", DRIVE_LEFT)
+    rig.command("stop")
+    assert not any(token in payload for payload in rig.bus.values("fleet/r1/*"))
+    assert not any(token in (sample.attachment or b"") for sample in rig.bus._shared.history)
+    assert len(rig.bus.values("fleet/*/@cmd/**")) == 2, "commands were looked at as well"
 
 
 @pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
-@jumping
-async def test_of_two_programs_only_the_holders_commands_are_carried_out(name: str, fields: dict[str, Any]) -> None:
-    async with established() as rig:
-        other = Program(rig, "other")
-        assert other.acquire("takeover")["ok"]
-        assert rig.hold("takeover")["ok"]
-        rig.command("drive", {"turn": 0.5})
-        await asyncio.sleep(0.05)
-        assert rig.written() == [TURN_LEFT]
-        for _ in range(3):
-            other.command(name, fields)
-        assert rig.written() == []
-        assert await rig.refused() == [("other", name, "the lease has ended (taken over by driver)", 3)]
-        assert rig.metrics.total("refused") == 3
-        assert rig.control["holder"] == "driver"
-        rig.command("drive", {"turn": 0.5})
-        assert rig.written() == [TURN_LEFT], "the holder drives on"
+@pytest.mark.scene(hold=False)
+async def test_without_the_lease_nothing_that_may_move_the_robot_is_carried_out(rig: Rig, name, fields) -> None:
+    rig.command(name, fields)
+    assert rig.written() == []
+    assert rig.metrics.total("refused") == 1
+    assert await rig.refused() == [(None, name, "no lease: acquire first", 1)]
+    assert rig.counted("stopped") == 0
 
 
-@jumping
-async def test_a_guessed_lease_is_nobodys_and_a_guessed_token_of_the_right_one_neither() -> None:
-    async with established() as rig:
-        forger = Program(rig, "forger")
-        for held in (STRANGE, Holder(bytes([1]) * 8, bytes(32)), Holder(bytes([1]) * 8, bytes([1]) * 31)):
-            held.seq = 1_000
-            forger.put("drive", DRIVE_LEFT, held.attachment("drive", packed(DRIVE_LEFT)))
-        assert rig.written() == []
-        assert await rig.refused() == [
-            (None, "drive", "held by driver (priority 0)", 1),
-            (None, "drive", "wrong proof", 2),
-        ]
-        assert [entry["code"] for entry in rig.last("control")["refusals"]] == ["held", "malformed"]
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT], "their numbers are not the holder's"
+@pytest.mark.parametrize(("name", "fields"), OF_THE_HOLDER)
+async def test_of_two_programs_only_the_holders_commands_are_carried_out(rig: Rig, name, fields) -> None:
+    other = Program(rig, "other")
+    assert other.acquire("takeover")["ok"]
+    assert rig.hold("takeover")["ok"]
+    rig.command("drive", {"turn": 0.5})
+    await asyncio.sleep(0.05)
+    assert rig.written() == [TURN_LEFT]
+    for _ in range(3):
+        other.command(name, fields)
+    assert rig.written() == []
+    assert await rig.refused() == [("other", name, "the lease has ended (taken over by driver)", 3)]
+    assert rig.metrics.total("refused") == 3
+    assert rig.control["holder"] == "driver"
+    rig.command("drive", {"turn": 0.5})
+    assert rig.written() == [TURN_LEFT], "the holder drives on"
+
+
+async def test_a_guessed_lease_is_nobodys_and_a_guessed_token_of_the_right_one_neither(rig: Rig) -> None:
+    forger = Program(rig, "forger")
+    for held in (STRANGE, Holder(bytes([1]) * 8, bytes(32)), Holder(bytes([1]) * 8, bytes([1]) * 31)):
+        held.seq = 1_000
+        forger.put("drive", DRIVE_LEFT, held.attachment("drive", packed(DRIVE_LEFT)))
+    assert rig.written() == []
+    assert await rig.refused() == [(None, "drive", "held by driver (priority 0)", 1), (None, "drive", "wrong proof", 2)]
+    assert [entry["code"] for entry in rig.last("control")["refusals"]] == ["held", "malformed"]
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT], "their numbers are not the holder's"
 
 
 @pytest.mark.parametrize(
@@ -971,39 +875,33 @@ async def test_a_guessed_lease_is_nobodys_and_a_guessed_token_of_the_right_one_n
         packed({"token": bytes([1]) * 32, "seq": 1}),
     ],
 )
-@jumping
-async def test_a_malformed_attachment_is_refused(attachment: bytes) -> None:
-    async with established() as rig:
-        rig.driver.put("drive", DRIVE_LEFT, attachment)
-        assert rig.written() == []
-        assert await rig.refused() == [(None, "drive", "malformed authorization: expected {lease, seq, proof}", 1)]
+async def test_a_malformed_attachment_is_refused(rig: Rig, attachment: bytes) -> None:
+    rig.driver.put("drive", DRIVE_LEFT, attachment)
+    assert rig.written() == []
+    assert await rig.refused() == [(None, "drive", "malformed authorization: expected {lease, seq, proof}", 1)]
 
 
-@jumping
-async def test_a_command_repeated_or_out_of_order_is_refused_and_may_be_anybodys() -> None:
-    async with established() as rig:
-        late, first = rig.driver.attachment("drive", DRIVE_LEFT), rig.driver.attachment("drive", {"turn": 0.5})
-        rig.driver.put("drive", {"turn": 0.5}, first)
-        for fields, attachment in (({"turn": 0.5}, first), (DRIVE_LEFT, late), ({"turn": 0.5}, first)):
-            rig.driver.put("drive", fields, attachment)
-        await asyncio.sleep(0.1)
-        assert rig.written() == [TURN_LEFT]
-        assert await rig.refused() == [(None, "drive", "repeated or out of order", 3)]
-        assert rig.last("control")["refusals"][0]["code"] == "out_of_order"
+async def test_a_command_repeated_or_out_of_order_is_refused_and_may_be_anybodys(rig: Rig) -> None:
+    late, first = rig.driver.attachment("drive", DRIVE_LEFT), rig.driver.attachment("drive", {"turn": 0.5})
+    rig.driver.put("drive", {"turn": 0.5}, first)
+    for fields, attachment in (({"turn": 0.5}, first), (DRIVE_LEFT, late), ({"turn": 0.5}, first)):
+        rig.driver.put("drive", fields, attachment)
+    await asyncio.sleep(0.1)
+    assert rig.written() == [TURN_LEFT]
+    assert await rig.refused() == [(None, "drive", "repeated or out of order", 3)]
+    assert rig.last("control")["refusals"][0]["code"] == "out_of_order"
 
 
-@jumping
-async def test_what_was_overheard_is_good_for_no_other_command_and_no_other_payload() -> None:
-    async with established() as rig:
-        seen = rig.driver.attachment("motor/left", {"value": 0.5})
-        for name, fields in (("motor/right", {"value": 0.5}), ("motor/left", {"value": 0.6}), ("mode", {"value": 0.5})):
-            rig.driver.put(name, fields, seen)
-        assert [(command, reason) for command, reason, _ in await rig.refusals()] == [
-            ("motor/right", "wrong proof"),
-            ("motor/left", "wrong proof"),
-            ("mode", "wrong proof"),
-        ]
-        assert rig.metrics.total("refused") == 3
+async def test_what_was_overheard_is_good_for_no_other_command_and_no_other_payload(rig: Rig) -> None:
+    seen = rig.driver.attachment("motor/left", {"value": 0.5})
+    for name, fields in (("motor/right", {"value": 0.5}), ("motor/left", {"value": 0.6}), ("mode", {"value": 0.5})):
+        rig.driver.put(name, fields, seen)
+    assert [(command, reason) for command, reason, _ in await rig.refusals()] == [
+        ("motor/right", "wrong proof"),
+        ("motor/left", "wrong proof"),
+        ("mode", "wrong proof"),
+    ]
+    assert rig.metrics.total("refused") == 3
 
 
 @pytest.mark.parametrize(
@@ -1018,80 +916,72 @@ async def test_what_was_overheard_is_good_for_no_other_command_and_no_other_payl
         "fleet/*/@cmd/light",
     ],
 )
-@jumping
-async def test_a_command_whose_key_has_wildcards_is_refused_whoever_proves_it(key: str) -> None:
-    async with established() as rig:
-        held = rig.driver.held
-        assert held is not None
-        payload = packed(DRIVE_LEFT)
-        attachment = shown(held.lease, held.token, key, 1, payload)
-        rig.hq.publisher(key, topics.CMD_DRIVE).put(payload, attachment)
-        assert MOVE_LEFT not in rig.written()
-        assert await rig.refused() == [(None, key.rpartition("@cmd/")[2], "its key has wildcards", 1)]
-        assert rig.last("control")["refusals"][0]["code"] == "malformed"
+async def test_a_command_whose_key_has_wildcards_is_refused_whoever_proves_it(rig: Rig, key: str) -> None:
+    held = rig.driver.held
+    assert held is not None
+    payload = packed(DRIVE_LEFT)
+    attachment = shown(held.lease, held.token, key, 1, payload)
+    rig.hq.publisher(key, topics.CMD_DRIVE).put(payload, attachment)
+    assert MOVE_LEFT not in rig.written()
+    assert await rig.refused() == [(None, key.rpartition("@cmd/")[2], "its key has wildcards", 1)]
+    assert rig.last("control")["refusals"][0]["code"] == "malformed"
 
 
 @pytest.mark.parametrize("key", ["fleet/*/@cmd/stop", "fleet/**/@cmd/stop", "*/*/@cmd/stop", "fleet/r$*/@cmd/stop"])
-@jumping
-async def test_a_stop_alone_may_have_wildcards(key: str) -> None:
-    async with established(deadman_s=60.0) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        for handler in handlers(rig, key):
-            handler(Sample(key, b""))
-        assert rig.written() == [STOP]
-        assert rig.control["state"] == "stopped"
-        assert await rig.refused() == []
+@pytest.mark.scene(deadman_s=60.0)
+async def test_a_stop_alone_may_have_wildcards(rig: Rig, key: str) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    for handler in handlers(rig, key):
+        handler(Sample(key, b""))
+    assert rig.written() == [STOP]
+    assert rig.control["state"] == "stopped"
+    assert await rig.refused() == []
 
 
-@jumping
-async def test_a_late_neutral_of_the_holder_does_not_end_its_motion() -> None:
-    async with established(deadman_s=60.0) as rig:
-        neutral = rig.driver.attachment("drive", NEUTRAL)
-        rig.command("drive", DRIVE_LEFT)
-        rig.driver.put("drive", NEUTRAL, neutral)
-        await asyncio.sleep(2.0)
-        assert set(rig.written()) == {MOVE_LEFT}
+@pytest.mark.scene(deadman_s=60.0)
+async def test_a_late_neutral_of_the_holder_does_not_end_its_motion(rig: Rig) -> None:
+    neutral = rig.driver.attachment("drive", NEUTRAL)
+    rig.command("drive", DRIVE_LEFT)
+    rig.driver.put("drive", NEUTRAL, neutral)
+    await asyncio.sleep(2.0)
+    assert set(rig.written()) == {MOVE_LEFT}
 
 
-@jumping
-async def test_the_numbers_of_a_new_lease_begin_anew() -> None:
-    async with established() as rig:
-        assert rig.driver.held is not None
-        rig.driver.held.seq = 1_000_000
-        rig.command("drive", NEUTRAL)
-        rig.hold("takeover")
-        rig.driver.held.seq = -1
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        assert rig.written() == [STOP, MOVE_LEFT]
-        assert rig.metrics.total("refused") == 0
+async def test_the_numbers_of_a_new_lease_begin_anew(rig: Rig) -> None:
+    assert rig.driver.held is not None
+    rig.driver.held.seq = 1_000_000
+    rig.command("drive", NEUTRAL)
+    rig.hold("takeover")
+    rig.driver.held.seq = -1
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    assert rig.written() == [STOP, MOVE_LEFT]
+    assert rig.metrics.total("refused") == 0
 
 
-@jumping
-async def test_neutral_of_anybody_else_has_no_effect() -> None:
-    async with established(deadman_s=60.0) as rig:
-        other = Program(rig, "other")
-        other.acquire("takeover")
-        rig.hold("takeover")
-        rig.command("drive", DRIVE_LEFT)
-        other.command("drive", NEUTRAL)
-        other.put("drive", NEUTRAL, None)
-        await asyncio.sleep(2.0)
-        assert set(rig.written()) == {MOVE_LEFT}
-        assert rig.control["holder"] == "driver"
+@pytest.mark.scene(deadman_s=60.0)
+async def test_neutral_of_anybody_else_has_no_effect(rig: Rig) -> None:
+    other = Program(rig, "other")
+    other.acquire("takeover")
+    rig.hold("takeover")
+    rig.command("drive", DRIVE_LEFT)
+    other.command("drive", NEUTRAL)
+    other.put("drive", NEUTRAL, None)
+    await asyncio.sleep(2.0)
+    assert set(rig.written()) == {MOVE_LEFT}
+    assert rig.control["holder"] == "driver"
 
 
-@jumping
-async def test_neutral_of_anybody_else_does_not_make_motion_possible() -> None:
-    async with established(deadman_s=0.2) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(3.0)
-        rig.forget_written()
-        Program(rig, "other").command("drive", NEUTRAL)
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == []
+@pytest.mark.scene(deadman_s=0.2)
+async def test_neutral_of_anybody_else_does_not_make_motion_possible(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(3.0)
+    rig.forget_written()
+    Program(rig, "other").command("drive", NEUTRAL)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == []
 
 
 @pytest.mark.parametrize(
@@ -1099,15 +989,11 @@ async def test_neutral_of_anybody_else_does_not_make_motion_possible() -> None:
     [
         ("text", {"text": "hi"}),
         ("lidar", {"on": True}),
-        (
-            "scan",
-            {"angle_min": 0.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": bytes(8)},
-        ),
+        ("scan", {"angle_min": 0.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": bytes(8)}),
         ("stop", {}),
     ],
 )
 @pytest.mark.parametrize("hold", [False, True])
-@jumping
 async def test_what_moves_nothing_needs_no_lease(name: str, fields: dict[str, Any], hold: bool) -> None:
     async with established(hold=hold) as rig:
         Program(rig, "other").command(name, fields)
@@ -1115,127 +1001,115 @@ async def test_what_moves_nothing_needs_no_lease(name: str, fields: dict[str, An
         assert rig.metrics.total("refused") == 0
 
 
-@jumping
-async def test_a_light_that_the_robot_has_not_is_refused_for_that_and_not_for_want_of_a_lease() -> None:
-    async with established(hold=False) as rig:
-        rig.command("light", {"on": True})
-        assert await rig.refusals() == [("light", "a TCP/UDP robot has no such command", 1)]
+@pytest.mark.scene(hold=False)
+async def test_a_light_that_the_robot_has_not_is_refused_for_that_and_not_for_want_of_a_lease(rig: Rig) -> None:
+    rig.command("light", {"on": True})
+    assert await rig.refusals() == [("light", "a TCP/UDP robot has no such command", 1)]
 
 
-@jumping
-async def test_a_robot_that_is_held_is_not_given_to_another_of_the_same_priority() -> None:
-    async with established(lease_s=3.0) as rig:
-        other = Program(rig, "other")
-        assert other.acquire() == {
-            **DENIED,
-            "expires_in_s": pytest.approx(3.0 - 1.15),
-            "holder": "driver",
-            "reason": "held by driver (priority 0)",
-            "code": "held",
-        }
-        assert await rig.refused() == [("other", "acquire", "held by driver (priority 0)", 1)]
-        assert rig.metrics.total("refused") == 1
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+@pytest.mark.scene(lease_s=3.0)
+async def test_a_robot_that_is_held_is_not_given_to_another_of_the_same_priority(rig: Rig) -> None:
+    other = Program(rig, "other")
+    assert other.acquire() == {
+        **DENIED,
+        "expires_in_s": pytest.approx(3.0 - 1.15),
+        "holder": "driver",
+        "reason": "held by driver (priority 0)",
+        "code": "held",
+    }
+    assert await rig.refused() == [("other", "acquire", "held by driver (priority 0)", 1)]
+    assert rig.metrics.total("refused") == 1
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
 @pytest.mark.parametrize(("how", "priority"), [("takeover", 0), ("takeover", -5), ("acquire", 1)])
-@jumping
+@pytest.mark.scene(deadman_s=60.0)
 async def test_the_stop_of_a_moving_robot_that_changes_hands_goes_before_the_new_holders_motion(
-    how: str, priority: int
+    rig: Rig, how: str, priority: int
 ) -> None:
-    async with established(deadman_s=60.0) as rig:
-        other = Program(rig, "other")
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        assert other.acquire(how, priority=priority)["ok"]
-        other.command("drive", {"turn": 0.5})
-        assert rig.written() == [STOP]
-        await asyncio.sleep(2.0)
-        assert set(rig.written()) == {TURN_LEFT}
-        rig.command("drive", DRIVE_LEFT)
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (taken over by other)", 1)]
-        assert (rig.control["holder"], rig.control["priority"]) == ("other", priority)
-        assert rig.counted("taken over" if how == "takeover" else "acquired") == (1 if how == "takeover" else 2)
+    other = Program(rig, "other")
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    assert other.acquire(how, priority=priority)["ok"]
+    other.command("drive", {"turn": 0.5})
+    assert rig.written() == [STOP]
+    await asyncio.sleep(2.0)
+    assert set(rig.written()) == {TURN_LEFT}
+    rig.command("drive", DRIVE_LEFT)
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (taken over by other)", 1)]
+    assert (rig.control["holder"], rig.control["priority"]) == ("other", priority)
+    assert rig.counted("taken over" if how == "takeover" else "acquired") == (1 if how == "takeover" else 2)
 
 
-@jumping
-async def test_a_standing_robot_that_changes_hands_is_sent_nothing() -> None:
-    async with established() as rig:
-        Program(rig, "other").acquire("takeover")
-        await asyncio.sleep(1.0)
-        assert rig.written() == []
+async def test_a_standing_robot_that_changes_hands_is_sent_nothing(rig: Rig) -> None:
+    Program(rig, "other").acquire("takeover")
+    await asyncio.sleep(1.0)
+    assert rig.written() == []
 
 
-@jumping
-async def test_a_moving_robot_that_is_released_is_stopped_for_a_second_and_free() -> None:
-    async with established(deadman_s=60.0) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        assert rig.driver.release() == {**DENIED, "ok": True}
-        assert rig.written() == [STOP]
-        assert rig.control["state"] == "free"
-        await asyncio.sleep(2.0)
-        stops = rig.written()
-        assert set(stops) == {STOP}
-        assert 9 <= len(stops) <= 10
-        rig.command("drive", DRIVE_LEFT)
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (released)", 1)]
-        assert Program(rig, "other").acquire()["ok"]
+@pytest.mark.scene(deadman_s=60.0)
+async def test_a_moving_robot_that_is_released_is_stopped_for_a_second_and_free(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    assert rig.driver.release() == {**DENIED, "ok": True}
+    assert rig.written() == [STOP]
+    assert rig.control["state"] == "free"
+    await asyncio.sleep(2.0)
+    stops = rig.written()
+    assert set(stops) == {STOP}
+    assert 9 <= len(stops) <= 10
+    rig.command("drive", DRIVE_LEFT)
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (released)", 1)]
+    assert Program(rig, "other").acquire()["ok"]
 
 
-@jumping
-async def test_a_standing_robot_that_is_released_is_sent_nothing() -> None:
-    async with established() as rig:
-        rig.driver.release()
-        await asyncio.sleep(1.0)
-        assert rig.written() == []
-        assert rig.control["state"] == "free"
+async def test_a_standing_robot_that_is_released_is_sent_nothing(rig: Rig) -> None:
+    rig.driver.release()
+    await asyncio.sleep(1.0)
+    assert rig.written() == []
+    assert rig.control["state"] == "free"
 
 
-@jumping
-async def test_a_lease_that_has_ended_or_never_was_is_neither_renewed_nor_released() -> None:
-    async with established() as rig:
-        rig.driver.release()
-        ended = {**DENIED, "reason": "the lease has ended (released)", "code": "lease_ended"}
-        assert (rig.driver.renew(), rig.driver.release()) == (ended, ended)
-        never = {**DENIED, "reason": "no lease: acquire first", "code": "no_lease"}
-        assert rig.driver.ask("renew", STRANGE.question("renew")) == never
-        other = Program(rig, "other")
-        other.acquire()
-        for name in ("renew", "release"):
-            denied = other.ask(name, STRANGE.question(name))
-            assert (denied["ok"], denied["token"], denied["holder"]) == (False, None, "other")
-            assert (denied["reason"], denied["code"]) == ("held by other (priority 0)", "held")
-        assert rig.control["holder"] == "other"
-        assert await rig.refused() == [
-            ("driver", "renew", "the lease has ended (released)", 1),
-            ("driver", "release", "the lease has ended (released)", 1),
-            (None, "renew", "no lease: acquire first", 1),
-            (None, "renew", "held by other (priority 0)", 1),
-            (None, "release", "held by other (priority 0)", 1),
-        ]
+async def test_a_lease_that_has_ended_or_never_was_is_neither_renewed_nor_released(rig: Rig) -> None:
+    rig.driver.release()
+    ended = {**DENIED, "reason": "the lease has ended (released)", "code": "lease_ended"}
+    assert (rig.driver.renew(), rig.driver.release()) == (ended, ended)
+    never = {**DENIED, "reason": "no lease: acquire first", "code": "no_lease"}
+    assert rig.driver.ask("renew", STRANGE.question("renew")) == never
+    other = Program(rig, "other")
+    other.acquire()
+    for name in ("renew", "release"):
+        denied = other.ask(name, STRANGE.question(name))
+        assert (denied["ok"], denied["token"], denied["holder"]) == (False, None, "other")
+        assert (denied["reason"], denied["code"]) == ("held by other (priority 0)", "held")
+    assert rig.control["holder"] == "other"
+    assert await rig.refused() == [
+        ("driver", "renew", "the lease has ended (released)", 1),
+        ("driver", "release", "the lease has ended (released)", 1),
+        (None, "renew", "no lease: acquire first", 1),
+        (None, "renew", "held by other (priority 0)", 1),
+        (None, "release", "held by other (priority 0)", 1),
+    ]
 
 
-@jumping
-async def test_a_question_about_the_lease_that_was_overheard_is_good_for_nothing() -> None:
-    async with established() as rig:
-        held = rig.driver.held
-        assert held is not None
-        overheard = held.question("renew")
-        assert rig.driver.ask("release", overheard)["code"] == "malformed", "of another key"
-        assert rig.driver.ask("renew", overheard)["ok"]
-        assert rig.driver.ask("renew", overheard)["code"] == "out_of_order"
-        rig.driver.put("drive", b"", overheard)
-        assert rig.control["holder"] == "driver"
-        assert await rig.refused() == [
-            (None, "release", "wrong proof", 1),
-            (None, "renew", "repeated or out of order", 1),
-            (None, "drive", "wrong proof", 1),
-        ]
-        assert rig.driver.release()["ok"]
+async def test_a_question_about_the_lease_that_was_overheard_is_good_for_nothing(rig: Rig) -> None:
+    held = rig.driver.held
+    assert held is not None
+    overheard = held.question("renew")
+    assert rig.driver.ask("release", overheard)["code"] == "malformed", "of another key"
+    assert rig.driver.ask("renew", overheard)["ok"]
+    assert rig.driver.ask("renew", overheard)["code"] == "out_of_order"
+    rig.driver.put("drive", b"", overheard)
+    assert rig.control["holder"] == "driver"
+    assert await rig.refused() == [
+        (None, "release", "wrong proof", 1),
+        (None, "renew", "repeated or out of order", 1),
+        (None, "drive", "wrong proof", 1),
+    ]
+    assert rig.driver.release()["ok"]
 
 
 @pytest.mark.parametrize("name", ["acquire", "takeover"])
@@ -1251,19 +1125,18 @@ async def test_a_question_about_the_lease_that_was_overheard_is_good_for_nothing
         ("op1", "%6Fp1", False),
     ],
 )
-@jumping
-async def test_a_program_asks_in_its_own_name_only(name: str, who: str, at: str, ok: bool) -> None:
-    async with established(hold=False) as rig:
-        (reply,) = rig.ask(f"control/{name}/{at}", packed({"who": who})).replies
-        if ok:
-            assert rig.control["holder"] == who
-            return
-        assert isinstance(reply.error, Malformed)
-        asked_as = "op1" if at == "%6Fp1" else at
-        reason = f"who = {who!r}: expected {asked_as!r}, or that and '.suffix'"
-        assert str(reply.error) == reason
-        assert await rig.refused() == [(None, name, reason, 1)]
-        assert rig.control["state"] == "free"
+@pytest.mark.scene(hold=False)
+async def test_a_program_asks_in_its_own_name_only(rig: Rig, name: str, who: str, at: str, ok: bool) -> None:
+    (reply,) = rig.ask(f"control/{name}/{at}", packed({"who": who})).replies
+    if ok:
+        assert rig.control["holder"] == who
+        return
+    assert isinstance(reply.error, Malformed)
+    asked_as = "op1" if at == "%6Fp1" else at
+    reason = f"who = {who!r}: expected {asked_as!r}, or that and '.suffix'"
+    assert str(reply.error) == reason
+    assert await rig.refused() == [(None, name, reason, 1)]
+    assert rig.control["state"] == "free"
 
 
 @pytest.mark.parametrize(
@@ -1276,34 +1149,29 @@ async def test_a_program_asks_in_its_own_name_only(name: str, who: str, at: str,
         ("release", "fleet/r1/@rpc/control/*"),
     ],
 )
-@jumping
-async def test_a_question_about_the_lease_whose_key_has_wildcards_is_refused(name: str, asked: str) -> None:
-    async with established() as rig:
-        held = rig.driver.held
-        assert held is not None
-        payload = shown(held.lease, held.token, asked, 9) if name in ("renew", "release") else packed({"who": "other"})
-        (reply,) = rig.ask(f"control/{name}", payload, asked=asked).replies
-        assert isinstance(reply.error, Malformed)
-        assert await rig.refused() == [(None, name.partition("/")[0], "its key has wildcards", 1)]
-        assert rig.control["holder"] == "driver"
+async def test_a_question_about_the_lease_whose_key_has_wildcards_is_refused(rig: Rig, name: str, asked: str) -> None:
+    held = rig.driver.held
+    assert held is not None
+    payload = shown(held.lease, held.token, asked, 9) if name in ("renew", "release") else packed({"who": "other"})
+    (reply,) = rig.ask(f"control/{name}", payload, asked=asked).replies
+    assert isinstance(reply.error, Malformed)
+    assert await rig.refused() == [(None, name.partition("/")[0], "its key has wildcards", 1)]
+    assert rig.control["holder"] == "driver"
 
 
 @pytest.mark.parametrize("name", ["acquire/ann", "takeover/ann", "renew", "release"])
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x90", b"\x81", packed({"who": 5, "lease": 5})])
-@jumping
-async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(
-    name: str, payload: bytes
-) -> None:
-    async with established(hold=False) as rig:
-        (reply,) = rig.ask(f"control/{name}", payload).replies
-        assert isinstance(reply.error, Malformed)
-        reason = str(reply.error)
-        if name in ("renew", "release"):
-            assert reason == "malformed authorization: expected {lease, seq, proof}"
-        else:
-            assert re.match("Acquire: .....", reason), "the message that was expected"
-        assert await rig.refused() == [(None, name.partition("/")[0], reason, 1)]
-        assert rig.control["state"] == "free"
+@pytest.mark.scene(hold=False)
+async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_expected(rig: Rig, name, payload) -> None:
+    (reply,) = rig.ask(f"control/{name}", payload).replies
+    assert isinstance(reply.error, Malformed)
+    reason = str(reply.error)
+    if name in ("renew", "release"):
+        assert reason == "malformed authorization: expected {lease, seq, proof}"
+    else:
+        assert re.match("Acquire: .....", reason), "the message that was expected"
+    assert await rig.refused() == [(None, name.partition("/")[0], reason, 1)]
+    assert rig.control["state"] == "free"
 
 
 @pytest.mark.parametrize(
@@ -1316,35 +1184,30 @@ async def test_a_malformed_question_about_the_lease_is_refused_with_what_was_exp
     ],
 )
 @pytest.mark.parametrize("how", ["acquire", "takeover"])
-@jumping
-async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_holder(
-    how: str, wishes: dict[str, Any], reason: str
-) -> None:
-    async with established() as rig:
-        wish = {"who": "other", "priority": 9, **wishes}
-        denied = rig.driver.ask(f"{how}/{topics.escape(wish['who'])}", packed(wish))
-        assert (denied["ok"], denied["token"], denied["code"]) == (False, None, "malformed")
-        assert denied["reason"].startswith(reason)
-        assert rig.control["holder"] == "driver"
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+async def test_a_wish_that_makes_no_sense_is_denied_and_takes_nothing_from_the_holder(rig, how, wishes, reason) -> None:
+    wish = {"who": "other", "priority": 9, **wishes}
+    denied = rig.driver.ask(f"{how}/{topics.escape(wish['who'])}", packed(wish))
+    assert (denied["ok"], denied["token"], denied["code"]) == (False, None, "malformed")
+    assert denied["reason"].startswith(reason)
+    assert rig.control["holder"] == "driver"
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
-@jumping
-async def test_wishes_are_capped_by_the_robots_own() -> None:
-    async with established(hold=False, lease_s=3.0, deadman_s=0.5) as rig:
-        assert rig.hold(lease_s=100.0, deadman_s=100.0)["expires_in_s"] == 3.0
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.55)
-        assert rig.written()[-1] == STOP
-        assert rig.hold("takeover", lease_s=1.0, deadman_s=0.1)["expires_in_s"] == 1.0
-        await asyncio.sleep(0.01)
-        rig.command("drive", DRIVE_LEFT)
-        rig.forget_written()
-        await asyncio.sleep(0.15)
-        assert STOP in rig.written()
-        await asyncio.sleep(1.0)
-        assert rig.control["state"] == "stopped"
+@pytest.mark.scene(hold=False, lease_s=3.0, deadman_s=0.5)
+async def test_wishes_are_capped_by_the_robots_own(rig: Rig) -> None:
+    assert rig.hold(lease_s=100.0, deadman_s=100.0)["expires_in_s"] == 3.0
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.55)
+    assert rig.written()[-1] == STOP
+    assert rig.hold("takeover", lease_s=1.0, deadman_s=0.1)["expires_in_s"] == 1.0
+    await asyncio.sleep(0.01)
+    rig.command("drive", DRIVE_LEFT)
+    rig.forget_written()
+    await asyncio.sleep(0.15)
+    assert STOP in rig.written()
+    await asyncio.sleep(1.0)
+    assert rig.control["state"] == "stopped"
 
 
 # The end of a lease
@@ -1358,326 +1221,301 @@ async def test_wishes_are_capped_by_the_robots_own() -> None:
         ("raw/tcpudp", {"id": 21, "body": b"\x01"}, bytes.fromhex("03000000 02 15 01"), [STOP]),
     ],
 )
-@jumping
-async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(
-    name: str, fields: dict[str, Any], sent: bytes, stop: list[bytes]
-) -> None:
-    async with established(lease_s=1.0, deadman_s=5.0, hold=False) as rig:
-        rig.hold()
-        await asyncio.sleep(0.5)
-        start = rig.loop.time()
-        rig.command(name, fields)
-        await asyncio.sleep(0.99)
-        assert set(rig.written()) == {sent}
-        await asyncio.sleep(3.0)
-        stops = rig.written()
-        assert stops == stop * (len(stops) // len(stop))
-        assert 10 <= len(stops) // len(stop) <= 11
-        assert rig.link.times[-len(stops)] == pytest.approx(start + 1.0)
-        assert rig.control["state"] == "stopped"
-        assert {rig.control[name] for name in ("holder", "lease", "priority", "expires_in_s")} == {None}
-        for again in (NEUTRAL, DRIVE_LEFT):
-            rig.command("drive", again)
-        assert rig.written() == []
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (lease expired)", 2)]
-        rig.hold()
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+@pytest.mark.scene(lease_s=1.0, deadman_s=5.0, hold=False)
+async def test_a_lease_that_expires_stops_a_robot_that_moves_or_may(rig: Rig, name, fields, sent, stop) -> None:
+    rig.hold()
+    await asyncio.sleep(0.5)
+    start = rig.loop.time()
+    rig.command(name, fields)
+    await asyncio.sleep(0.99)
+    assert set(rig.written()) == {sent}
+    await asyncio.sleep(3.0)
+    stops = rig.written()
+    assert stops == stop * (len(stops) // len(stop))
+    assert 10 <= len(stops) // len(stop) <= 11
+    assert rig.link.times[-len(stops)] == pytest.approx(start + 1.0)
+    assert rig.control["state"] == "stopped"
+    assert {rig.control[name] for name in ("holder", "lease", "priority", "expires_in_s")} == {None}
+    for again in (NEUTRAL, DRIVE_LEFT):
+        rig.command("drive", again)
+    assert rig.written() == []
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (lease expired)", 2)]
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
 @pytest.mark.parametrize("mode", ["none", "manual"])
-@jumping
-async def test_a_lease_that_expires_ends_and_sends_a_standing_robot_nothing(mode: str) -> None:
-    async with established(lease_s=1.0, hold=False) as rig:
-        rig.hold()
-        rig.command("mode", {"mode": mode})
-        rig.forget_written()
-        await asyncio.sleep(3.0)
-        assert rig.written() == []
-        assert rig.control["state"] == "stopped"
-        assert rig.counted("ended") == 1
+@pytest.mark.scene(lease_s=1.0, hold=False)
+async def test_a_lease_that_expires_ends_and_sends_a_standing_robot_nothing(rig: Rig, mode: str) -> None:
+    rig.hold()
+    rig.command("mode", {"mode": mode})
+    rig.forget_written()
+    await asyncio.sleep(3.0)
+    assert rig.written() == []
+    assert rig.control["state"] == "stopped"
+    assert rig.counted("ended") == 1
 
 
-@jumping
-async def test_renewing_keeps_a_robot_going_that_moves_on_its_own() -> None:
-    async with established(lease_s=1.0, deadman_s=0.3, hold=False) as rig:
-        rig.hold()
-        rig.command("mode", {"mode": "autonomous"})
-        for _ in range(10):
-            await asyncio.sleep(0.9)
-            assert rig.driver.renew() == {**DENIED, "ok": True, "expires_in_s": 1.0, "holder": "driver"}
-        assert rig.written() == [AUTONOMOUS]
+@pytest.mark.scene(lease_s=1.0, deadman_s=0.3, hold=False)
+async def test_renewing_keeps_a_robot_going_that_moves_on_its_own(rig: Rig) -> None:
+    rig.hold()
+    rig.command("mode", {"mode": "autonomous"})
+    for _ in range(10):
+        await asyncio.sleep(0.9)
+        assert rig.driver.renew() == {**DENIED, "ok": True, "expires_in_s": 1.0, "holder": "driver"}
+    assert rig.written() == [AUTONOMOUS]
 
 
-@jumping
-async def test_a_drive_renews_the_lease() -> None:
-    async with established(lease_s=1.0, hold=False) as rig:
-        rig.hold()
-        for _ in range(10):
-            await asyncio.sleep(0.9)
-            rig.command("drive", DRIVE_LEFT)
-        assert rig.driver.renew()["ok"]
-        assert STOP not in rig.written()
-
-
-@jumping
-async def test_the_commands_of_others_renew_no_lease() -> None:
-    async with established(lease_s=1.0, hold=False) as rig:
-        rig.hold()
-        other = Program(rig, "other")
-        for _ in range(4):
-            await asyncio.sleep(0.3)
-            rig.command("text", {"text": "hi"})
-            other.command("drive", NEUTRAL)
-            other.acquire()
-        assert rig.control["holder"] == "other", "free after a second, and asked for"
-
-
-@jumping
-async def test_a_holder_whose_liveliness_token_goes_is_lost_and_the_robot_stopped_in_the_same_moment() -> None:
-    async with established(deadman_s=60.0, hold=False) as rig:
-        token = rig.hq.announce("fleet/r1/@alive/operator.7")
-        rig.hold(alive="operator.7")
+@pytest.mark.scene(lease_s=1.0, hold=False)
+async def test_a_drive_renews_the_lease(rig: Rig) -> None:
+    rig.hold()
+    for _ in range(10):
+        await asyncio.sleep(0.9)
         rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
+    assert rig.driver.renew()["ok"]
+    assert STOP not in rig.written()
+
+
+@pytest.mark.scene(lease_s=1.0, hold=False)
+async def test_the_commands_of_others_renew_no_lease(rig: Rig) -> None:
+    rig.hold()
+    other = Program(rig, "other")
+    for _ in range(4):
+        await asyncio.sleep(0.3)
+        rig.command("text", {"text": "hi"})
+        other.command("drive", NEUTRAL)
+        other.acquire()
+    assert rig.control["holder"] == "other", "free after a second, and asked for"
+
+
+@pytest.mark.scene(deadman_s=60.0, hold=False)
+async def test_a_holder_whose_liveliness_token_goes_is_lost_and_the_robot_stopped_in_the_same_moment(rig: Rig) -> None:
+    token = rig.hq.announce("fleet/r1/@alive/operator.7")
+    rig.hold(alive="operator.7")
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    token.close()
+    assert rig.written() == [STOP]
+    assert rig.control["state"] == "stopped"
+    for fields in (NEUTRAL, DRIVE_LEFT):
+        rig.command("drive", fields)
+    assert await rig.refused() == [("driver", "drive", "the lease has ended (holder lost)", 2)]
+    await asyncio.sleep(2.0)
+    assert set(rig.written()) == {STOP}
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
+
+
+@pytest.mark.scene(deadman_s=60.0, hold=False)
+async def test_the_liveliness_token_of_anybody_else_is_nothing_to_the_holder(rig: Rig) -> None:
+    own = rig.hq.announce("fleet/r1/@alive/operator.7")
+    others = [
+        rig.hq.announce(key)
+        for key in ("fleet/r1/@alive/operator.8", "fleet/r2/@alive/operator.7", "fleet/r1/@alive/gateway")
+    ]
+    rig.hold(alive="operator.7")
+    rig.command("drive", DRIVE_LEFT)
+    for token in others:
         token.close()
-        assert rig.written() == [STOP]
-        assert rig.control["state"] == "stopped"
-        for fields in (NEUTRAL, DRIVE_LEFT):
-            rig.command("drive", fields)
-        assert await rig.refused() == [("driver", "drive", "the lease has ended (holder lost)", 2)]
-        await asyncio.sleep(2.0)
-        assert set(rig.written()) == {STOP}
-        rig.hold()
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+    await asyncio.sleep(0.1)
+    assert set(rig.written()) == {MOVE_LEFT}
+    rig.driver.release()
+    Program(rig, "other").acquire()
+    own.close()
+    assert rig.control["holder"] == "other", "the token of a lease that has ended"
 
 
-@jumping
-async def test_the_liveliness_token_of_anybody_else_is_nothing_to_the_holder() -> None:
-    async with established(deadman_s=60.0, hold=False) as rig:
-        own = rig.hq.announce("fleet/r1/@alive/operator.7")
-        others = [
-            rig.hq.announce(key)
-            for key in ("fleet/r1/@alive/operator.8", "fleet/r2/@alive/operator.7", "fleet/r1/@alive/gateway")
-        ]
-        rig.hold(alive="operator.7")
-        rig.command("drive", DRIVE_LEFT)
-        for token in others:
-            token.close()
-        await asyncio.sleep(0.1)
-        assert set(rig.written()) == {MOVE_LEFT}
-        rig.driver.release()
-        Program(rig, "other").acquire()
-        own.close()
-        assert rig.control["holder"] == "other", "the token of a lease that has ended"
+@pytest.mark.scene(hold=False)
+async def test_a_holder_without_a_liveliness_token_is_not_refused(rig: Rig) -> None:
+    assert rig.hold(alive="operator.7")["ok"]
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
-@jumping
-async def test_a_holder_without_a_liveliness_token_is_not_refused() -> None:
-    async with established(hold=False) as rig:
-        assert rig.hold(alive="operator.7")["ok"]
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+async def test_a_lease_outlives_the_loss_of_the_robot(rig: Rig) -> None:
+    rig.goes()
+    await asyncio.sleep(1.0)
+    assert rig.driver.renew()["ok"]
+    assert Program(rig, "other").acquire()["reason"] == "held by driver (priority 0)"
+    await rig.establish()
+    rig.command("drive", DRIVE_LEFT)
+    assert [reason for _, reason, _ in await rig.refusals()] == [
+        "held by driver (priority 0)",
+        "robot lost: send a neutral drive first",
+    ]
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.05)
+    assert rig.written()[-1] == MOVE_LEFT
 
 
-@jumping
-async def test_a_lease_outlives_the_loss_of_the_robot() -> None:
-    async with established() as rig:
-        rig.goes()
-        await asyncio.sleep(1.0)
-        assert rig.driver.renew()["ok"]
-        assert Program(rig, "other").acquire()["reason"] == "held by driver (priority 0)"
-        await rig.establish()
-        rig.command("drive", DRIVE_LEFT)
-        assert [reason for _, reason, _ in await rig.refusals()] == [
-            "held by driver (priority 0)",
-            "robot lost: send a neutral drive first",
-        ]
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.05)
-        assert rig.written()[-1] == MOVE_LEFT
+@pytest.mark.scene(deadman_s=60.0)
+async def test_a_robot_that_is_busy_is_stopped_and_the_lease_stays_but_needs_neutral(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.sends(bytes.fromhex("02000000 01 04"))  # serverStartUDP, unasked: it takes nothing for two seconds
+    assert rig.last("status")["reason"] == "handshaking"
+    assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["handshaking"]
+    rig.command("drive", DRIVE_LEFT)
+    rig.command("drive", NEUTRAL)
+    assert await rig.refused() == [("driver", "drive", "handshaking", 2)]
+    await asyncio.sleep(2.5)
+    report, *rest = rig.written()
+    assert report == bytes.fromhex("03000000 02 07 00"), "all that such a robot may be sent at first"
+    assert set(rest) == {STOP}
+    rig.command("drive", DRIVE_LEFT)
+    assert (await rig.refused())[-1] == ("driver", "drive", "no longer busy: send a neutral drive first", 1)
+    assert rig.control["holder"] == "driver"
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(0.1)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written()[-1] == MOVE_LEFT
 
 
-@jumping
-async def test_a_robot_that_is_busy_is_stopped_and_the_lease_stays_but_needs_neutral() -> None:
-    async with established(deadman_s=60.0) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.sends(bytes.fromhex("02000000 01 04"))  # serverStartUDP, unasked: it takes nothing for two seconds
-        assert rig.last("status")["reason"] == "handshaking"
-        assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["handshaking"]
-        rig.command("drive", DRIVE_LEFT)
-        rig.command("drive", NEUTRAL)
-        assert await rig.refused() == [("driver", "drive", "handshaking", 2)]
-        await asyncio.sleep(2.5)
-        report, *rest = rig.written()
-        assert report == bytes.fromhex("03000000 02 07 00"), "all that such a robot may be sent at first"
-        assert set(rest) == {STOP}
-        rig.command("drive", DRIVE_LEFT)
-        assert (await rig.refused())[-1] == ("driver", "drive", "no longer busy: send a neutral drive first", 1)
-        assert rig.control["holder"] == "driver"
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(0.1)
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written()[-1] == MOVE_LEFT
-
-
-@jumping
-async def test_a_lease_that_expires_while_the_robot_is_away_has_ended_when_it_returns() -> None:
-    async with established(lease_s=2.0, hold=False) as rig:
-        rig.hold()
-        rig.command("drive", DRIVE_LEFT)
-        rig.goes()
-        rig.unreachable = "no route"
-        await asyncio.sleep(3.0)
-        rig.unreachable = None
-        await asyncio.sleep(3.0)
-        await rig.establish()
-        assert rig.control["state"] == "stopped"
-        assert rig.metrics.total("refused") == 0, "a stop for a robot that is away is none that failed"
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == []
+@pytest.mark.scene(lease_s=2.0, hold=False)
+async def test_a_lease_that_expires_while_the_robot_is_away_has_ended_when_it_returns(rig: Rig) -> None:
+    rig.hold()
+    rig.command("drive", DRIVE_LEFT)
+    rig.goes()
+    rig.unreachable = "no route"
+    await asyncio.sleep(3.0)
+    rig.unreachable = None
+    await asyncio.sleep(3.0)
+    await rig.establish()
+    assert rig.control["state"] == "stopped"
+    assert rig.metrics.total("refused") == 0, "a stop for a robot that is away is none that failed"
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == []
 
 
 # A gateway that stood still itself
 
 
-@jumping
-async def test_motion_that_comes_after_the_deadman_time_is_refused_although_the_gateway_was_frozen_meanwhile() -> None:
-    async with established(deadman_s=0.6) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.freeze(5.0)
-        rig.command("drive", {"turn": 0.5})
-        assert rig.written() == [STOP]
-        assert await rig.refusals() == [("drive", "deadman: send a neutral drive first", 1)]
-        await asyncio.sleep(2.0)
-        assert set(rig.written()) == {STOP}
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(0.1)
-        rig.command("drive", {"turn": 0.5})
-        assert rig.written()[-1] == TURN_LEFT
-        assert rig.counted("stopped") == 1
+@pytest.mark.scene(deadman_s=0.6)
+async def test_motion_that_comes_after_the_deadman_time_is_refused_although_the_gateway_was_frozen_meanwhile(
+    rig: Rig,
+) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.freeze(5.0)
+    rig.command("drive", {"turn": 0.5})
+    assert rig.written() == [STOP]
+    assert await rig.refusals() == [("drive", "deadman: send a neutral drive first", 1)]
+    await asyncio.sleep(2.0)
+    assert set(rig.written()) == {STOP}
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(0.1)
+    rig.command("drive", {"turn": 0.5})
+    assert rig.written()[-1] == TURN_LEFT
+    assert rig.counted("stopped") == 1
 
 
 @pytest.mark.parametrize("attachment", [None, b"\xc1", STRANGE.attachment("drive", packed(NEUTRAL))])
-@jumping
-async def test_a_late_command_of_anybody_lets_the_deadman_act(attachment: bytes | None) -> None:
-    async with established(deadman_s=0.6) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.freeze(5.0)
-        rig.driver.put("drive", NEUTRAL, attachment)
-        assert rig.written() == [STOP]
+@pytest.mark.scene(deadman_s=0.6)
+async def test_a_late_command_of_anybody_lets_the_deadman_act(rig: Rig, attachment: bytes | None) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.freeze(5.0)
+    rig.driver.put("drive", NEUTRAL, attachment)
+    assert rig.written() == [STOP]
 
 
-@jumping
-async def test_a_late_neutral_is_taken_behind_the_stop_that_was_due() -> None:
-    async with established(deadman_s=0.6) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.freeze(5.0)
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", {"turn": 0.5})
-        await asyncio.sleep(0.05)
-        assert rig.written() == [STOP, TURN_LEFT]
-        assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["deadman"]
+@pytest.mark.scene(deadman_s=0.6)
+async def test_a_late_neutral_is_taken_behind_the_stop_that_was_due(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.freeze(5.0)
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", {"turn": 0.5})
+    await asyncio.sleep(0.05)
+    assert rig.written() == [STOP, TURN_LEFT]
+    assert [line["reason"] for line in rig.audited if line["event"] == "stopped"] == ["deadman"]
 
 
 @pytest.mark.parametrize("how", ["drive", "renew", "release"])
-@jumping
-async def test_what_the_holder_does_after_its_lease_expired_comes_too_late(how: str) -> None:
-    async with established(lease_s=3.0, hold=False) as rig:
-        rig.hold()
-        rig.command("mode", {"mode": "autonomous"})
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.freeze(5.0)
-        if how == "drive":
-            rig.command("drive", DRIVE_LEFT)
-            await asyncio.sleep(0.01)
-            assert rig.written() == [MODE_NONE, STOP]
-            ((_, reason, _),) = await rig.refusals()
-        else:
-            reason = getattr(rig.driver, how)()["reason"]
-            await asyncio.sleep(0.01)
-            assert rig.written() == [MODE_NONE, STOP]
-        assert reason == "the lease has ended (lease expired)"
-        assert rig.control["state"] == "stopped"
-        assert rig.counted("ended") == 1
-
-
-@jumping
-async def test_a_gateway_that_wakes_from_being_frozen_sends_the_stop_before_any_repetition() -> None:
-    async with established(deadman_s=0.6) as rig:
+@pytest.mark.scene(lease_s=3.0, hold=False)
+async def test_what_the_holder_does_after_its_lease_expired_comes_too_late(rig: Rig, how: str) -> None:
+    rig.hold()
+    rig.command("mode", {"mode": "autonomous"})
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.freeze(5.0)
+    if how == "drive":
         rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.freeze(5.0)
-        await asyncio.sleep(0.5)
-        assert set(rig.written()) == {STOP}
+        await asyncio.sleep(0.01)
+        assert rig.written() == [MODE_NONE, STOP]
+        ((_, reason, _),) = await rig.refusals()
+    else:
+        reason = getattr(rig.driver, how)()["reason"]
+        await asyncio.sleep(0.01)
+        assert rig.written() == [MODE_NONE, STOP]
+    assert reason == "the lease has ended (lease expired)"
+    assert rig.control["state"] == "stopped"
+    assert rig.counted("ended") == 1
+
+
+@pytest.mark.scene(deadman_s=0.6)
+async def test_a_gateway_that_wakes_from_being_frozen_sends_the_stop_before_any_repetition(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.freeze(5.0)
+    await asyncio.sleep(0.5)
+    assert set(rig.written()) == {STOP}
 
 
 @pytest.mark.parametrize(("name", "fields"), [("drive", {"left": 9.0}), ("motor/x", {"value": 1.0})])
-@jumping
-async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(name: str, fields: dict[str, Any]) -> None:
-    async with established(deadman_s=0.6) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        for _ in range(4):
-            await asyncio.sleep(0.2)
-            rig.command(name, fields)
-        assert rig.written()[-1] == STOP
-        assert rig.counted("stopped") == 1
+@pytest.mark.scene(deadman_s=0.6)
+async def test_refused_commands_of_the_holder_do_not_keep_the_robot_moving(rig: Rig, name, fields) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    for _ in range(4):
+        await asyncio.sleep(0.2)
+        rig.command(name, fields)
+    assert rig.written()[-1] == STOP
+    assert rig.counted("stopped") == 1
 
 
-@jumping
-async def test_the_limits_begin_anew_after_a_stop_whatever_comes_first() -> None:
-    async with established(limits=MotionLimits(slew_per_s=1.0)) as rig:
-        for _ in range(5):
-            rig.command("drive", {"forward": 1.0})
-            await asyncio.sleep(0.25)
-        rig.driver.put("stop", NEUTRAL, None)
-        await asyncio.sleep(2.0)
-        rig.hold()
-        rig.command("mode", {"mode": "autonomous"})
-        await asyncio.sleep(0.1)
-        rig.forget_written()
+@pytest.mark.scene(limits=MotionLimits(slew_per_s=1.0))
+async def test_the_limits_begin_anew_after_a_stop_whatever_comes_first(rig: Rig) -> None:
+    for _ in range(5):
         rig.command("drive", {"forward": 1.0})
-        await asyncio.sleep(0.05)
-        assert rig.written()[-1] == forward_drive(0.25)
+        await asyncio.sleep(0.25)
+    rig.driver.put("stop", NEUTRAL, None)
+    await asyncio.sleep(2.0)
+    rig.hold()
+    rig.command("mode", {"mode": "autonomous"})
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.command("drive", {"forward": 1.0})
+    await asyncio.sleep(0.05)
+    assert rig.written()[-1] == forward_drive(0.25)
 
 
-@jumping
-async def test_commands_are_served_in_the_midst_of_a_large_read() -> None:
-    async with established() as rig:
-        attended: list[int] = []
-        rig.bus.attend = lambda: attended.append(len(rig.values("pose")))  # type: ignore[method-assign]
-        rig.sends(POSITION * (3 * ATTEND_EVERY))
-        assert len(attended) == 3
-        assert len(rig.values("pose")) == 3 * ATTEND_EVERY
+async def test_commands_are_served_in_the_midst_of_a_large_read(rig: Rig) -> None:
+    attended: list[int] = []
+    rig.bus.attend = lambda: attended.append(len(rig.values("pose")))  # type: ignore[method-assign]
+    rig.sends(POSITION * (3 * ATTEND_EVERY))
+    assert len(attended) == 3
+    assert len(rig.values("pose")) == 3 * ATTEND_EVERY
 
 
 @pytest.mark.parametrize("first", ["mode", "raw/tcpudp"])
 @pytest.mark.parametrize("mode", ["manual", "none"])
-@jumping
-async def test_a_release_stops_a_robot_that_was_let_move_by_itself_whatever_its_mode_is_now(
-    first: str, mode: str
-) -> None:
-    async with established() as rig:
-        rig.command(first, {"mode": "autonomous", "id": 40, "body": b"x"})
-        rig.command("mode", {"mode": mode})
-        await asyncio.sleep(0.1)
-        rig.forget_written()
-        rig.driver.release()
-        assert STOP in rig.written()
+async def test_a_release_stops_a_robot_that_was_let_move_by_itself_whatever_its_mode_is_now(rig, first, mode) -> None:
+    rig.command(first, {"mode": "autonomous", "id": 40, "body": b"x"})
+    rig.command("mode", {"mode": mode})
+    await asyncio.sleep(0.1)
+    rig.forget_written()
+    rig.driver.release()
+    assert STOP in rig.written()
 
 
 # Limits on motion
@@ -1687,207 +1525,187 @@ def forward_drive(speed: float) -> bytes:
     return bytes.fromhex("0e000000 02 0b 00000000 0000803f") + struct.pack("<f", speed)
 
 
-@jumping
-async def test_a_robot_is_not_sent_faster_changes_than_its_owner_allows() -> None:
-    async with established(limits=MotionLimits(slew_per_s=1.0)) as rig:
-        for _ in range(5):
-            rig.command("drive", {"forward": 0.6})
-            await asyncio.sleep(0.1)
-        speeds = [round(struct.unpack("<f", data[-4:])[0], 3) for data in rig.written() if data[5] == 11]
-        assert list(dict.fromkeys(speeds)) == [0.25, 0.35, 0.45, 0.55, 0.6]
-        assert rig.metrics.total("drives_slowed") == 4
-        rig.command("drive", {"forward": 0.1})
-        assert rig.written() == [forward_drive(0.1)], "slowing down is never slowed"
-        assert rig.metrics.total("drives_slowed") == 4
-
-
-@jumping
-async def test_after_a_stop_a_robot_starts_from_standing_again() -> None:
-    async with established(limits=MotionLimits(slew_per_s=1.0), deadman_s=0.3) as rig:
-        for _ in range(8):
-            rig.command("drive", {"forward": 1.0})
-            await asyncio.sleep(0.1)
-        await asyncio.sleep(2.0)
-        rig.hold("takeover")
-        rig.forget_written()
-        rig.command("drive", {"forward": 1.0})
-        assert rig.written() == [forward_drive(0.25)]
-
-
-@jumping
-async def test_drives_that_come_too_fast_are_refused_and_neutral_never_is() -> None:
-    async with established(limits=MotionLimits(rate_hz=10.0)) as rig:
-        for _ in range(5):
-            rig.command("drive", DRIVE_LEFT)
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(0.05)
-        assert rig.written() == [MOVE_LEFT, STOP]
-        assert await rig.refused() == [("driver", "drive", "more than 10 commands a second", 3)]
+@pytest.mark.scene(limits=MotionLimits(slew_per_s=1.0))
+async def test_a_robot_is_not_sent_faster_changes_than_its_owner_allows(rig: Rig) -> None:
+    for _ in range(5):
+        rig.command("drive", {"forward": 0.6})
         await asyncio.sleep(0.1)
+    speeds = [round(struct.unpack("<f", data[-4:])[0], 3) for data in rig.written() if data[5] == 11]
+    assert list(dict.fromkeys(speeds)) == [0.25, 0.35, 0.45, 0.55, 0.6]
+    assert rig.metrics.total("drives_slowed") == 4
+    rig.command("drive", {"forward": 0.1})
+    assert rig.written() == [forward_drive(0.1)], "slowing down is never slowed"
+    assert rig.metrics.total("drives_slowed") == 4
+
+
+@pytest.mark.scene(limits=MotionLimits(slew_per_s=1.0), deadman_s=0.3)
+async def test_after_a_stop_a_robot_starts_from_standing_again(rig: Rig) -> None:
+    for _ in range(8):
+        rig.command("drive", {"forward": 1.0})
+        await asyncio.sleep(0.1)
+    await asyncio.sleep(2.0)
+    rig.hold("takeover")
+    rig.forget_written()
+    rig.command("drive", {"forward": 1.0})
+    assert rig.written() == [forward_drive(0.25)]
+
+
+@pytest.mark.scene(limits=MotionLimits(rate_hz=10.0))
+async def test_drives_that_come_too_fast_are_refused_and_neutral_never_is(rig: Rig) -> None:
+    for _ in range(5):
         rig.command("drive", DRIVE_LEFT)
-        assert rig.written()[-1] == MOVE_LEFT
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(0.05)
+    assert rig.written() == [MOVE_LEFT, STOP]
+    assert await rig.refused() == [("driver", "drive", "more than 10 commands a second", 3)]
+    await asyncio.sleep(0.1)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written()[-1] == MOVE_LEFT
 
 
 # What is written down, counted, and put in which lane
 
 
-@jumping
-async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_the_robot() -> None:
-    async with established(hold=False, deadman_s=0.5) as rig:
-        other = Program(rig, "other")
-        rig.hold(priority=2)
-        other.acquire()
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(1.0)
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", DRIVE_LEFT)
-        other.acquire("takeover")
-        other.release()
-        rig.hold()
-        other.command("stop")
-        assert rig.audited == [
-            {"event": "acquired", "who": "driver", "priority": 2},
-            {"event": "refused", "who": "other", "command": "acquire", "reason": "held by driver (priority 2)"},
-            {"event": "stopped", "who": "driver", "reason": "deadman", "stops": True},
-            {"event": "ended", "who": "driver", "reason": "taken over by other", "stops": True},
-            {"event": "taken over", "who": "other", "priority": 0},
-            {"event": "released", "who": "other", "reason": "released"},
-            {"event": "acquired", "who": "driver", "priority": 0},
-            {"event": "stopped", "who": "driver", "reason": "stop", "stops": True},
-        ]
-        assert {json.loads(line)["robot"] for line in rig.audit_lines} == {"r1"}
-        counted = {labels[0][1]: value for name, labels, value in rig.metrics if name == "control"}
-        assert counted == {"acquired": 2, "stopped": 2, "ended": 1, "taken over": 1, "released": 1}
-        assert rig.metrics.total("refused") == 1
+@pytest.mark.scene(hold=False, deadman_s=0.5)
+async def test_the_audit_log_tells_who_drove_what_was_refused_and_what_stopped_the_robot(rig: Rig) -> None:
+    other = Program(rig, "other")
+    rig.hold(priority=2)
+    other.acquire()
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(1.0)
+    rig.command("drive", NEUTRAL)
+    rig.command("drive", DRIVE_LEFT)
+    other.acquire("takeover")
+    other.release()
+    rig.hold()
+    other.command("stop")
+    assert rig.audited == [
+        {"event": "acquired", "who": "driver", "priority": 2},
+        {"event": "refused", "who": "other", "command": "acquire", "reason": "held by driver (priority 2)"},
+        {"event": "stopped", "who": "driver", "reason": "deadman", "stops": True},
+        {"event": "ended", "who": "driver", "reason": "taken over by other", "stops": True},
+        {"event": "taken over", "who": "other", "priority": 0},
+        {"event": "released", "who": "other", "reason": "released"},
+        {"event": "acquired", "who": "driver", "priority": 0},
+        {"event": "stopped", "who": "driver", "reason": "stop", "stops": True},
+    ]
+    assert {json.loads(line)["robot"] for line in rig.audit_lines} == {"r1"}
+    counted = {labels[0][1]: value for name, labels, value in rig.metrics if name == "control"}
+    assert counted == {"acquired": 2, "stopped": 2, "ended": 1, "taken over": 1, "released": 1}
+    assert rig.metrics.total("refused") == 1
 
 
-@jumping
-async def test_a_flood_of_refusals_is_one_line_and_then_one_a_second() -> None:
-    async with established() as rig:
-        before = len(rig.audit_lines)
-        for _ in range(3):
-            for _ in range(50):
-                rig.driver.put("drive", DRIVE_LEFT, None)
-            await asyncio.sleep(HEARTBEAT_S)
-        lines = rig.audited[before:]
-        assert 3 <= len(lines) <= 6
-        assert sum(line.get("count", 1) for line in lines) == 150
-        assert {line["reason"] for line in lines} == {"no lease: acquire first"}
+async def test_a_flood_of_refusals_is_one_line_and_then_one_a_second(rig: Rig) -> None:
+    before = len(rig.audit_lines)
+    for _ in range(3):
+        for _ in range(50):
+            rig.driver.put("drive", DRIVE_LEFT, None)
+        await asyncio.sleep(HEARTBEAT_S)
+    lines = rig.audited[before:]
+    assert 3 <= len(lines) <= 6
+    assert sum(line.get("count", 1) for line in lines) == 150
+    assert {line["reason"] for line in lines} == {"no lease: acquire first"}
 
 
-@jumping
-async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too() -> None:
-    async with established(hold=False) as rig:
-        rig.command("stop")
-        rig.goes()
-        assert [(line["event"], line["reason"]) for line in rig.audited] == [
-            ("stopped", "stop"),
-            ("stopped", "robot lost"),
-        ]
+@pytest.mark.scene(hold=False)
+async def test_a_robot_that_was_lost_or_stopped_by_nobody_is_written_down_too(rig: Rig) -> None:
+    rig.command("stop")
+    rig.goes()
+    assert [(line["event"], line["reason"]) for line in rig.audited] == [("stopped", "stop"), ("stopped", "robot lost")]
 
 
-@jumping
-async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing() -> None:
-    async with established() as rig:
-        lane = rig.bus.lanes["fleet/r1/@cmd/**"]
-        assert not isinstance(lane, Lane)
-        held, drive = rig.driver.held, packed(DRIVE_LEFT)
-        assert held is not None
+async def test_the_holders_commands_wait_for_nobody_elses_and_a_stop_for_nothing(rig: Rig) -> None:
+    lane = rig.bus.lanes["fleet/r1/@cmd/**"]
+    assert not isinstance(lane, Lane)
+    held, drive = rig.driver.held, packed(DRIVE_LEFT)
+    assert held is not None
 
-        def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane | None:
-            return lane(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
+    def lane_of(attachment: bytes | None, payload: bytes = drive, key: str = "fleet/r1/@cmd/drive") -> Lane | None:
+        return lane(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
 
-        assert lane_of(None, key="fleet/r1/@cmd/stop") is lane_of(None, key="fleet/*/@cmd/stop") is Lane.STOP
+    assert lane_of(None, key="fleet/r1/@cmd/stop") is lane_of(None, key="fleet/*/@cmd/stop") is Lane.STOP
 
-        first, late = held.attachment("drive", drive), held.attachment("drive", drive)
-        for other in (None, b"", b"\xc1", STRANGE.attachment("drive", drive)):
-            assert lane_of(other) is Lane.OTHER
-        near = Holder(held.lease, bytes(32), first=2**40)
-        assert lane_of(near.attachment("drive", drive)) is Lane.OTHER, "who knows the id alone"
-        assert lane_of(first, packed(NEUTRAL)) is lane_of(first, key="fleet/r1/@cmd/mode") is Lane.OTHER
-        assert lane_of(first) is Lane.COMMAND, "whatever numbers others came with"
-        assert lane_of(first) is Lane.OTHER, "what was overheard fills no lane of the holder's"
-        assert lane_of(late) is Lane.COMMAND
-        newest = held.attachment("drive", drive)
-        Program(rig, "other").acquire("takeover")
-        assert lane_of(newest) is Lane.OTHER
-        rig.command("stop")
-        assert lane_of(newest) is Lane.OTHER
-        assert lane_of(b"") is Lane.OTHER
+    first, late = held.attachment("drive", drive), held.attachment("drive", drive)
+    for other in (None, b"", b"\xc1", STRANGE.attachment("drive", drive)):
+        assert lane_of(other) is Lane.OTHER
+    near = Holder(held.lease, bytes(32), first=2**40)
+    assert lane_of(near.attachment("drive", drive)) is Lane.OTHER, "who knows the id alone"
+    assert lane_of(first, packed(NEUTRAL)) is lane_of(first, key="fleet/r1/@cmd/mode") is Lane.OTHER
+    assert lane_of(first) is Lane.COMMAND, "whatever numbers others came with"
+    assert lane_of(first) is Lane.OTHER, "what was overheard fills no lane of the holder's"
+    assert lane_of(late) is Lane.COMMAND
+    newest = held.attachment("drive", drive)
+    Program(rig, "other").acquire("takeover")
+    assert lane_of(newest) is Lane.OTHER
+    rig.command("stop")
+    assert lane_of(newest) is Lane.OTHER
+    assert lane_of(b"") is Lane.OTHER
 
 
 @pytest.mark.parametrize("name", ["renew", "release"])
-@jumping
-async def test_the_holders_questions_wait_for_nobody_elses(name: str) -> None:
-    async with established() as rig:
-        key = f"fleet/r1/@rpc/control/{name}"
-        lane, commands, held = rig.bus.lanes[key], rig.bus.lanes["fleet/r1/@cmd/**"], rig.driver.held
-        assert not isinstance(lane, Lane)
-        assert not isinstance(commands, Lane)
-        assert held is not None
-        held.seq = 1_000  # its commands have numbers of their own
-        assert commands("fleet/r1/@cmd/drive", held.attachment("drive", b""), 60, bytes) is Lane.COMMAND
-        question = held.question(name)
-        assert lane(f"fleet/r2/@rpc/control/{name}", question, 60, bytes) is Lane.OTHER
-        assert lane(key, question, 60, bytes) is Lane.COMMAND
-        assert lane(key, question, 60, bytes) is Lane.OTHER
-        for asker in ("acquire", "takeover"):
-            asking = rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"]
-            assert not isinstance(asking, Lane)
-            assert asking(f"fleet/r1/@rpc/control/{asker}/me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
+async def test_the_holders_questions_wait_for_nobody_elses(rig: Rig, name: str) -> None:
+    key = f"fleet/r1/@rpc/control/{name}"
+    lane, commands, held = rig.bus.lanes[key], rig.bus.lanes["fleet/r1/@cmd/**"], rig.driver.held
+    assert not isinstance(lane, Lane)
+    assert not isinstance(commands, Lane)
+    assert held is not None
+    held.seq = 1_000  # its commands have numbers of their own
+    assert commands("fleet/r1/@cmd/drive", held.attachment("drive", b""), 60, bytes) is Lane.COMMAND
+    question = held.question(name)
+    assert lane(f"fleet/r2/@rpc/control/{name}", question, 60, bytes) is Lane.OTHER
+    assert lane(key, question, 60, bytes) is Lane.COMMAND
+    assert lane(key, question, 60, bytes) is Lane.OTHER
+    for asker in ("acquire", "takeover"):
+        asking = rig.bus.lanes[f"fleet/r1/@rpc/control/{asker}/*"]
+        assert not isinstance(asking, Lane)
+        assert asking(f"fleet/r1/@rpc/control/{asker}/me", packed({"who": "me"}), 10, bytes) is Lane.OTHER
 
 
 # Floods
 
 
-@jumping
-async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_any_refusal() -> None:
-    async with established() as rig:
-        commands, acquires = rig.bus.lanes["fleet/r1/@cmd/**"], rig.bus.lanes["fleet/r1/@rpc/control/acquire/*"]
-        assert not isinstance(commands, Lane)
-        assert not isinstance(acquires, Lane)
-        before = rig.metrics.total("refused")
-        passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(Lane.OTHER)
-        asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(Lane.OTHER)
-        await asyncio.sleep(1.1)
-        kept_back = [entry for entry in rig.last("control")["refusals"] if entry["command"] in ("commands", "acquire")]
-        assert [(entry["who"], entry["command"], entry["code"], entry["count"]) for entry in kept_back] == [
-            (None, "commands", "no_lease", 1000 - passed),
-            (None, "acquire", "rate", 1000 - asked),
-        ]
-        assert rig.metrics.total("refused") - before == 2000 - passed - asked
-        await asyncio.sleep(1.1)
-        assert rig.metrics.total("refused") - before == 2000 - passed - asked
+async def test_what_the_gates_keep_back_is_shown_once_a_second_and_counted_like_any_refusal(rig: Rig) -> None:
+    commands, acquires = rig.bus.lanes["fleet/r1/@cmd/**"], rig.bus.lanes["fleet/r1/@rpc/control/acquire/*"]
+    assert not isinstance(commands, Lane)
+    assert not isinstance(acquires, Lane)
+    before = rig.metrics.total("refused")
+    passed = [commands("fleet/r1/@cmd/drive", None, 10, bytes) for _ in range(1000)].count(Lane.OTHER)
+    asked = [acquires("fleet/r1/@rpc/control/acquire/n", b"", 0, bytes) for _ in range(1000)].count(Lane.OTHER)
+    await asyncio.sleep(1.1)
+    kept_back = [entry for entry in rig.last("control")["refusals"] if entry["command"] in ("commands", "acquire")]
+    assert [(entry["who"], entry["command"], entry["code"], entry["count"]) for entry in kept_back] == [
+        (None, "commands", "no_lease", 1000 - passed),
+        (None, "acquire", "rate", 1000 - asked),
+    ]
+    assert rig.metrics.total("refused") - before == 2000 - passed - asked
+    await asyncio.sleep(1.1)
+    assert rig.metrics.total("refused") - before == 2000 - passed - asked
 
 
-@jumping
-async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot() -> None:
-    async with established() as rig:
-        taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
-        assert [reply.error is None for reply in taken] == [True] * 5 + [False] * 3
-        assert {str(reply.error) for reply in taken[5:]} == {"more than 5 takeovers a second"}
-        assert isinstance(taken[-1].error, TooFast)
-        assert rig.control["holder"] == "n.4"
-        assert (None, "takeover", "more than 5 takeovers a second", 3) in await rig.refused()
-        await asyncio.sleep(0.25)
-        assert rig.ask("control/takeover/n", packed({"who": "n"})).replies[0].error is None
+async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot(rig: Rig) -> None:
+    taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
+    assert [reply.error is None for reply in taken] == [True] * 5 + [False] * 3
+    assert {str(reply.error) for reply in taken[5:]} == {"more than 5 takeovers a second"}
+    assert isinstance(taken[-1].error, TooFast)
+    assert rig.control["holder"] == "n.4"
+    assert (None, "takeover", "more than 5 takeovers a second", 3) in await rig.refused()
+    await asyncio.sleep(0.25)
+    assert rig.ask("control/takeover/n", packed({"who": "n"})).replies[0].error is None
 
 
-@jumping
-async def test_a_stop_right_after_a_stop_is_not_carried_out_again() -> None:
-    async with established() as rig:
-        gate = rig.bus.lanes["fleet/r1/@cmd/**"]
-        assert not isinstance(gate, Lane)
-        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
-        rig.command("stop")
-        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
-        await asyncio.sleep(0.06)
-        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
-        rig.command("stop")
-        rig.driver.acquire()
-        assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP, "a new holder is stopped at once"
-        await asyncio.sleep(1.0)
-        assert rig.metrics.total("stops_folded") == 1
+async def test_a_stop_right_after_a_stop_is_not_carried_out_again(rig: Rig) -> None:
+    gate = rig.bus.lanes["fleet/r1/@cmd/**"]
+    assert not isinstance(gate, Lane)
+    assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+    rig.command("stop")
+    assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
+    await asyncio.sleep(0.06)
+    assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP
+    rig.command("stop")
+    rig.driver.acquire()
+    assert gate("fleet/r1/@cmd/stop", None, 0, bytes) is Lane.STOP, "a new holder is stopped at once"
+    await asyncio.sleep(1.0)
+    assert rig.metrics.total("stops_folded") == 1
 
 
 # Refusals
@@ -1899,21 +1717,19 @@ def telling(*refusals: dict[str, Any]) -> bytes:
     return packed({"refusals": [{**whole, **refusal} for refusal in refusals]})
 
 
-@jumping
-async def test_what_a_listener_refused_its_programs_is_shown_with_who_command_code_reason_and_by_whom() -> None:
-    async with established() as rig:
-        (reply,) = rig.ask("control/refused/hq.desk", telling({"count": 7}, {"who": "hq.desk.4"})).replies
-        assert (reply.error, msgpack.unpackb(reply.payload)) == (None, {})
-        rig.ask("control/refused/hq.desk", telling({"count": 5}))
-        await asyncio.sleep(0.06)
-        told = {"command": "drive", "code": "neutral_first", "reason": "let go first", "by": "hq.desk"}
-        assert rig.last("control")["refusals"] == [
-            {"who": "hq.desk.4", "count": 1, **told},
-            {"who": "hq.desk.3", "count": 12, **told},
-        ]
-        assert rig.control["holder"] == "driver", "and nothing else comes of it"
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [MOVE_LEFT]
+async def test_what_a_listener_refused_its_programs_is_shown_with_who_command_code_reason_and_by_whom(rig: Rig) -> None:
+    (reply,) = rig.ask("control/refused/hq.desk", telling({"count": 7}, {"who": "hq.desk.4"})).replies
+    assert (reply.error, msgpack.unpackb(reply.payload)) == (None, {})
+    rig.ask("control/refused/hq.desk", telling({"count": 5}))
+    await asyncio.sleep(0.06)
+    told = {"command": "drive", "code": "neutral_first", "reason": "let go first", "by": "hq.desk"}
+    assert rig.last("control")["refusals"] == [
+        {"who": "hq.desk.4", "count": 1, **told},
+        {"who": "hq.desk.3", "count": 12, **told},
+    ]
+    assert rig.control["holder"] == "driver", "and nothing else comes of it"
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [MOVE_LEFT]
 
 
 @pytest.mark.parametrize(
@@ -1928,45 +1744,39 @@ async def test_what_a_listener_refused_its_programs_is_shown_with_who_command_co
         ("hq.desk", {"who": ""}),
     ],
 )
-@jumping
-async def test_nobody_tells_of_refusals_in_anybody_elses_name(at: str, refusal: dict[str, Any]) -> None:
-    async with established() as rig:
-        (reply,) = rig.ask(f"control/refused/{at}", telling({}, refusal)).replies
-        assert isinstance(reply.error, Malformed)
-        ((who, command, _, _),) = await rig.refused()
-        assert (who, command) == (None, "refused"), "neither that one nor what came with it"
+async def test_nobody_tells_of_refusals_in_anybody_elses_name(rig: Rig, at: str, refusal: dict[str, Any]) -> None:
+    (reply,) = rig.ask(f"control/refused/{at}", telling({}, refusal)).replies
+    assert isinstance(reply.error, Malformed)
+    ((who, command, _, _),) = await rig.refused()
+    assert (who, command) == (None, "refused"), "neither that one nor what came with it"
 
 
 @pytest.mark.parametrize(
     "payload",
     [b"\xc1", packed({}), packed({"refusals": 5}), packed({"refusals": [{"who": "hq.desk.3"}]}), telling(*17 * [{}])],
 )
-@jumping
-async def test_a_telling_that_cannot_be_read_or_is_too_long_is_refused(payload: bytes) -> None:
-    async with established() as rig:
-        (reply,) = rig.ask("control/refused/hq.desk", payload).replies
-        assert isinstance(reply.error, Malformed)
+async def test_a_telling_that_cannot_be_read_or_is_too_long_is_refused(rig: Rig, payload: bytes) -> None:
+    (reply,) = rig.ask("control/refused/hq.desk", payload).replies
+    assert isinstance(reply.error, Malformed)
 
 
-@jumping
-async def test_tellings_are_bounded_and_so_is_what_they_say() -> None:
-    async with established() as rig:
-        rig.ask("control/refused/hq.desk", telling({"reason": "r" * 10_000, "command": "c" * 10_000, "count": 2**60}))
-        rig.ask("control/refused/hq.desk", telling({"code": "of tomorrow", "count": -5}))
-        await asyncio.sleep(0.06)
-        long, unknown = rig.last("control")["refusals"]
-        assert (len(long["reason"]), len(long["command"]), long["count"]) == (200, 64, 1_000_000)
-        assert (unknown["code"], unknown["count"]) == ("unsupported", 1)
-        for number in range(200):
-            last = rig.ask("control/refused/hq.desk", telling({"reason": f"reason {number}"}))
-        assert isinstance(last.replies[0].error, TooFast)
-        await asyncio.sleep(0.06)
-        shown_now = rig.last("control")["refusals"]
-        assert len(shown_now) == 16
-        assert len([entry for entry in shown_now if entry["code"] == "rate"]) == 1
-        await asyncio.sleep(1.0)
-        (reply,) = rig.ask("control/refused/hq.desk", telling({})).replies
-        assert reply.error is None
+async def test_tellings_are_bounded_and_so_is_what_they_say(rig: Rig) -> None:
+    rig.ask("control/refused/hq.desk", telling({"reason": "r" * 10_000, "command": "c" * 10_000, "count": 2**60}))
+    rig.ask("control/refused/hq.desk", telling({"code": "of tomorrow", "count": -5}))
+    await asyncio.sleep(0.06)
+    long, unknown = rig.last("control")["refusals"]
+    assert (len(long["reason"]), len(long["command"]), long["count"]) == (200, 64, 1_000_000)
+    assert (unknown["code"], unknown["count"]) == ("unsupported", 1)
+    for number in range(200):
+        last = rig.ask("control/refused/hq.desk", telling({"reason": f"reason {number}"}))
+    assert isinstance(last.replies[0].error, TooFast)
+    await asyncio.sleep(0.06)
+    shown_now = rig.last("control")["refusals"]
+    assert len(shown_now) == 16
+    assert len([entry for entry in shown_now if entry["code"] == "rate"]) == 1
+    await asyncio.sleep(1.0)
+    (reply,) = rig.ask("control/refused/hq.desk", telling({})).replies
+    assert reply.error is None
 
 
 @pytest.mark.parametrize(
@@ -1981,28 +1791,24 @@ async def test_tellings_are_bounded_and_so_is_what_they_say() -> None:
         (msgpack.packb({"forward": None}), "forward"),
     ],
 )
-@jumping
-async def test_a_malformed_payload_is_refused_counted_and_shown(payload: bytes, reason: str) -> None:
-    async with established() as rig:
-        rig.command("drive", payload)
-        assert rig.written() == []
-        assert rig.metrics.total("refused") == 1
-        ((command, shown, count),) = await rig.refusals()
-        assert command == "drive"
-        assert shown.startswith("Drive: "), "the message that was expected"
-        assert reason in shown
-        assert count == 1
+async def test_a_malformed_payload_is_refused_counted_and_shown(rig: Rig, payload: bytes, reason: str) -> None:
+    rig.command("drive", payload)
+    assert rig.written() == []
+    assert rig.metrics.total("refused") == 1
+    ((command, shown, count),) = await rig.refusals()
+    assert command == "drive"
+    assert shown.startswith("Drive: "), "the message that was expected"
+    assert reason in shown
+    assert count == 1
 
 
 @pytest.mark.parametrize("name", ["dance", "drive/fast", "motor/left", "light", "raw/other", "sensor/x"])
-@jumping
-async def test_an_unknown_command_is_refused(name: str) -> None:
-    async with established() as rig:
-        rig.command(name, {"on": True, "value": 1.0, "id": 1})
-        assert rig.written() == []
-        ((command, reason, _),) = await rig.refusals()
-        assert command == name
-        assert "no such command" in reason
+async def test_an_unknown_command_is_refused(rig: Rig, name: str) -> None:
+    rig.command(name, {"on": True, "value": 1.0, "id": 1})
+    assert rig.written() == []
+    ((command, reason, _),) = await rig.refusals()
+    assert command == name
+    assert "no such command" in reason
 
 
 @pytest.mark.parametrize(
@@ -2017,48 +1823,38 @@ async def test_an_unknown_command_is_refused(name: str) -> None:
         ("text", {"text": "Grüße"}, "text"),
     ],
 )
-@jumping
-async def test_what_the_robot_cannot_do_is_refused_with_the_reason(
-    name: str, fields: dict[str, Any], reason: str
-) -> None:
-    async with established() as rig:
-        rig.command(name, fields)
-        await asyncio.sleep(0.1)
-        assert rig.written() == []
-        ((_, shown, _),) = await rig.refusals()
-        assert reason in shown
+async def test_what_the_robot_cannot_do_is_refused_with_the_reason(rig: Rig, name, fields, reason) -> None:
+    rig.command(name, fields)
+    await asyncio.sleep(0.1)
+    assert rig.written() == []
+    ((_, shown, _),) = await rig.refusals()
+    assert reason in shown
 
 
-@jumping
-async def test_refusals_are_gathered_before_control_shows_them() -> None:
-    async with established() as rig:
-        before = len(rig.values("control"))
-        for _ in range(100):
-            rig.command("dance")
-        assert len(rig.values("control")) == before
-        assert await rig.refusals() == [("dance", "no such command", 100)]
-        assert len(rig.values("control")) == before + 1
-        assert rig.metrics.total("refused") == 100
+async def test_refusals_are_gathered_before_control_shows_them(rig: Rig) -> None:
+    before = len(rig.values("control"))
+    for _ in range(100):
+        rig.command("dance")
+    assert len(rig.values("control")) == before
+    assert await rig.refusals() == [("dance", "no such command", 100)]
+    assert len(rig.values("control")) == before + 1
+    assert rig.metrics.total("refused") == 100
 
 
-@jumping
-async def test_the_part_of_a_drive_that_is_left_out_is_reported() -> None:
-    async with established() as rig:
-        rig.command("drive", {"left": 1.0, "turn": 0.5, "light": True})
-        assert rig.written() == [MOVE_LEFT]
-        ((command, reason, _),) = await rig.refusals()
-        assert command == "drive"
-        assert "turn" in reason
+async def test_the_part_of_a_drive_that_is_left_out_is_reported(rig: Rig) -> None:
+    rig.command("drive", {"left": 1.0, "turn": 0.5, "light": True})
+    assert rig.written() == [MOVE_LEFT]
+    ((command, reason, _),) = await rig.refusals()
+    assert command == "drive"
+    assert "turn" in reason
 
 
-@jumping
 async def test_a_command_while_the_robot_is_offline_is_refused() -> None:
     async with serving(unreachable="no route") as rig:
         rig.command("lidar", {"on": True})
         assert await rig.refusals() == [("lidar", "offline", 1)]
 
 
-@jumping
 async def test_a_command_during_the_handshake_is_refused() -> None:
     async with serving() as rig:
         rig.command("lidar", {"on": True})
@@ -2066,7 +1862,6 @@ async def test_a_command_during_the_handshake_is_refused() -> None:
         assert await rig.refusals() == [("lidar", "handshaking", 1)]
 
 
-@jumping
 async def test_motion_refused_while_offline_needs_neutral_afterwards() -> None:
     async with serving() as rig:
         rig.command("drive", DRIVE_LEFT)
@@ -2079,7 +1874,6 @@ async def test_motion_refused_while_offline_needs_neutral_afterwards() -> None:
         assert rig.written() == [STOP, MOVE_LEFT]
 
 
-@jumping
 async def test_neutral_refused_while_offline_does_not_make_motion_possible() -> None:
     async with serving() as rig:
         rig.command("drive", DRIVE_LEFT)
@@ -2089,7 +1883,6 @@ async def test_neutral_refused_while_offline_does_not_make_motion_possible() -> 
         assert rig.written() == []
 
 
-@jumping
 async def test_a_stop_while_offline_is_taken_and_remembered() -> None:
     async with serving(unreachable="no route") as rig:
         rig.command("stop")
@@ -2097,7 +1890,6 @@ async def test_a_stop_while_offline_is_taken_and_remembered() -> None:
         assert await rig.refusals() == []
 
 
-@jumping
 async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() -> None:
     async with serving() as rig:
         await rig.establish(PLAIN_SETTINGS)
@@ -2113,7 +1905,6 @@ async def test_a_robot_that_announces_nothing_is_sent_nothing_it_may_not_know() 
         assert not rig.device._enforcer.authority.moving, "there is nothing to stop"
 
 
-@jumping
 async def test_forced_features_are_used_although_the_robot_does_not_announce_them() -> None:
     async with serving(Options(force=("joystick",))) as rig:
         await rig.establish(PLAIN_SETTINGS)
@@ -2121,49 +1912,42 @@ async def test_forced_features_are_used_although_the_robot_does_not_announce_the
         assert rig.written() == [MOVE_LEFT]
 
 
-@jumping
-async def test_a_robot_that_takes_nothing_is_not_flooded() -> None:
-    async with established() as rig:
-        rig.link.ready = False
-        for _ in range(100):
-            rig.command("text", {"text": "hi"})
-        assert rig.written() == []
-        ((command, reason, count),) = await rig.refusals()
-        assert command == "text"
-        assert reason.startswith("64 packets wait")
-        rig.link.ready = True
-        rig.conversations[0].writable()
-        await asyncio.sleep(2.0)
-        assert len(rig.written()) == 100 - count
+async def test_a_robot_that_takes_nothing_is_not_flooded(rig: Rig) -> None:
+    rig.link.ready = False
+    for _ in range(100):
+        rig.command("text", {"text": "hi"})
+    assert rig.written() == []
+    ((command, reason, count),) = await rig.refusals()
+    assert command == "text"
+    assert reason.startswith("64 packets wait")
+    rig.link.ready = True
+    rig.conversations[0].writable()
+    await asyncio.sleep(2.0)
+    assert len(rig.written()) == 100 - count
 
 
 # Simulated lidar data
 
 
-@jumping
-async def test_a_scan_is_sent_in_the_robots_unit_and_shown_on_the_bus() -> None:
-    async with established() as rig:
-        ranges = struct.pack("<360f", *([2.0] * 360))
-        fields = {"angle_min": 0.0, "angle_increment": math.radians(1), "range_min": 0.1, "range_max": 9.0}
-        rig.command("scan", {**fields, "ranges": ranges})
-        expected = bytes.fromhex("a6050000 02 3d 68010000") + bytes.fromhex("00004843") * 360  # 200 cm
-        assert rig.written() == [expected]
-        assert rig.last("scan")["ranges"] == ranges
+async def test_a_scan_is_sent_in_the_robots_unit_and_shown_on_the_bus(rig: Rig) -> None:
+    ranges = struct.pack("<360f", *([2.0] * 360))
+    fields = {"angle_min": 0.0, "angle_increment": math.radians(1), "range_min": 0.1, "range_max": 9.0}
+    rig.command("scan", {**fields, "ranges": ranges})
+    expected = bytes.fromhex("a6050000 02 3d 68010000") + bytes.fromhex("00004843") * 360  # 200 cm
+    assert rig.written() == [expected]
+    assert rig.last("scan")["ranges"] == ranges
 
 
-@jumping
-async def test_a_scan_of_absurd_geometry_does_no_harm() -> None:
-    async with established() as rig:
-        fields = {"angle_min": 0.0, "angle_increment": 1e-300, "range_min": 0.1, "range_max": 9.0}
-        rig.command("scan", {**fields, "ranges": struct.pack("<10f", *([2.0] * 10))})
-        one_degree = bytes.fromhex("00004843") + bytes(4 * 359)  # 200 cm straight ahead
-        assert rig.written() == [bytes.fromhex("a6050000 02 3d 68010000") + one_degree]
+async def test_a_scan_of_absurd_geometry_does_no_harm(rig: Rig) -> None:
+    fields = {"angle_min": 0.0, "angle_increment": 1e-300, "range_min": 0.1, "range_max": 9.0}
+    rig.command("scan", {**fields, "ranges": struct.pack("<10f", *([2.0] * 10))})
+    one_degree = bytes.fromhex("00004843") + bytes(4 * 359)  # 200 cm straight ahead
+    assert rig.written() == [bytes.fromhex("a6050000 02 3d 68010000") + one_degree]
 
 
 # Loss and return of the robot
 
 
-@jumping
 async def test_a_robot_lost_before_it_was_established_needs_no_neutral() -> None:
     async with serving() as rig:
         rig.goes("reset")
@@ -2174,79 +1958,70 @@ async def test_a_robot_lost_before_it_was_established_needs_no_neutral() -> None
         assert rig.written() == [MOVE_LEFT]
 
 
-@jumping
-async def test_a_lost_robot_shows_as_offline_with_the_reason() -> None:
-    async with established() as rig:
-        rig.goes("connection lost: reset")
-        status = rig.last("status")
-        assert (status["state"], status["reason"]) == ("offline", "connection lost: reset")
-        assert status["version"] is None
-        assert status["features"] == []
+async def test_a_lost_robot_shows_as_offline_with_the_reason(rig: Rig) -> None:
+    rig.goes("connection lost: reset")
+    status = rig.last("status")
+    assert (status["state"], status["reason"]) == ("offline", "connection lost: reset")
+    assert status["version"] is None
+    assert status["features"] == []
 
 
-@jumping
-async def test_a_robot_that_returns_publishes_again() -> None:
-    async with established() as rig:
-        rig.goes()
-        await asyncio.sleep(1.0)
-        assert len(rig.links) == 2
-        await rig.establish()
-        assert rig.last("status")["state"] == "established"
-        rig.sends(POSITION)
-        assert len(rig.values("pose")) == 1
+async def test_a_robot_that_returns_publishes_again(rig: Rig) -> None:
+    rig.goes()
+    await asyncio.sleep(1.0)
+    assert len(rig.links) == 2
+    await rig.establish()
+    assert rig.last("status")["state"] == "established"
+    rig.sends(POSITION)
+    assert len(rig.values("pose")) == 1
 
 
-@jumping
-async def test_a_robot_lost_while_moving_needs_neutral_when_it_returns_and_gets_no_old_motion() -> None:
-    async with established(deadman_s=60.0) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        await asyncio.sleep(0.1)
-        rig.goes()
-        assert rig.counted("stopped") == 1
-        await asyncio.sleep(1.0)
-        await rig.establish()
-        await asyncio.sleep(1.0)
-        assert rig.written() == []
-        assert rig.control["holder"] == "driver", "the lease stays"
-        rig.command("drive", DRIVE_LEFT)
-        rig.command("mode", {"mode": "autonomous"})
-        assert rig.written() == []
-        assert "robot lost" in (await rig.refusals())[-1][1]
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(0.1)
-        rig.command("drive", DRIVE_LEFT)
-        assert rig.written() == [STOP, MOVE_LEFT]
+@pytest.mark.scene(deadman_s=60.0)
+async def test_a_robot_lost_while_moving_needs_neutral_when_it_returns_and_gets_no_old_motion(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    await asyncio.sleep(0.1)
+    rig.goes()
+    assert rig.counted("stopped") == 1
+    await asyncio.sleep(1.0)
+    await rig.establish()
+    await asyncio.sleep(1.0)
+    assert rig.written() == []
+    assert rig.control["holder"] == "driver", "the lease stays"
+    rig.command("drive", DRIVE_LEFT)
+    rig.command("mode", {"mode": "autonomous"})
+    assert rig.written() == []
+    assert "robot lost" in (await rig.refusals())[-1][1]
+    rig.command("drive", NEUTRAL)
+    await asyncio.sleep(0.1)
+    rig.command("drive", DRIVE_LEFT)
+    assert rig.written() == [STOP, MOVE_LEFT]
 
 
-@jumping
-async def test_the_deadman_of_a_lost_robot_does_not_fire() -> None:
-    async with established(deadman_s=0.5) as rig:
-        rig.command("drive", DRIVE_LEFT)
-        rig.goes()
-        rig.unreachable = "no route"
-        await asyncio.sleep(2.0)
-        rig.unreachable = None
-        await asyncio.sleep(3.0)
-        await rig.establish()
-        rig.command("drive", DRIVE_LEFT)
-        assert "robot lost" in (await rig.refusals())[-1][1]
+@pytest.mark.scene(deadman_s=0.5)
+async def test_the_deadman_of_a_lost_robot_does_not_fire(rig: Rig) -> None:
+    rig.command("drive", DRIVE_LEFT)
+    rig.goes()
+    rig.unreachable = "no route"
+    await asyncio.sleep(2.0)
+    rig.unreachable = None
+    await asyncio.sleep(3.0)
+    await rig.establish()
+    rig.command("drive", DRIVE_LEFT)
+    assert "robot lost" in (await rig.refusals())[-1][1]
 
 
-@jumping
-async def test_the_robots_new_client_id_is_used_after_its_return() -> None:
-    async with established() as rig:
-        rig.goes()
-        await asyncio.sleep(1.0)
-        await rig.establish(SETTINGS[:6] + b"\x07" + SETTINGS[7:])
-        rig.command("stop")
-        await asyncio.sleep(0.05)
-        assert rig.written() == [bytes.fromhex("02000000 07 0d")]
+async def test_the_robots_new_client_id_is_used_after_its_return(rig: Rig) -> None:
+    rig.goes()
+    await asyncio.sleep(1.0)
+    await rig.establish(SETTINGS[:6] + b"\x07" + SETTINGS[7:])
+    rig.command("stop")
+    await asyncio.sleep(0.05)
+    assert rig.written() == [bytes.fromhex("02000000 07 0d")]
 
 
 # Raw frames
 
 
-@jumping
 async def test_raw_frames_are_shown_only_to_those_who_listen() -> None:
     async with established() as rig:
         rig.sends(POSITION)
@@ -2268,54 +2043,45 @@ async def test_raw_frames_are_shown_only_to_those_who_listen() -> None:
 @pytest.mark.parametrize(
     ("name", "asked", "answer"), [("map", "02000000 02 34", MAP), ("pose", "02000000 02 36", POSITION)]
 )
-@jumping
-async def test_a_query_asks_the_robot_and_is_answered_with_what_it_sends(name: str, asked: str, answer: bytes) -> None:
-    async with established() as rig:
-        question = rig.ask(name)
-        assert rig.written() == [bytes.fromhex(asked)]
-        assert question.replies == []
-        rig.sends(answer)
-        (reply,) = question.replies
-        assert reply.error is None
-        assert msgpack.unpackb(reply.payload) == rig.last(name)
-        rig.sends(answer)
-        assert len(question.replies) == 1
+async def test_a_query_asks_the_robot_and_is_answered_with_what_it_sends(rig: Rig, name, asked, answer) -> None:
+    question = rig.ask(name)
+    assert rig.written() == [bytes.fromhex(asked)]
+    assert question.replies == []
+    rig.sends(answer)
+    (reply,) = question.replies
+    assert reply.error is None
+    assert msgpack.unpackb(reply.payload) == rig.last(name)
+    rig.sends(answer)
+    assert len(question.replies) == 1
 
 
-@jumping
-async def test_two_queries_at_once_ask_the_robot_once_and_are_both_answered() -> None:
-    async with established() as rig:
-        questions = [rig.ask("pose"), rig.ask("pose")]
-        await asyncio.sleep(0.1)
-        assert len(rig.written()) == 1
-        rig.sends(POSITION)
-        assert [len(question.replies) for question in questions] == [1, 1]
+async def test_two_queries_at_once_ask_the_robot_once_and_are_both_answered(rig: Rig) -> None:
+    questions = [rig.ask("pose"), rig.ask("pose")]
+    await asyncio.sleep(0.1)
+    assert len(rig.written()) == 1
+    rig.sends(POSITION)
+    assert [len(question.replies) for question in questions] == [1, 1]
 
 
-@jumping
-async def test_a_position_does_not_answer_a_query_for_the_map() -> None:
-    async with established() as rig:
-        question = rig.ask("map")
-        rig.sends(POSITION)
-        assert question.replies == []
+async def test_a_position_does_not_answer_a_query_for_the_map(rig: Rig) -> None:
+    question = rig.ask("map")
+    rig.sends(POSITION)
+    assert question.replies == []
 
 
-@jumping
-async def test_a_query_the_robot_does_not_answer_is_refused_after_two_seconds() -> None:
-    async with established() as rig:
-        question = rig.ask("map")
-        await asyncio.sleep(1.99)
-        assert question.replies == []
-        await asyncio.sleep(0.02)
-        (reply,) = question.replies
-        assert isinstance(reply.error, NotReady)
-        assert str(reply.error) == "the robot did not answer within 2 s"
-        rig.forget_written()
-        rig.ask("map")
-        assert len(rig.written()) == 1, "the next query asks anew"
+async def test_a_query_the_robot_does_not_answer_is_refused_after_two_seconds(rig: Rig) -> None:
+    question = rig.ask("map")
+    await asyncio.sleep(1.99)
+    assert question.replies == []
+    await asyncio.sleep(0.02)
+    (reply,) = question.replies
+    assert isinstance(reply.error, NotReady)
+    assert str(reply.error) == "the robot did not answer within 2 s"
+    rig.forget_written()
+    rig.ask("map")
+    assert len(rig.written()) == 1, "the next query asks anew"
 
 
-@jumping
 async def test_a_query_while_offline_is_refused_at_once() -> None:
     async with serving(unreachable="no route") as rig:
         (reply,) = await rig.hq.ask("fleet/r1/@rpc/map")
@@ -2323,7 +2089,6 @@ async def test_a_query_while_offline_is_refused_at_once() -> None:
         assert str(reply.error) == "offline"
 
 
-@jumping
 async def test_a_query_the_robot_cannot_be_asked_is_refused_at_once() -> None:
     async with serving() as rig:
         await rig.establish(PLAIN_SETTINGS)
@@ -2333,48 +2098,41 @@ async def test_a_query_the_robot_cannot_be_asked_is_refused_at_once() -> None:
         assert rig.written() == []
 
 
-@jumping
-async def test_queries_that_wait_are_refused_when_the_robot_is_lost() -> None:
-    async with established() as rig:
-        question = rig.ask("map")
-        rig.goes()
-        (reply,) = question.replies
-        assert str(reply.error) == "the robot was lost"
-        await asyncio.sleep(3.0)
-        assert len(question.replies) == 1
+async def test_queries_that_wait_are_refused_when_the_robot_is_lost(rig: Rig) -> None:
+    question = rig.ask("map")
+    rig.goes()
+    (reply,) = question.replies
+    assert str(reply.error) == "the robot was lost"
+    await asyncio.sleep(3.0)
+    assert len(question.replies) == 1
 
 
 # Back pressure and leave-taking
 
 
-@jumping
-async def test_a_bus_that_is_full_pauses_the_link_until_it_takes_more() -> None:
-    async with established() as rig:
-        rig.bus.takes = False
-        rig.sends(POSITION)
-        assert rig.link.paused
-        rig.bus.relieve()
-        assert not rig.link.paused
-        rig.sends(POSITION)
-        assert not rig.link.paused
+async def test_a_bus_that_is_full_pauses_the_link_until_it_takes_more(rig: Rig) -> None:
+    rig.bus.takes = False
+    rig.sends(POSITION)
+    assert rig.link.paused
+    rig.bus.relieve()
+    assert not rig.link.paused
+    rig.sends(POSITION)
+    assert not rig.link.paused
 
 
-@jumping
-async def test_a_link_made_while_the_bus_is_full_is_read_until_the_bus_says_so_again() -> None:
-    async with established() as rig:
-        rig.bus.takes = False
-        rig.sends(POSITION)
-        assert rig.link.paused
-        rig.goes()
-        await asyncio.sleep(1.0)
-        await rig.establish()
-        rig.sends(POSITION)
-        assert rig.link.paused
-        rig.bus.relieve()
-        assert not rig.link.paused
+async def test_a_link_made_while_the_bus_is_full_is_read_until_the_bus_says_so_again(rig: Rig) -> None:
+    rig.bus.takes = False
+    rig.sends(POSITION)
+    assert rig.link.paused
+    rig.goes()
+    await asyncio.sleep(1.0)
+    await rig.establish()
+    rig.sends(POSITION)
+    assert rig.link.paused
+    rig.bus.relieve()
+    assert not rig.link.paused
 
 
-@jumping
 async def test_a_second_cancellation_does_not_cut_the_leave_taking_short() -> None:
     rig = Rig(deadman_s=60.0)
     task = asyncio.create_task(rig.device.run())
@@ -2394,7 +2152,6 @@ async def test_a_second_cancellation_does_not_cut_the_leave_taking_short() -> No
     assert rig.link.closed
 
 
-@jumping
 async def test_a_moving_robot_is_stopped_before_the_gateway_ends() -> None:
     async with established(deadman_s=60.0) as rig:
         rig.command("drive", DRIVE_LEFT)
@@ -2409,7 +2166,6 @@ async def test_a_moving_robot_is_stopped_before_the_gateway_ends() -> None:
     assert (rig.last("status")["state"], rig.last("status")["reason"]) == ("offline", "gateway stopped")
 
 
-@jumping
 async def test_a_gateway_that_ends_gives_no_lease_any_more_and_ends_the_one_of_a_moving_robot() -> None:
     rig = Rig(deadman_s=60.0)
     task = asyncio.create_task(rig.device.run())
@@ -2436,7 +2192,6 @@ async def test_a_gateway_that_ends_gives_no_lease_any_more_and_ends_the_one_of_a
     assert set(rig.written()) == {STOP}
 
 
-@jumping
 async def test_a_robot_in_autonomous_mode_is_stopped_before_the_gateway_ends() -> None:
     async with established() as rig:
         rig.command("mode", {"mode": "autonomous"})
@@ -2447,7 +2202,6 @@ async def test_a_robot_in_autonomous_mode_is_stopped_before_the_gateway_ends() -
     assert stops == [MODE_NONE, STOP] * (len(stops) // 2)
 
 
-@jumping
 async def test_a_neutral_shortly_before_the_gateway_ends_is_repeated_for_its_second() -> None:
     async with established() as rig:
         rig.command("drive", DRIVE_LEFT)
@@ -2459,7 +2213,6 @@ async def test_a_neutral_shortly_before_the_gateway_ends_is_repeated_for_its_sec
     assert 1.0 <= rig.loop.time() - start < 1.1
 
 
-@jumping
 async def test_a_standing_robot_is_left_at_once() -> None:
     async with established() as rig:
         start = rig.loop.time()
@@ -2469,7 +2222,6 @@ async def test_a_standing_robot_is_left_at_once() -> None:
     assert rig.last("status")["reason"] == "gateway stopped"
 
 
-@jumping
 async def test_a_gateway_that_ends_leaves_the_robots_keys_to_others_and_writes_no_loss_down() -> None:
     async with established() as rig:
         pass
@@ -2481,7 +2233,5 @@ async def test_a_gateway_that_ends_leaves_the_robots_keys_to_others_and_writes_n
     assert [line for line in rig.audited if line["event"] == "stopped"] == []
 
 
-@jumping
-async def test_a_device_prints_its_robot_and_state() -> None:
-    async with established() as rig:
-        assert repr(rig.device) == "<Device r1 established>"
+async def test_a_device_prints_its_robot_and_state(rig: Rig) -> None:
+    assert repr(rig.device) == "<Device r1 established>"

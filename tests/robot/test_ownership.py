@@ -9,13 +9,14 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.clock import jumping
 from tests.tables import documented, executed
 from zbridge.bus import Answer, Handle, IncomingQuery, Lane
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.fleet.topics import KeySpace
 from zbridge.robot.ownership import ANNOUNCE_S, LOOKS, MOST_S, RIVALS, WATCH_S, Ownership
+
+pytestmark = pytest.mark.jumping
 
 KEYS = KeySpace("fleet", "r1")
 TOKEN = "fleet/r1/@alive/gateway"
@@ -37,7 +38,6 @@ class Slow(FakeBus):
         return Slow(zid, self._shared)
 
 
-@jumping
 async def test_the_only_gateway_takes_the_robot_and_shows_it() -> None:
     bus = FakeBus("1")
     claim = Ownership(bus, KEYS)
@@ -47,7 +47,6 @@ async def test_the_only_gateway_takes_the_robot_and_shows_it() -> None:
     assert await bus.join("2").alive("fleet/*/@alive/*") == [TOKEN]
 
 
-@jumping
 async def test_a_second_gateway_waits_until_the_first_goes_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
     bus = FakeBus("5")
     first, second = Ownership(bus, KEYS), Ownership(bus.join("1"), KEYS)
@@ -63,7 +62,6 @@ async def test_a_second_gateway_waits_until_the_first_goes_and_says_so_once(capl
     assert repr(second) == "<Ownership r1 held>"
 
 
-@jumping
 async def test_gateways_of_different_robots_do_not_meet() -> None:
     bus = FakeBus("1")
     await Ownership(bus, KEYS).take()
@@ -72,7 +70,6 @@ async def test_gateways_of_different_robots_do_not_meet() -> None:
 
 
 @pytest.mark.parametrize("zids", [("1", "2"), ("2", "1"), ("a", "b"), ("b", "a")])
-@jumping
 async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: tuple[str, str]) -> None:
     bus = Slow(zids[0])
     claims = {zids[0]: Ownership(bus, KEYS), zids[1]: Ownership(bus.join(zids[1]), KEYS)}
@@ -85,7 +82,6 @@ async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: t
     await asyncio.wait_for(takes[loser], 1.0)
 
 
-@jumping
 async def test_of_many_that_start_together_exactly_one_goes_on() -> None:
     bus = Slow("0")
     claims = [Ownership(bus, KEYS), *(Ownership(bus.join(str(number)), KEYS) for number in range(1, 6))]
@@ -97,7 +93,6 @@ async def test_of_many_that_start_together_exactly_one_goes_on() -> None:
     await asyncio.gather(*takes, return_exceptions=True)
 
 
-@jumping
 async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id() -> None:
     bus = Slow("9")
     first = Ownership(bus, KEYS)
@@ -112,21 +107,18 @@ async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id() -> Non
         await second
 
 
-@jumping
 async def test_a_gateway_starts_although_nobody_else_is_on_the_bus_yet() -> None:
     bus = FakeBus("1")
     bus.connection(False)
     await asyncio.wait_for(Ownership(bus, KEYS).take(), 1.0)
 
 
-@jumping
 async def test_an_answer_that_is_no_map_does_not_decide() -> None:
     bus = FakeBus("5")
     bus.join("1").answer("fleet/r1/@rpc/claim/gateway", lambda question: question.answer(b"\xc1"))
     await asyncio.wait_for(Ownership(bus, KEYS).take(), 1.0)
 
 
-@jumping
 async def test_a_released_claim_leaves_nothing_behind_and_releasing_twice_does_no_harm() -> None:
     bus = FakeBus("1")
     claim = Ownership(bus, KEYS)
@@ -175,7 +167,6 @@ IMPLAUSIBLE = [
 
 
 @pytest.mark.parametrize("claim", IMPLAUSIBLE, ids=range(len(IMPLAUSIBLE)))
-@jumping
 async def test_what_nobody_can_claim_is_no_claim(claim: Any) -> None:
     bus = FakeBus("5")
     forge(bus.join("1"), claim)
@@ -188,7 +179,6 @@ async def test_what_nobody_can_claim_is_no_claim(claim: Any) -> None:
     await watch.end()
 
 
-@jumping
 async def test_whoever_goes_on_answering_delays_a_start_and_nothing_else() -> None:
     bus = FakeBus("1")
     forged = forge(bus.join("9"), {"held_s": 3600.0, "has": True})
@@ -199,14 +189,12 @@ async def test_whoever_goes_on_answering_delays_a_start_and_nothing_else() -> No
     await asyncio.wait_for(taking, 1.0)
 
 
-@jumping
 async def test_whose_claim_it_is_the_bus_tells_and_no_payload() -> None:
     bus = FakeBus("5")
     forge(bus.join("9"), {"held_s": 0.0, "zid": "1"})
     await asyncio.wait_for(Ownership(bus, KEYS).take(), 1.0)  # of two that begin the lower one goes on: 5
 
 
-@jumping
 async def test_what_one_answers_several_times_counts_once() -> None:
     bus, evil = FakeBus("5"), {"held_s": 3600.0, "has": True}
     forge(bus.join("9"), {"held_s": 0.0}, evil, evil)
@@ -218,7 +206,6 @@ async def test_what_one_answers_several_times_counts_once() -> None:
     await watch.end()
 
 
-@jumping
 async def test_a_crowd_of_weak_claims_hides_no_good_one() -> None:
     bus = FakeBus("5")
     for number in range(3 * RIVALS):
@@ -231,7 +218,6 @@ async def test_a_crowd_of_weak_claims_hides_no_good_one() -> None:
     taking.cancel()
 
 
-@jumping
 async def test_a_token_without_a_claim_behind_it_is_said_once_and_ignored(caplog: pytest.LogCaptureFixture) -> None:
     bus = FakeBus("5")
     bus.join("1").announce(TOKEN)
@@ -242,7 +228,6 @@ async def test_a_token_without_a_claim_behind_it_is_said_once_and_ignored(caplog
     ]
 
 
-@jumping
 async def test_a_gateway_that_does_not_answer_at_once_is_waited_for() -> None:
     class Silent(FakeBus):
         """The first questions find no answer, as where a gateway is busy."""
@@ -285,7 +270,6 @@ EVIL = [{"held_s": 3600.0, "has": True}, {"held_s": MOST_S, "has": True}, {"held
 
 
 @pytest.mark.parametrize("claim", EVIL)
-@jumping
 async def test_a_gateway_that_has_its_robot_leaves_it_to_nobody_and_tells_of_them(claim: dict[str, Any]) -> None:
     bus = FakeBus("5")
     ours = Ownership(bus, KEYS)
@@ -307,7 +291,6 @@ async def test_a_gateway_that_has_its_robot_leaves_it_to_nobody_and_tells_of_the
     await watch.end()
 
 
-@jumping
 async def test_others_are_found_while_the_bus_stays() -> None:
     bus = FakeBus("5")
     ours = Ownership(bus, KEYS)
@@ -330,10 +313,7 @@ HEALED = [
 
 
 @pytest.mark.parametrize(("first_has", "second_has", "left"), HEALED)
-@jumping
-async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it(
-    first_has: bool, second_has: bool, left: tuple[bool, bool]
-) -> None:
+async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it(first_has, second_has, left) -> None:
     bus, other = FakeBus("9"), FakeBus("1")
     clock = asyncio.get_running_loop().time
     first, second = Ownership(bus, KEYS, clock), Ownership(other, KEYS, clock)
@@ -396,7 +376,6 @@ class Distant(FakeBus):
 
 
 @pytest.mark.parametrize("count", [2, 3])
-@jumping
 async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hundred(count: int) -> None:
     settled = []
     for seed in range(100):

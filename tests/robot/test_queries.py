@@ -4,11 +4,12 @@ import asyncio
 
 import pytest
 
-from tests.clock import jumping
 from zbridge.bus.fake import FakeQuery
 from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.robot.queries import WAITING, PendingQueries
+
+pytestmark = pytest.mark.jumping
 
 
 def questions() -> PendingQueries:
@@ -19,7 +20,6 @@ def question() -> FakeQuery:
     return FakeQuery("fleet/r1/@rpc/map")
 
 
-@jumping
 async def test_the_first_question_of_a_topic_must_be_put_to_the_robot_and_the_others_not() -> None:
     waiting = questions()
     assert not waiting.waiting
@@ -29,7 +29,6 @@ async def test_the_first_question_of_a_topic_must_be_put_to_the_robot_and_the_ot
     assert waiting
 
 
-@jumping
 async def test_an_answer_goes_to_all_who_wait_for_its_topic_once() -> None:
     waiting = questions()
     first, second, other = question(), question(), question()
@@ -44,12 +43,10 @@ async def test_an_answer_goes_to_all_who_wait_for_its_topic_once() -> None:
     assert waiting.add(topics.MAP, question()), "the next one asks anew"
 
 
-@jumping
 async def test_an_answer_nobody_waits_for_is_no_error() -> None:
     questions().answer(topics.MAP, b"map")
 
 
-@jumping
 async def test_a_question_is_refused_when_its_own_time_is_over() -> None:
     waiting = questions()
     first, second = question(), question()
@@ -64,7 +61,6 @@ async def test_a_question_is_refused_when_its_own_time_is_over() -> None:
     assert not waiting.waiting
 
 
-@jumping
 async def test_an_answered_question_is_not_refused_later() -> None:
     waiting = questions()
     asked = question()
@@ -74,7 +70,6 @@ async def test_an_answered_question_is_not_refused_later() -> None:
     assert len(asked.replies) == 1
 
 
-@jumping
 async def test_a_removed_question_gets_no_reply() -> None:
     waiting = questions()
     asked = question()
@@ -87,7 +82,6 @@ async def test_a_removed_question_gets_no_reply() -> None:
     assert asked.replies == []
 
 
-@jumping
 async def test_all_who_wait_can_be_refused_at_once() -> None:
     waiting = questions()
     first, second = question(), question()
@@ -99,7 +93,6 @@ async def test_all_who_wait_can_be_refused_at_once() -> None:
     assert not waiting.waiting
 
 
-@jumping
 async def test_one_question_too_many_is_refused_and_the_others_go_on_waiting() -> None:
     waiting = questions()
     asked = [question() for _ in range(WAITING)]
@@ -111,7 +104,6 @@ async def test_one_question_too_many_is_refused_and_the_others_go_on_waiting() -
     assert all(len(each.replies) == 1 for each in asked)
 
 
-@jumping
 async def test_questions_print_what_they_wait_for() -> None:
     waiting = questions()
     waiting.add(topics.MAP, question())

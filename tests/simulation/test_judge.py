@@ -1,7 +1,5 @@
 """What every judge keeps."""
 
-from __future__ import annotations
-
 import pytest
 
 from zbridge.simulation.judge import Judge

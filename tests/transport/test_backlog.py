@@ -1,7 +1,5 @@
 """Since when bytes have waited for their acknowledgement."""
 
-from __future__ import annotations
-
 from zbridge.transport.backlog import ENTRIES, Backlog
 
 

@@ -5,13 +5,14 @@ import logging
 
 import pytest
 
-from tests.clock import jumping
 from tests.protocol.test_session import LIMITS, Toy
 from zbridge.errors import NotReady
 from zbridge.metrics import Count
 from zbridge.protocol.session import LINGER_S, State
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
+
+pytestmark = pytest.mark.jumping
 
 WELCOME = b"\x07welcome"
 
@@ -39,7 +40,6 @@ def established() -> Rig:
     return rig
 
 
-@jumping
 async def test_a_link_that_is_up_opens_the_session_and_writes_its_first_frame() -> None:
     rig = Rig()
     rig.conversation.attached(rig.link)
@@ -48,7 +48,6 @@ async def test_a_link_that_is_up_opens_the_session_and_writes_its_first_frame() 
     assert rig.happened == [State.HANDSHAKING]
 
 
-@jumping
 async def test_a_change_of_state_is_told_before_the_messages_of_the_same_read() -> None:
     rig = Rig()
     rig.conversation.attached(rig.link)
@@ -56,7 +55,6 @@ async def test_a_change_of_state_is_told_before_the_messages_of_the_same_read() 
     assert rig.happened == [State.HANDSHAKING, State.ESTABLISHED, [b"a", b"b"]]
 
 
-@jumping
 async def test_a_doubt_is_told_when_it_comes_and_when_it_goes() -> None:
     rig = established()
     for doubts in (("client id 3",), ("client id 3",), ()):
@@ -65,7 +63,6 @@ async def test_a_doubt_is_told_when_it_comes_and_when_it_goes() -> None:
     assert rig.happened == [State.ESTABLISHED, State.ESTABLISHED]
 
 
-@jumping
 async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_look() -> None:
     """The look comes before everything that is written: it stops a robot whose driver is silent."""
     clock_s, looks = [0.0], []
@@ -94,7 +91,6 @@ async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_l
     conversation.abandon()
 
 
-@jumping
 async def test_a_read_without_a_whole_message_delivers_nothing() -> None:
     rig = established()
     rig.conversation.received(b"\x05ab")
@@ -103,7 +99,6 @@ async def test_a_read_without_a_whole_message_delivers_nothing() -> None:
     assert rig.happened == [[b"abcde"]]
 
 
-@jumping
 async def test_frames_are_written_one_at_a_time_with_the_gap_between_them() -> None:
     rig = established()
     await asyncio.sleep(1)
@@ -117,7 +112,6 @@ async def test_frames_are_written_one_at_a_time_with_the_gap_between_them() -> N
     assert rig.link.written == [b"\x01a", b"\x01b", b"\x01c"]
 
 
-@jumping
 async def test_nothing_is_written_to_a_link_that_is_not_ready_until_it_is() -> None:
     rig = established()
     await asyncio.sleep(1)
@@ -131,7 +125,6 @@ async def test_nothing_is_written_to_a_link_that_is_not_ready_until_it_is() -> N
     assert rig.link.written == [b"\x01a"]
 
 
-@jumping
 async def test_an_unfinished_handshake_ends_the_conversation_and_its_link() -> None:
     rig = Rig()
     rig.conversation.attached(rig.link)
@@ -144,7 +137,6 @@ async def test_an_unfinished_handshake_ends_the_conversation_and_its_link() -> N
     assert rig.happened == [State.HANDSHAKING, State.CLOSED]
 
 
-@jumping
 async def test_a_lost_link_ends_the_conversation() -> None:
     rig = established()
     rig.conversation.lost("closed by peer")
@@ -157,7 +149,6 @@ async def test_a_lost_link_ends_the_conversation() -> None:
     assert rig.link.written == []
 
 
-@jumping
 async def test_closing_writes_what_waits_and_then_closes_the_link() -> None:
     rig = established()
     rig.session.send(b"a")
@@ -171,7 +162,6 @@ async def test_closing_writes_what_waits_and_then_closes_the_link() -> None:
     assert rig.session.reason == "enough"
 
 
-@jumping
 async def test_closing_does_not_wait_long_for_a_link_that_takes_nothing() -> None:
     rig = established()
     rig.link.ready = False
@@ -183,7 +173,6 @@ async def test_closing_does_not_wait_long_for_a_link_that_takes_nothing() -> Non
     assert rig.link.closed
 
 
-@jumping
 async def test_a_broken_stream_ends_conversation_and_link_after_the_messages_before_it() -> None:
     rig = established()
     rig.conversation.received(b"\x01a\xff")
@@ -192,7 +181,6 @@ async def test_a_broken_stream_ends_conversation_and_link_after_the_messages_bef
     assert rig.link.closed
 
 
-@jumping
 async def test_messages_before_the_peers_farewell_are_delivered_before_the_end_is_told() -> None:
     rig = established()
     rig.conversation.received(b"\x01a\x03bye\x01b")
@@ -203,7 +191,6 @@ async def test_messages_before_the_peers_farewell_are_delivered_before_the_end_i
     assert rig.link.written == [b"\x07bye too"]
 
 
-@jumping
 async def test_malformed_messages_are_counted() -> None:
     count = Count()
     session = Toy(LIMITS, name="robot")
@@ -229,7 +216,6 @@ class Wary(Toy):
             raise NotReady("not taken")
 
 
-@jumping
 async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say() -> None:
     rivals, refused = Count(), []
     loop = asyncio.get_running_loop()
@@ -248,7 +234,6 @@ async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say
     assert session.reason == "rivalled"
 
 
-@jumping
 async def test_a_session_that_drops_its_source_has_its_link_forget_it() -> None:
     rig = established()
     rig.conversation.pump()
@@ -259,7 +244,6 @@ async def test_a_session_that_drops_its_source_has_its_link_forget_it() -> None:
     assert rig.link.sources_dropped == 1
 
 
-@jumping
 async def test_abandoning_ends_everything_at_once_and_twice_does_no_harm() -> None:
     rig = established()
     rig.session.send(b"a")
@@ -271,14 +255,12 @@ async def test_abandoning_ends_everything_at_once_and_twice_does_no_harm() -> No
     assert rig.session.state is State.CLOSED
 
 
-@jumping
 async def test_a_conversation_that_never_had_a_link_can_be_abandoned() -> None:
     rig = Rig()
     rig.conversation.abandon()
     assert rig.conversation.ended.done()
 
 
-@jumping
 async def test_an_ended_conversation_leaves_no_timer_behind() -> None:
     rig = Rig()
     rig.conversation.attached(rig.link)
@@ -288,7 +270,6 @@ async def test_an_ended_conversation_leaves_no_timer_behind() -> None:
     assert rig.happened == happened
 
 
-@jumping
 async def test_pause_and_resume_are_passed_to_the_link_while_there_is_one() -> None:
     rig = established()
     rig.conversation.pause()
@@ -300,7 +281,6 @@ async def test_pause_and_resume_are_passed_to_the_link_while_there_is_one() -> N
     assert not rig.link.paused
 
 
-@jumping
 async def test_malformed_messages_are_logged_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:
     rig = established()
     with caplog.at_level(logging.WARNING):
@@ -310,12 +290,10 @@ async def test_malformed_messages_are_logged_ever_more_rarely(caplog: pytest.Log
     assert "what is ?" in caplog.text
 
 
-@jumping
 async def test_a_conversation_prints_its_session() -> None:
     assert repr(Rig().conversation) == "<Conversation <Toy robot connecting>>"
 
 
-@jumping
 async def test_a_timer_that_does_not_tell_when_it_is_due_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """uvloop gives a plain handle for a timer that is due at once."""
     rig = established()

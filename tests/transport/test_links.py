@@ -674,9 +674,7 @@ async def test_a_robots_connection_is_kept_for_a_minute_and_what_was_lost_sent_a
             assert here.getsockopt(socket.IPPROTO_TCP, 44) == 1000
 
 
-async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkeypatch, caplog) -> None:
     def unknown(*_: object) -> bytes:
         raise OSError("Inappropriate ioctl for device")
 

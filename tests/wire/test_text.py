@@ -2,8 +2,6 @@
 binary message, which the same declaration makes. Texts and bytes are written by hand.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re
@@ -411,9 +409,7 @@ def test_an_array_that_readers_cannot_hold_is_an_encode_error(values: Any) -> No
         (b"5|10|-\n20|9", (5, [10, 20], 9)),
     ],
 )
-def test_everything_but_a_number_separates_around_an_array_too(
-    body: bytes, expected: tuple[int, list[int], int]
-) -> None:
+def test_everything_but_a_number_separates_around_an_array_too(body, expected) -> None:
     assert row(SWEEP.decode(body)) == expected
 
 
@@ -424,9 +420,7 @@ def test_everything_but_a_number_separates_around_an_array_too(
     ids=["10^400", "-10^400", "6000 nines", "2^63", "1.5"],
 )
 @pytest.mark.parametrize("separator", [b"|", b" x"], ids=["in order", "with garbage"])
-def test_a_number_that_is_too_large_or_no_integer_is_never_clipped_wherever_it_stands(
-    place: int, number: bytes, separator: bytes
-) -> None:
+def test_a_number_that_is_too_large_or_no_integer_is_never_clipped_wherever_it_stands(place, number, separator) -> None:
     fields = [b"5", b"10", b"20", b"30", b"9"]
     fields[place] = number
     with pytest.raises(ProtocolError) as caught:
@@ -487,9 +481,7 @@ def test_a_row_in_order_is_read_as_one_with_garbage_is(points: list[int], sequen
 
 
 @pytest.mark.parametrize("body", [b"1|2|3 4", b"1|2|3x4", b"1||2", b"x"])
-def test_a_numpy_that_only_warns_of_what_it_did_not_read_loses_no_field(
-    body: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_numpy_that_only_warns_of_what_it_did_not_read_loses_no_field(body, monkeypatch: pytest.MonkeyPatch) -> None:
     """numpy 1.26 to 2.3 warn and give what they have read; who runs a gateway has warnings ignored, not raised."""
 
     def fromstring(data: bytes, dtype: Any, *, sep: str) -> Any:

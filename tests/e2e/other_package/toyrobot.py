@@ -3,8 +3,6 @@
 The robot says ``at X Y HEADING`` ten times a second, and takes ``go FORWARD TURN``.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 from collections.abc import Iterable
@@ -23,8 +21,6 @@ from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Teleme
 from zbridge.protocol.session import Limits, Role, Session
 
 TEMPLATE = """\
-[robot]
-name = "{name}"
 [device]
 protocol = "toy"
 connect = ["tcp://127.0.0.1:4000"]
@@ -120,21 +116,21 @@ class ToyRobot(Robot):
 
 async def simulate(simulation: Simulation) -> None:
     """Be a robot that moves along x."""
-    place = [0.0, 0.0]
+    place, speed = [0.0, 0.0], [0.0, 0.0]
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         listening = asyncio.create_task(listen(reader))
         with contextlib.suppress(ConnectionError):
             while not listening.done():
-                place[0] += place[1] / 10
-                writer.write(b"at %f 0 0\n" % place[0])
+                place[:] = place[0] + speed[0] / 10, place[1] + speed[1] / 10
+                writer.write(b"at %f 0 %f\n" % (place[0], place[1]))
                 await writer.drain()
                 await asyncio.sleep(0.1)
         writer.close()
 
     async def listen(reader: asyncio.StreamReader) -> None:
         while line := await reader.readline():
-            place[1] = float(line.split()[1])
+            speed[:] = map(float, line.split()[1:])
 
     (address,) = simulation.addresses
     async with await asyncio.start_server(serve, address.host, address.port) as server:

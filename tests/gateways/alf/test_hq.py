@@ -1,7 +1,5 @@
 """What HQ programs of ALF are shown and what they command: texts and bytes of the protocol page, written by hand."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterable
@@ -23,7 +21,7 @@ from tests.captures import payloads, stream
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as fleet_payload
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner, Status
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.intent import Action, Intent
@@ -452,9 +450,7 @@ published = st.one_of(
 
 @pytest.mark.parametrize("dialect", DIALECTS)
 @given(history=st.lists(published, max_size=8), points=st.sampled_from([2, 12, 769]))
-def test_whatever_is_on_the_bus_deployed_receivers_break_on_nothing(
-    dialect: Any, history: list[tuple[Topic, FleetMessage]], points: int
-) -> None:
+def test_whatever_is_on_the_bus_deployed_receivers_break_on_nothing(dialect, history, points) -> None:
     """An ``EncodeError`` or ``ProtocolError`` is what a listener counts; it sends nothing then."""
     scene, readers = Scene(dialect=dialect, points=points), [Reader(dialect, points)]
     kinds: list[list[int]] = [[]]
@@ -534,9 +530,7 @@ def test_a_command_of_the_document_has_its_own_scales(said: str, drive: Drive) -
 @pytest.mark.parametrize(("protocol", "turn"), [("alf", -0.5), ("tcpudp", 0.0), ("wc2ec", 0.0), (None, 0.0)])
 @pytest.mark.parametrize("direction", [0, 1])
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_wheels_that_are_set_without_speed_turn_only_a_robot_that_has_some(
-    dialect: str, direction: int, protocol: str | None, turn: float
-) -> None:
+def test_wheels_that_are_set_without_speed_turn_only_a_robot_that_has_some(dialect, direction, protocol, turn) -> None:
     """45 degrees to the right; with forward 0 a vehicle only sets its wheels, by -turn, whatever the direction."""
     said = b"3|0|%d|45|0;" % direction if dialect == "text" else bytes((3, 0, direction, 135, 0))
     ((_, command),) = Scene(protocol=protocol, dialect=dialect).says(said)
@@ -592,7 +586,22 @@ def test_a_listener_is_auto_unless_told_otherwise() -> None:
 
 def test_what_its_programs_are_is_said_to_the_core() -> None:
     side = Scene().side
-    assert (side.name, side.deadman_s, side.steers, side.hold, side.modes) == ("alf", 0.3, True, False, False)
+    assert (side.name, side.deadman_s, side.initial_commands()) == ("alf", 0.3, ())
+
+
+@pytest.mark.parametrize(
+    ("command", "motion"),
+    [
+        (Drive(turn=0.5), False),
+        (Drive(light=True), False),
+        (Drive(forward=0.1, turn=0.5), True),
+        (Drive(left=0.1), True),
+        (Motor(0.5), True),
+        (Motor(0.0), False),
+    ],
+)
+def test_a_turn_without_speed_sets_the_wheels_and_is_no_motion(command: Drive | Motor, motion: bool) -> None:
+    assert Scene().side.is_motion(command) is motion
 
 
 # Drive, laser or both
@@ -600,12 +609,7 @@ def test_what_its_programs_are_is_said_to_the_core() -> None:
 
 @pytest.mark.parametrize(
     ("serve", "kinds"),
-    [
-        ("auto", [b"2|", b"1|"]),
-        ("both", [b"2|", b"1|", b"4|"]),
-        ("laser", [b"2|", b"1|"]),
-        ("drive", [b"4|"]),
-    ],
+    [("auto", [b"2|", b"1|"]), ("both", [b"2|", b"1|", b"4|"]), ("laser", [b"2|", b"1|"]), ("drive", [b"4|"])],
 )
 def test_a_listener_serves_what_it_was_told_to(serve: str, kinds: list[bytes]) -> None:
     scene = Scene(serve=serve, clients=0)
@@ -723,9 +727,7 @@ def test_a_command_behind_end_is_none() -> None:
 
 
 @pytest.mark.parametrize(("dialect", "writer"), [("text", "write_text"), ("binary", "write_binary")])
-def test_a_message_is_encoded_once_however_many_clients_there_are(
-    dialect: str, writer: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_message_is_encoded_once_however_many_clients_there_are(dialect, writer, monkeypatch) -> None:
     write: Callable[[AlfMessage], bytes] = getattr(module, writer)
     encoded: list[str] = []
 
@@ -772,7 +774,7 @@ def test_the_recorded_hq_says_neutral_and_then_drives_right() -> None:
 
 def test_the_recorded_hq_acquires_with_its_first_motion_and_keeps_the_robot_to_its_end() -> None:
     scene, done = Scene(), []
-    intent = Intent(scene.side.deadman_s, modes=scene.side.modes)
+    intent = Intent(scene.side.deadman_s)
     for record in payloads("alf-drive.hex", destination=16668):
         now = record.seconds
         intent.heard(now)

@@ -1,15 +1,10 @@
 """The five messages and their framing in both dialects. Texts and bytes are written by hand from the protocol page."""
 
-from __future__ import annotations
-
 import math
-import warnings
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gateways.alf.messages import (
@@ -32,62 +27,28 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import AlfSession, HqSession, VehicleSession
+from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from tests.conformance.side import plain
+from tests.gateways.alf.golden import (
+    ALL,
+    BINARY,
+    DRIVE_BYTES,
+    GOLDEN_BINARY,
+    GOLDEN_TEXT,
+    INFO_BYTES,
+    INIT_BYTES,
+    MEASUREMENT_BYTES,
+    OF_HQ,
+    OF_VEHICLE,
+    TEXT,
+    heard,
+    session,
+)
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.protocol.session import State
 from zbridge.wire import FrameBuffer
 
-TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
-OF_VEHICLE, OF_HQ = frozenset({1, 2, 4, 255}), frozenset({3, 255})
-ALL = OF_VEHICLE | OF_HQ
 GOOGOL4 = b"1" + b"0" * 400
-
-MEASUREMENT_BYTES = bytes.fromhex(
-    "01 07000000 88130000"  # sequence 7, counter 5000
-    "e803000000000000 0000000000000000 fdffffffffffffff"  # 1000, 0, -3 mm
-    "01000000 02000000"
-)
-INIT_BYTES = bytes.fromhex("02 000007c3 00c4ef42 0000b43e 64000000 14000000 e0150000")
-DRIVE_BYTES = bytes.fromhex("03 50 00 78 01")
-INFO_BYTES = bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 00001242")
-END_BYTES = bytes.fromhex("ff 01")
-
-GOLDEN_TEXT: list[tuple[AlfMessage, bytes]] = [
-    (Measurement(7, 5000, np.array([1000, 0, 2147483647]), 1, 2), b"1|7|5000|1000|0|2147483647|1|2;"),
-    (ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600), b"2|-135.000000|119.882812|0.351562|100|20|5600;"),
-    (DriveCommand(80, 0, -30, True), b"3|80|0|-30|1;"),
-    (DriveCommand(255, 1, 90, False), b"3|255|1|90|0;"),
-    (
-        DriveInfo(10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999),
-        b"4|10|0.250000|-0.500000|0.987654|1.500000|-2.750000|123.456001|36.529999;",
-    ),
-    (End(), b"255|1;"),
-]
-GOLDEN_BINARY: list[tuple[AlfMessage, bytes]] = [
-    (Measurement(7, 5000, np.array([1000, 0, -3]), 1, 2), MEASUREMENT_BYTES),
-    (ScannerInit(-135.0, 119.8828125, 0.3515625, 100, 20, 5600), INIT_BYTES),
-    (DriveCommand(80, 0, 120, True), DRIVE_BYTES),
-    (DriveCommand(255, 1, 0, False), bytes.fromhex("03 ff 01 00 00")),
-    (DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5), INFO_BYTES),
-    (End(), END_BYTES),
-]
-
-
-def plain(message: AlfMessage) -> list[Any]:
-    """A message for comparing: its class and its values, an array as a list."""
-    values = (getattr(message, name) for name in message.__struct_fields__)
-    return [type(message), *(value.tolist() if isinstance(value, np.ndarray) else value for value in values)]
-
-
-def session(kind: type[AlfSession], dialect: Dialect, points: int = 3) -> AlfSession:
-    made = kind(dialect, points=points)
-    made.open(0.0)
-    return made
-
-
-def heard(by: AlfSession, *reads: bytes) -> list[list[Any]]:
-    return [plain(message) for read in reads for message in by.receive(read, 0.0)]
-
 
 # The table
 
@@ -104,25 +65,11 @@ def test_the_message_table_is_that_of_the_page() -> None:
     assert sent_by(Sender.HQ) == OF_HQ
 
 
-@pytest.mark.parametrize(("message", "golden"), GOLDEN_TEXT)
-def test_a_message_and_its_text_are_made_from_each_other(message: AlfMessage, golden: bytes) -> None:
-    assert write_text(message) == golden
-    assert plain(read_text(golden, ALL)) == plain(message)
-
-
-@pytest.mark.parametrize(("message", "golden"), GOLDEN_BINARY)
-def test_a_message_and_its_bytes_are_made_from_each_other(message: AlfMessage, golden: bytes) -> None:
-    assert write_binary(message) == golden
-    assert plain(read_binary(golden, ALL)) == plain(message)
-
-
 @pytest.mark.parametrize(
     ("message_id", "points", "size"),
     [(1, 769, 6169), (1, 726, 5825), (1, 0, 17), (2, 769, 25), (3, 769, 5), (4, 769, 18), (255, 769, 2)],
 )
-def test_the_id_and_the_number_of_points_give_the_length_of_a_binary_message(
-    message_id: int, points: int, size: int
-) -> None:
+def test_the_id_and_the_number_of_points_give_the_length_of_a_binary_message(message_id, points, size) -> None:
     assert binary_size(message_id, points) == size
 
 
@@ -197,7 +144,7 @@ def test_a_text_with_a_field_missing_or_empty_or_no_number_is_a_protocol_error(g
     for place in range(1, len(fields)):
         for instead in ([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]):
             broken = b"|".join(fields[:place] + instead + fields[place + 1 :]) + b";"
-            got = heard(session(HqSession, TEXT), broken) + heard(session(VehicleSession, TEXT), broken)
+            got = heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken)
             assert got == []
 
 
@@ -235,17 +182,6 @@ def test_tolerance_goes_no_further_than_the_readers_of_the_field_and_as_far() ->
 def test_bytes_that_are_no_message_are_a_protocol_error_that_says_why(golden: str, what: str) -> None:
     with pytest.raises(ProtocolError, match=what):
         read_binary(bytes.fromhex(golden), ALL)
-
-
-@pytest.mark.parametrize("golden", [golden for _, golden in GOLDEN_BINARY])
-def test_a_truncated_or_prolonged_binary_message_is_a_protocol_error(golden: bytes) -> None:
-    for length in range(1, len(golden)):
-        if golden[0] == 1 and (length - 17) % 8 == 0 and length >= 17:
-            continue  # a measurement of fewer points: the session knows how many there must be
-        with pytest.raises(ProtocolError):
-            read_binary(golden[:length], ALL)
-    with pytest.raises(ProtocolError):
-        read_binary(golden + b"\x00", ALL)
 
 
 def test_every_byte_of_light_but_zero_is_on() -> None:
@@ -290,47 +226,6 @@ def test_what_binary_cannot_carry_is_an_encode_error(message: AlfMessage) -> Non
 # Framing
 
 
-STREAMS = [
-    pytest.param(HqSession, TEXT, GOLDEN_TEXT, id="vehicle, text"),
-    pytest.param(VehicleSession, TEXT, GOLDEN_TEXT, id="hq, text"),
-    pytest.param(HqSession, BINARY, GOLDEN_BINARY, id="vehicle, binary"),
-    pytest.param(VehicleSession, BINARY, GOLDEN_BINARY, id="hq, binary"),
-]
-
-
-def sent_to(kind: type[AlfSession], golden: list[tuple[AlfMessage, bytes]]) -> tuple[list[list[Any]], list[bytes]]:
-    """What a session is sent but for END, twice over: as messages and as frames."""
-    ids = OF_VEHICLE if kind is HqSession else OF_HQ
-    pairs = [(message, frame) for message, frame in golden if message.spec.id in ids - {255}] * 2
-    return [plain(message) for message, _ in pairs], [frame for _, frame in pairs]
-
-
-@pytest.mark.parametrize(("kind", "dialect", "golden"), STREAMS)
-def test_a_stream_may_be_cut_at_every_byte(
-    kind: type[AlfSession], dialect: Dialect, golden: list[tuple[AlfMessage, bytes]]
-) -> None:
-    messages, frames = sent_to(kind, golden)
-    data = b"".join(frames)
-    for cut in range(len(data) + 1):
-        by = session(kind, dialect)
-        assert heard(by, data[:cut], data[cut:]) == messages
-        assert by.traffic.malformed == 0
-        assert by.traffic.frames_in == len(messages)
-
-
-@pytest.mark.parametrize(("kind", "dialect", "golden"), STREAMS)
-def test_a_stream_may_come_byte_by_byte_and_a_message_comes_with_its_last_byte(
-    kind: type[AlfSession], dialect: Dialect, golden: list[tuple[AlfMessage, bytes]]
-) -> None:
-    messages, frames = sent_to(kind, golden)
-    by = session(kind, dialect)
-    for message, frame in zip(messages, frames, strict=True):
-        *before, last = (heard(by, frame[at : at + 1]) for at in range(len(frame)))
-        assert not any(before)
-        assert last == [message]
-    assert by.traffic.malformed == 0
-
-
 @pytest.mark.parametrize("dialect", Dialect)
 def test_a_full_scan_comes_whole_byte_by_byte(dialect: Dialect) -> None:
     scan = Measurement(7, 5000, np.arange(1000, 1769), 44, 725)
@@ -339,18 +234,8 @@ def test_a_full_scan_comes_whole_byte_by_byte(dialect: Dialect) -> None:
     else:
         points = b"".join(mm.to_bytes(8, "little") for mm in range(1000, 1769))
         frame = bytes.fromhex("01 07000000 88130000") + points + bytes.fromhex("2c000000 d5020000")
-    by = session(HqSession, dialect, 769)
+    by = session(HqRole, dialect, 769)
     assert heard(by, *(frame[at : at + 1] for at in range(len(frame)))) == [plain(scan)]
-
-
-@pytest.mark.parametrize(("kind", "dialect", "golden"), STREAMS)
-def test_a_thousand_messages_may_come_in_one_read(
-    kind: type[AlfSession], dialect: Dialect, golden: list[tuple[AlfMessage, bytes]]
-) -> None:
-    messages, frames = sent_to(kind, golden)
-    by = session(kind, dialect)
-    assert heard(by, b"".join(frames) * 500) == messages * 500
-    assert by.traffic.malformed == 0
 
 
 @pytest.mark.parametrize("dialect", Dialect)
@@ -359,7 +244,7 @@ def test_a_thousand_scans_may_come_in_one_read(dialect: Dialect) -> None:
         frame = b"1|7|5000|" + b"1000|" * 769 + b"44|725;"
     else:
         frame = bytes.fromhex("01 07000000 88130000" + "e803000000000000" * 769 + "2c000000 d5020000")
-    by = session(HqSession, dialect, 769)
+    by = session(HqRole, dialect, 769)
     scans = by.receive(frame * 1000, 0.0)
     assert len(scans) == 1000
     assert all(isinstance(scan, Measurement) and (scan.points == 1000).all() for scan in scans)
@@ -378,7 +263,7 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
         held = max(held, len(buffer))
     assert held <= limit
     assert frames == reads * read_bytes // limit
-    by = session(HqSession, TEXT, 769)
+    by = session(HqRole, TEXT, 769)
     assert heard(by, *[b"1|7|" + b"7|" * 30_000] * 20) == []
     assert by.state is State.ESTABLISHED
     assert by.traffic.malformed >= 1
@@ -386,12 +271,10 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
 
 @pytest.mark.parametrize("length", [text_limit(769) + 100, 3 * text_limit(769), 500_000])
 @pytest.mark.parametrize("read_bytes", [1 << 20, 4096, 1000])
-def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(
-    length: int, read_bytes: int
-) -> None:
+def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(length, read_bytes) -> None:
     """The end of a message that is too long may look like one: cut anywhere, it must not drive a vehicle."""
     long = b"1" + b"|3|80|0|30|1" * (length // 12) + b";"
-    by = session(VehicleSession, TEXT, 769)
+    by = session(VehicleRole, TEXT, 769)
     data = long + b"3|50|1|-90|0;"
     assert heard(by, *(data[at : at + read_bytes] for at in range(0, len(data), read_bytes))) == [
         plain(DriveCommand(50, 1, -90, False))
@@ -405,14 +288,14 @@ def test_nothing_of_a_text_that_is_too_long_is_taken_for_a_message_wherever_it_i
     """And an END in it ends nothing."""
     limit = text_limit(769)
     for tail in (b"3|80|0|30|1;", b"255|1;"):
-        by = session(VehicleSession, TEXT, 769)
+        by = session(VehicleRole, TEXT, 769)
         long = b"1|" + b"9" * (limit - 2 - offset) + tail
         assert heard(by, long, b"3|50|1|-90|0;") == [plain(DriveCommand(50, 1, -90, False))]
         assert by.state is State.ESTABLISHED
 
 
 def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
-    by = session(HqSession, TEXT)
+    by = session(HqRole, TEXT)
     good = b"1|7|5000|1000|0|3|1|2;"
     bad = (b"1|7|5000|1000|0|3|1;", b"9|9;", b";", b"hello;", b"3|80|0|30|1;", b"4|1|2;", b"1|" + GOOGOL4 + b";")
     for number, text in enumerate(bad, 1):
@@ -426,18 +309,18 @@ def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
 @pytest.mark.parametrize(
     ("kind", "garbage"),
     [
-        (HqSession, b"\x00"),
-        (HqSession, bytes(10_000)),
-        (HqSession, bytes.fromhex("03 50 00 78 00")),
-        (HqSession, b"hello, vehicle"),
-        (HqSession, bytes(range(5, 255))),
-        (HqSession, b"]^-[\\"),
-        (VehicleSession, bytes.fromhex("00 01 02 04 05 fe")),
-        (VehicleSession, b"hello, hq"),
+        (HqRole, b"\x00"),
+        (HqRole, bytes(10_000)),
+        (HqRole, bytes.fromhex("03 50 00 78 00")),
+        (HqRole, b"hello, vehicle"),
+        (HqRole, bytes(range(5, 255))),
+        (HqRole, b"]^-[\\"),
+        (VehicleRole, bytes.fromhex("00 01 02 04 05 fe")),
+        (VehicleRole, b"hello, hq"),
     ],
 )
 def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[AlfSession], garbage: bytes) -> None:
-    golden = INFO_BYTES if kind is HqSession else DRIVE_BYTES
+    golden = INFO_BYTES if kind is HqRole else DRIVE_BYTES
     message = plain(read_binary(golden, ALL))
     for reads in ((garbage + golden,), (golden + garbage, golden), (garbage, golden)):
         by = session(kind, BINARY)
@@ -448,7 +331,7 @@ def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[A
 
 
 def test_binary_garbage_byte_by_byte_is_skipped_too() -> None:
-    by = session(HqSession, BINARY)
+    by = session(HqRole, BINARY)
     assert heard(by, *[b"\x00"] * 5000, INFO_BYTES) == [plain(DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5))]
     assert by.traffic.malformed >= 1
 
@@ -470,7 +353,7 @@ def test_a_binary_measurement_that_is_not_whole_is_kept_and_no_more_of_it_than_i
 
 
 def test_the_length_of_a_binary_measurement_may_change_while_the_link_stands() -> None:
-    by = session(HqSession, BINARY, 3)
+    by = session(HqRole, BINARY, 3)
     assert len(heard(by, MEASUREMENT_BYTES)) == 1
     by.points = 2
     shorter = bytes.fromhex("01 07000000 88130000 e803000000000000 0000000000000000 01000000 02000000")
@@ -496,54 +379,11 @@ PIECES = st.one_of(
 )
 
 
-@given(st.sampled_from(list(Dialect)), st.sampled_from([HqSession, VehicleSession]), st.lists(PIECES, max_size=12))
-def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(
-    dialect: Dialect, kind: type[AlfSession], reads: list[bytes]
-) -> None:
+@given(st.sampled_from(list(Dialect)), st.sampled_from([HqRole, VehicleRole]), st.lists(PIECES, max_size=12))
+def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(dialect, kind, reads) -> None:
     by = session(kind, dialect)
-    ids = OF_VEHICLE if kind is HqSession else OF_HQ
+    ids = OF_VEHICLE if kind is HqRole else OF_HQ
     for read in reads:
         for message in by.receive(read, 0.0):
             assert message.spec.id in ids
     assert by.state is State.ESTABLISHED or by.reason == "ended"
-
-
-@given(st.sampled_from(list(Dialect)), st.sampled_from([HqSession, VehicleSession]), st.data())
-def test_the_cut_of_a_random_stream_changes_none_of_its_messages(
-    dialect: Dialect, kind: type[AlfSession], data: st.DataObject
-) -> None:
-    stream = b"".join(data.draw(st.lists(PIECES, max_size=8)))
-    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=6)))
-    parts = [stream[start:end] for start, end in pairwise([0, *cuts, len(stream)])]
-    assert heard(session(kind, dialect), *parts) == heard(session(kind, dialect), stream)
-
-
-@given(st.one_of(st.binary(max_size=60), st.text("0123456789.|-", max_size=60).map(str.encode)))
-@example(b"1|7")
-def test_random_bytes_give_a_message_or_a_protocol_error(data: bytes) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for message_id in sorted(ALL):
-            for read, frame in (
-                (read_text, data + b";"),
-                (read_text, b"%d|%b;" % (message_id, data)),
-                (read_binary, bytes([message_id]) + data),
-                (read_binary, data or b"\x00"),
-            ):
-                try:
-                    message = read(frame, ALL)
-                except ProtocolError:
-                    continue
-                assert isinstance(message, AlfMessage)
-
-
-@given(st.integers(0, 2**31 - 1), st.integers(0, 1), st.integers(-90, 90), st.booleans())
-def test_every_drive_command_survives_text(speed: int, direction: int, steering: int, light: bool) -> None:
-    command = DriveCommand(speed, direction, steering, light)
-    assert read_text(write_text(command), OF_HQ) == command
-
-
-@given(st.integers(0, 255), st.integers(0, 255), st.integers(0, 255), st.booleans())
-def test_every_drive_command_survives_binary(speed: int, direction: int, steering: int, light: bool) -> None:
-    command = DriveCommand(speed, direction, steering, light)
-    assert read_binary(write_binary(command), OF_HQ) == command

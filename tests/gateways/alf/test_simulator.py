@@ -1,7 +1,5 @@
 """The simulated vehicle itself: what commands make it do, what it sees, and what it says of itself."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
-from gateways.alf.session import HqSession, VehicleSession
+from gateways.alf.session import HqRole, VehicleRole
 from gateways.alf.simulator import SCANNER, STEP_S, Car
 from zbridge.address import Address
 from zbridge.errors import ConfigError
@@ -294,9 +292,7 @@ def test_measurements_are_numbered_and_their_counter_is_in_milliseconds() -> Non
         (3.0, 2.0, 180, 0, 0.5),
     ],
 )
-def test_ranges_are_those_to_the_walls_and_boxes(
-    x: float, y: float, heading_deg: float, angle_deg: float, range_m: float
-) -> None:
+def test_ranges_are_those_to_the_walls_and_boxes(x, y, heading_deg, angle_deg, range_m) -> None:
     assert seen_m(car(x, y, math.radians(heading_deg)), angle_deg) == pytest.approx(range_m, abs=0.04)
 
 
@@ -379,7 +375,7 @@ def test_info_says_how_fast_it_turns_and_what_pulls_it_to_the_side(right_deg: in
 @pytest.mark.parametrize("speed", [0, 60, 100, 255])
 def test_everything_it_says_can_be_sent_and_is_read_back(speed: int, dialect: Dialect) -> None:
     told = car(dialect=dialect)
-    sender, reader = VehicleSession(dialect), HqSession(dialect)
+    sender, reader = VehicleRole(dialect), HqRole(dialect)
     for session in (sender, reader):
         session.open(0.0)
     for right_deg in (-90, 90):

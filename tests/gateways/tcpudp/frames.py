@@ -3,8 +3,6 @@
 Nothing here encodes with the code under test.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet

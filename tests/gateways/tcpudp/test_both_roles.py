@@ -1,7 +1,5 @@
 """Both roles back to back over a network that cuts, delays, loses, reorders and doubles, on a simulated clock."""
 
-from __future__ import annotations
-
 import heapq
 import random
 from collections.abc import Callable, Iterable
@@ -244,9 +242,7 @@ SAID = [(True, 1), (False, 0)]
 @example(robot_udp=True, hq_udp=True, weather=Weather(1, doubled=1.0), said=SAID)
 @example(robot_udp=True, hq_udp=True, weather=Weather(1, late=1.0), said=SAID)
 @settings(max_examples=100, deadline=None)
-def test_both_agree_whatever_the_network_does(
-    version: str, robot_udp: bool, hq_udp: bool, weather: Weather, said: list[tuple[bool, int]]
-) -> None:
+def test_both_agree_whatever_the_network_does(version, robot_udp, hq_udp, weather, said) -> None:
     robot, hq = ends(version, robot_udp=robot_udp, hq_udp=hq_udp)
     network = Network(robot, hq, weather)
     network.run(12.0)
@@ -280,9 +276,7 @@ RUBBISH = st.tuples(
 @pytest.mark.parametrize("version", VERSIONS)
 @given(udp=st.booleans(), weather=weathers, rubbish=st.lists(RUBBISH, max_size=12))
 @settings(max_examples=100, deadline=None)
-def test_rubbish_costs_at_most_the_session(
-    version: str, udp: bool, weather: Weather, rubbish: list[tuple[float, bool, bool, bytes]]
-) -> None:
+def test_rubbish_costs_at_most_the_session(version, udp, weather, rubbish) -> None:
     robot, hq = ends(version, robot_udp=udp, hq_udp=True)
     network = Network(robot, hq, weather)
     for at, to_hq, by_datagram, data in sorted(rubbish):

@@ -1,7 +1,5 @@
 """Both recorded sessions through the sessions of both roles, each segment and datagram at its recorded time."""
 
-from __future__ import annotations
-
 from gateways.tcpudp.messages import (
     ClientControllMode,
     ClientGetPosition,

@@ -37,11 +37,7 @@ SOON_S = 5.0
 PROBE_S = 0.3
 OLD = ("1.1", "1.2")
 VERSIONS = (*OLD, "1.3")
-ANSWERS = {
-    "1.1": (b"1.1", "0100000000"),
-    "1.2": (b"1.2", "010000000000"),
-    "1.3": (b"1.1,1.2,1.3", "01000000000000"),
-}
+ANSWERS = {"1.1": (b"1.1", "0100000000"), "1.2": (b"1.2", "010000000000"), "1.3": (b"1.1,1.2,1.3", "01000000000000")}
 FORWARD = Drive(forward=1.0)
 RIVAL = "another source of datagrams claims to be this client"
 VOID = "packets by UDP from another port than this client's are not taken"
@@ -116,8 +112,8 @@ class Scene:
 @contextlib.asynccontextmanager
 async def serving(**options: Any) -> AsyncIterator[Scene]:
     scene = Scene()
-    audience = RobotSubscription(scene.bus, KEYS, scene.metrics)
-    audience.open()
+    robot = RobotSubscription(scene.bus, KEYS, scene.metrics)
+    robot.open()
     plan = ListenerPlan(
         PROTOCOL,
         HqOptions(**{"client_port": scene.client_port, **options}),
@@ -125,9 +121,7 @@ async def serving(**options: Any) -> AsyncIterator[Scene]:
         HqSettings(protocol="tcpudp", listen="tcp://127.0.0.1:0"),
         (),
     )
-    scene.listener = Listener(
-        plan, "tcpudp", audience, scene.bus, KEYS, scene.manager, scene.metrics, lambda: scene.now
-    )
+    scene.listener = Listener(plan, "tcpudp", robot, scene.manager, scene.metrics, lambda: scene.now)
     task = asyncio.create_task(scene.listener.run())
     await asyncio.wait_for(scene.listener.ready.wait(), SOON_S)
     try:
@@ -235,8 +229,8 @@ class Program:
         """Say neutral, and that the stick is to drive."""
         await self.send(13)
         await self.send(10, struct.pack("<i", 2))
-        helm = self.scene.listener.clients[self.number].helm
-        await self.scene.until(lambda: helm.intent.mode == "manual")
+        operator = self.scene.listener.clients[self.number].operator
+        await self.scene.until(lambda: operator.intent.mode == "manual")
 
     async def drive(self, *, by_udp: bool) -> None:
         """Drive until the robot does."""
@@ -399,9 +393,7 @@ async def test_a_5_that_two_waiting_clients_could_have_sent_is_neithers(version:
 
 @pytest.mark.parametrize("sender", [None, 0, 1])
 @pytest.mark.parametrize("version", VERSIONS)
-async def test_an_attacker_whose_5_came_first_is_not_heard_and_the_client_is_let_go(
-    version: str, sender: int | None
-) -> None:
+async def test_an_attacker_whose_5_came_first_is_not_heard_and_the_client_is_let_go(version, sender) -> None:
     async with serving() as scene, program(scene, version) as client:
         await client.greet()
         with udp() as attacker:

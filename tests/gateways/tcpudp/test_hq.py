@@ -1,7 +1,5 @@
 """What HQ programs of each version are shown, and what they command. Bytes come from the protocol page, by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from itertools import pairwise
@@ -13,21 +11,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp import hq as hq_module
-from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq
+from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq, display
+from gateways.tcpudp.hq import client as client_module
 from gateways.tcpudp.maps import resampled, squared
 from gateways.tcpudp.messages import Packet, encode_packet
 from tests.captures import payloads
-from tests.gateways.tcpudp.frames import (
-    ANSWER_TRUE,
-    LISTED,
-    POSITION,
-    START,
-    Timed,
-    client_settings,
-    counted,
-    framed,
-)
+from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, POSITION, START, Timed, client_settings, counted, framed
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads_codec
 from zbridge.fleet import topics
@@ -191,9 +180,7 @@ def test_a_listener_without_datagrams_does_not_announce_them() -> None:
         ("1.3", ("joystick", "of tomorrow"), "01000100000000"),
     ],
 )
-def test_a_robot_of_the_same_protocol_is_announced_as_it_announced_itself(
-    version: str, features: tuple[str, ...], expected: str
-) -> None:
+def test_a_robot_of_the_same_protocol_is_announced_as_it_announced_itself(version, features, expected) -> None:
     assert flags(side(robot(version, *features))) == expected
 
 
@@ -464,9 +451,7 @@ ALL_OF_A_ROBOT: tuple[tuple[Topic, FleetMessage], ...] = (
     ("version", "ids"), [("1.1", [1, 51, 53, 55]), ("1.2", [1, 51, 53, 55, 60]), ("1.3", [1, 51, 53, 55, 60])]
 )
 @pytest.mark.parametrize("udp", [False, True])
-def test_a_client_gets_the_packets_that_its_version_knows_and_the_rest_is_counted(
-    version: str, ids: list[int], udp: bool
-) -> None:
+def test_a_client_gets_the_packets_that_its_version_knows_and_the_rest_is_counted(version, ids, udp) -> None:
     listener = side()
     client = joined(listener, version, udp=udp)
     for topic, message in ALL_OF_A_ROBOT:
@@ -752,9 +737,7 @@ def test_a_client_of_1_1_that_never_asked_gets_no_map_and_no_position(versions: 
 @pytest.mark.parametrize(
     ("asked", "topic", "shown"), [(ASK_MAP, topics.RPC_MAP, [53]), (ASK_POSE, topics.RPC_POSE, [55])]
 )
-def test_a_client_of_1_1_that_asked_for_one_gets_that_one_from_then_on(
-    asked: bytes, topic: Topic, shown: list[int]
-) -> None:
+def test_a_client_of_1_1_that_asked_for_one_gets_that_one_from_then_on(asked, topic, shown) -> None:
     listener = side(seen())
     client = joined(listener, "1.1", asks=False)
     assert said(listener, client, asked) == [(topic, Query())]
@@ -882,9 +865,7 @@ def test_full_scale_is_what_the_listener_says() -> None:
 @given(st.binary(min_size=12, max_size=12), st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
 @example(bytes.fromhex("ffff7f7f ffff7fff ffff7f7f"), 1.0, 1.0)
 @example(bytes.fromhex("01000000 01000000 01000000"), 1000.0, 1000.0)
-def test_whatever_a_stick_says_the_bus_takes_the_drive_or_there_is_none(
-    body: bytes, speed_full: float, turn_full: float
-) -> None:
+def test_whatever_a_stick_says_the_bus_takes_the_drive_or_there_is_none(body, speed_full, turn_full) -> None:
     listener = side(speed_full=speed_full, turn_full=turn_full)
     client = joined(listener)
     for packet in (framed(2, 11, body), framed(2, 12, body[:4])):
@@ -1007,9 +988,7 @@ def test_a_length_that_cannot_be_ends_the_session(length: str) -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.booleans())
-def test_whatever_a_client_sends_gives_commands_the_bus_takes_or_counts_as_malformed(
-    sent: list[tuple[int, bytes]], by_datagram: bool
-) -> None:
+def test_whatever_a_client_sends_gives_commands_the_bus_takes_or_counts_as_malformed(sent, by_datagram) -> None:
     listener = side()
     client = joined(listener, udp=by_datagram)
     for packet_id, body in sent:
@@ -1044,9 +1023,10 @@ class Counts:
             self.maps += 1
             return squared(grid, most)
 
-        monkeypatch.setattr(hq_module, "encode_packet", count_packet)
-        monkeypatch.setattr(hq_module, "resampled", count_resampled)
-        monkeypatch.setattr(hq_module, "squared", count_squared)
+        for module in (client_module, display):
+            monkeypatch.setattr(module, "encode_packet", count_packet)
+        monkeypatch.setattr(display, "resampled", count_resampled)
+        monkeypatch.setattr(display, "squared", count_squared)
 
 
 def crowd(listener: TcpUdpHq, of_each: int = 5) -> list[Timed]:
@@ -1065,9 +1045,7 @@ def crowd(listener: TcpUdpHq, of_each: int = 5) -> list[Timed]:
         (topics.RAW("tcpudp"), Raw(70, b"led")),
     ],
 )
-def test_a_message_is_encoded_once_for_clients_of_all_versions(
-    topic: Topic, message: FleetMessage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_message_is_encoded_once_for_clients_of_all_versions(topic, message, monkeypatch: pytest.MonkeyPatch) -> None:
     listener = side(known=(31, 40, 70))
     clients = crowd(listener)
     counts = Counts(monkeypatch)
@@ -1243,12 +1221,21 @@ def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]])
     return done
 
 
+def intent_of(listener: TcpUdpHq) -> Intent:
+    """The intent of a client that has just connected."""
+    intent = Intent(listener.deadman_s)
+    for topic, command in listener.initial_commands():
+        assert (topic, command) == (topics.CMD_MODE, Mode("none"))
+        assert intent.choose("none", 0.0) is Action.NOTHING
+    return intent
+
+
 @pytest.mark.parametrize("name", [OLD, NEW])
 def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> None:
     listener, client = captured(name)
-    assert (listener.deadman_s, listener.modes) == (1.3, True)
-    intent = Intent(listener.deadman_s, modes=listener.modes)
-    owed = "connected: let go of the stick first"
+    assert listener.deadman_s == 1.3
+    intent = intent_of(listener)
+    owed = "connected: release the stick first"
     assert carry_out(intent, replay(listener, client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
     again = replay(listener, client, name, late=10.0)
     assert carry_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]
@@ -1260,7 +1247,7 @@ def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> 
 @pytest.mark.parametrize("name", [OLD, NEW])
 def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> None:
     listener, client = captured(name)
-    intent = Intent(listener.deadman_s, modes=listener.modes)
+    intent = intent_of(listener)
     intent.neutral(0.0)
     commands = [entry for entry in replay(listener, client, name) if not isinstance(entry[2], Mode)]
     moved, rotated, stopped = carry_out(intent, commands)
@@ -1271,7 +1258,9 @@ def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> Non
 
 def test_ids_are_those_of_clients() -> None:
     listener = side(quiet_s=7.0)
-    assert (listener.numbers[0], listener.numbers[-1], len(listener.numbers)) == (2, 255, 254)
-    assert listener.quiet_s == 7.0
-    assert side().quiet_s == 2.0
+    numbers = listener.numbers(10)
+    assert [numbers.take(0.0) for _ in range(255)] == [*range(2, 256), None]
+    numbers.release(9, 100.0)
+    assert [numbers.take(now) for now in (106.9, 107.0)] == [None, 9]
+    assert HqOptions().quiet_s == 2.0
     assert connected(listener, 255).frames("tcp")[0][6] == 255

@@ -10,13 +10,14 @@ import pytest
 from gateways.tcpudp.messages import ClientControllMode, ServerSLAMMapPart
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
-from tests.clock import jumping
 from tests.gateways.tcpudp.frames import STOP, Timed, framed, server_settings
 from tests.robot.test_device import serving
 from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map
 from zbridge.protocol.session import State
+
+pytestmark = pytest.mark.jumping
 
 LISTED_14 = b"1.1,1.2,1.3,1.4"
 SIZE_30_10 = "1e000000 0a000000"
@@ -267,7 +268,6 @@ def for_2(settings: bytes) -> bytes:
     return settings[:6] + b"\x02" + settings[7:]
 
 
-@jumping
 async def test_a_robot_is_driven_stopped_and_asked_while_its_parts_come() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))
@@ -286,7 +286,6 @@ async def test_a_robot_is_driven_stopped_and_asked_while_its_parts_come() -> Non
         assert [shown["columns"] for shown in rig.values("map")] == [3] * 6
 
 
-@jumping
 async def test_a_question_before_the_first_part_is_answered_by_it() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))
@@ -302,7 +301,6 @@ async def test_a_question_before_the_first_part_is_answered_by_it() -> None:
         assert rig.written() == []
 
 
-@jumping
 async def test_a_question_that_no_part_answers_is_refused() -> None:
     async with serving() as rig:
         await rig.establish(for_2(SETTINGS))

@@ -3,8 +3,6 @@
 The protocol page: index = x * side + y, 0 unknown, 1 free, 2 obstacle.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -200,9 +198,7 @@ def test_an_announced_map_fits_covers_the_whole_and_keeps_every_obstacle(grid: M
     st.integers(1, 40), st.integers(1, 40), st.data(), st.floats(0.01, 1.0), st.integers(1, 50), st.floats(0.01, 1.0)
 )
 @example(3, 3, None, 0.1, 2, 0.15)
-def test_an_obstacle_is_shown_where_it_is(
-    rows: int, columns: int, data: st.DataObject | None, cell: float, side: int, cell_m: float
-) -> None:
+def test_an_obstacle_is_shown_where_it_is(rows, columns, data, cell, side, cell_m) -> None:
     row = data.draw(st.integers(0, rows - 1)) if data is not None else 1
     column = data.draw(st.integers(0, columns - 1)) if data is not None else 1
     cells = np.ones((rows, columns), np.uint8)

@@ -301,9 +301,7 @@ NEEDS = [
 
 @pytest.mark.parametrize(("message", "needs"), NEEDS, ids=lambda value: type(value).__name__)
 @pytest.mark.parametrize("feature", [feature for feature in Feature if feature is not Feature.UDP])
-def test_a_packet_is_sent_only_to_a_robot_that_announces_its_feature(
-    message: Packet, needs: tuple[Feature, ...], feature: Feature
-) -> None:
+def test_a_packet_is_sent_only_to_a_robot_that_announces_its_feature(message, needs, feature) -> None:
     flags = "".join("01" if each is feature else "00" for each in Feature)
     session = established_hq(flags=flags)
     if feature in needs:
@@ -316,9 +314,7 @@ def test_a_packet_is_sent_only_to_a_robot_that_announces_its_feature(
 
 
 @pytest.mark.parametrize(("message", "needs"), NEEDS, ids=lambda value: type(value).__name__)
-def test_a_forced_feature_is_used_although_the_robot_does_not_announce_it(
-    message: Packet, needs: tuple[Feature, ...]
-) -> None:
+def test_a_forced_feature_is_used_although_the_robot_does_not_announce_it(message, needs) -> None:
     session = established_hq(*needs, flags=NONE)
     session.send(message)
     assert session.outgoing(1.0) is not None

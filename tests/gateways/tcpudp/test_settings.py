@@ -1,7 +1,5 @@
 """Settings blocks against the protocol page and the recorded sessions; all bytes by hand."""
 
-from __future__ import annotations
-
 import pytest
 
 from gateways.tcpudp.messages import ClientSettings, ServerSettings, decode_packet

@@ -8,7 +8,6 @@ import pytest
 
 from gateways.tcpudp.session import HqSession, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
-from tests.clock import jumping
 from tests.gateways.tcpudp.frames import (
     ANSWER_FALSE,
     ANSWER_TRUE,
@@ -23,6 +22,8 @@ from tests.gateways.tcpudp.frames import (
 )
 from tests.robot.test_device import Rig, serving
 from zbridge.fleet import topics
+
+pytestmark = pytest.mark.jumping
 
 MALFORMED = framed(1, 51, b"\x01")
 TEXT = framed(1, 1, counted(b"hello"))
@@ -262,7 +263,6 @@ async def poor(rig: Rig) -> None:
     await rig.establish(settings(3))
 
 
-@jumping
 async def test_a_second_connection_with_two_signs_is_named_stopped_and_not_driven() -> None:
     async with serving() as rig:
         await poor(rig)
@@ -289,7 +289,6 @@ async def test_a_second_connection_with_two_signs_is_named_stopped_and_not_drive
             assert refusal["reason"] == f"connection in doubt: {LATER}; {MUTE}"
 
 
-@jumping
 async def test_a_robot_that_moves_is_stopped_when_the_second_sign_comes() -> None:
     async with serving() as rig:
         await poor(rig)
@@ -301,7 +300,6 @@ async def test_a_robot_that_moves_is_stopped_when_the_second_sign_comes() -> Non
         assert rig.last("control")["state"] == "held"
 
 
-@jumping
 async def test_stops_neutral_and_what_does_not_move_the_robot_go_out_on_a_poor_connection() -> None:
     async with serving() as rig:
         await poor(rig)
@@ -321,7 +319,6 @@ async def test_stops_neutral_and_what_does_not_move_the_robot_go_out_on_a_poor_c
             assert packet_id in {frame[5] for frame in rig.written()}
 
 
-@jumping
 async def test_when_a_sign_passes_the_robot_is_driven_after_a_neutral() -> None:
     async with serving() as rig:
         await poor(rig)
@@ -337,7 +334,6 @@ async def test_when_a_sign_passes_the_robot_is_driven_after_a_neutral() -> None:
         assert rig.written()[-1] == MOVE_3
 
 
-@jumping
 async def test_a_healthy_second_hq_is_driven() -> None:
     async with serving() as rig:
         await rig.establish(settings(3))
@@ -348,7 +344,6 @@ async def test_a_healthy_second_hq_is_driven() -> None:
         assert await rig.refusals() == []
 
 
-@jumping
 async def test_a_lost_robot_shows_why_it_was_lost_and_no_doubts() -> None:
     async with serving() as rig:
         await poor(rig)
@@ -360,7 +355,6 @@ async def test_a_lost_robot_shows_why_it_was_lost_and_no_doubts() -> None:
         assert (lost["state"], lost["reason"]) == ("offline", "closed by peer")
 
 
-@jumping
 async def test_the_states_of_a_connection_are_shown_once_each_though_it_has_a_sign() -> None:
     async with serving() as rig:
         await rig.settle()

@@ -10,7 +10,6 @@ import pytest
 
 from gateways.tcpudp.session import HqSession
 from gateways.tcpudp.translate import Options, TcpUdpRobot
-from tests.clock import jumping
 from tests.gateways.tcpudp.frames import LISTED, SIZE_100_10, START, server_settings
 from tests.robot.test_device import Program, Rig, established, serving
 from zbridge.errors import Refused
@@ -18,6 +17,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.session import State
+
+pytestmark = pytest.mark.jumping
 
 NONE, MANUAL, AUTONOMOUS = (bytes.fromhex(f"06000000 02 0a 0{mode}000000") for mode in (1, 2, 3))
 STOP = bytes.fromhex("02000000 02 0d")
@@ -348,7 +349,6 @@ async def stopped_by_reconnection(rig: Rig) -> None:
         stopped_by_reconnection,
     ],
 )
-@jumping
 async def test_whatever_stops_a_robot_in_mode_3_sends_the_pair(stopped: Callable[[Rig], object]) -> None:
     async with established() as rig:
         await in_mode_3(rig)
@@ -369,7 +369,6 @@ TRUE = bytes.fromhex("03000000 02 07 01")
 
 
 @pytest.mark.parametrize("who", ["stop", "nobody"])
-@jumping
 async def test_a_stop_in_the_silence_is_kept_and_is_the_first_packet_after_it(who: str) -> None:
     async with serving() as rig:
         await rig.settle()
@@ -391,7 +390,6 @@ async def test_a_stop_in_the_silence_is_kept_and_is_the_first_packet_after_it(wh
         assert set(rig.link.written[2:]) == {STOP}
 
 
-@jumping
 async def test_commands_in_the_silence_are_refused_with_their_code_and_reason() -> None:
     async with serving() as rig:
         await rig.settle()
@@ -414,7 +412,6 @@ async def test_commands_in_the_silence_are_refused_with_their_code_and_reason() 
 
 
 @pytest.mark.parametrize("stopped_in_silence", [False, True])
-@jumping
 async def test_after_a_reconnection_in_mode_3_the_pair_comes_first_after_the_silence(stopped_in_silence: bool) -> None:
     async with established() as rig:
         await in_mode_3(rig)

@@ -227,9 +227,7 @@ def test_packets_of_the_table_that_no_fleet_message_holds_are_raw(wire: Wire) ->
         (-0.6, -0.8, 0.8, -0.6, 1.0),
     ],
 )
-def test_translation_becomes_a_direction_x_right_y_forward_and_a_speed(
-    wire: Wire, forward: float, left: float, x: float, y: float, speed: float
-) -> None:
+def test_translation_becomes_a_direction_x_right_y_forward_and_a_speed(wire: Wire, forward, left, x, y, speed) -> None:
     assert wire.drive(forward, left) is None
     assert wire.moves() == pytest.approx((x, y, speed))
 

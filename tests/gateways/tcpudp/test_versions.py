@@ -46,13 +46,7 @@ ROWS = [
     pytest.param(b"1.1", "0000000000", b"1.1", "0000000000", "1.1", "", id="robot 1.1 with nothing"),
     pytest.param(b"1.2", "000001000001", b"1.2", "000000000001", "1.2", "joystick lidar_sim", id="robot 1.2"),
     pytest.param(
-        LISTED,
-        "00000100000001" + SIZE_100_10,
-        LISTED,
-        "00000000000100",
-        "1.3",
-        "joystick slam_map",
-        id="robot 1.3",
+        LISTED, "00000100000001" + SIZE_100_10, LISTED, "00000000000100", "1.3", "joystick slam_map", id="robot 1.3"
     ),
     pytest.param(
         LISTED_14,
@@ -78,9 +72,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("listed", "block", "answer", "answered", "version", "features"), ROWS)
-def test_a_robot_is_answered_with_what_it_understands(
-    listed: bytes, block: str, answer: bytes, answered: str, version: str, features: str
-) -> None:
+def test_a_robot_is_answered_with_what_it_understands(listed, block, answer, answered, version, features) -> None:
     timed = hq(listed, block)
     assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
     assert timed.session.state is State.ESTABLISHED
@@ -120,8 +112,7 @@ def test_a_version_list_that_cannot_be_answered_does_no_harm() -> None:
 
 
 @pytest.mark.parametrize(
-    ("listed", "block"),
-    [(b"1.1", "00000000"), (b"1.2", "0000000000"), (LISTED, "00" * 14), (LISTED_14, "00" * 7)],
+    ("listed", "block"), [(b"1.1", "00000000"), (b"1.2", "0000000000"), (LISTED, "00" * 14), (LISTED_14, "00" * 7)]
 )
 def test_a_settings_block_that_is_too_short_for_its_version_is_malformed(listed: bytes, block: str) -> None:
     timed = hq(listed, block)
@@ -191,9 +182,7 @@ def test_a_feature_nobody_knows_cannot_be_announced(announce: object) -> None:
         (LISTED_14, "00010101010100" + SIZE_100_10, False),
     ],
 )
-def test_map_and_position_are_asked_of_robots_that_know_the_question(
-    listed: bytes, block: str, sent: bool, question: Packet
-) -> None:
+def test_map_and_position_are_asked_of_robots_that_know_the_question(listed, block, sent, question) -> None:
     timed = hq(listed, block)
     if sent:
         timed.session.send(question)

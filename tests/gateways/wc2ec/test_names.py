@@ -1,17 +1,16 @@
 """A Webots robot that registers new names on every connection: what its gateway keeps of the old ones."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import struct
 from collections.abc import AsyncIterator
 
 import msgpack
+import pytest
 
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
-from tests.clock import jumping
+from tests.clock import scene_of
 from zbridge.address import Address
 from zbridge.bus import Publisher
 from zbridge.bus.fake import FakeBus
@@ -24,6 +23,8 @@ from zbridge.robot.device import Device
 from zbridge.robot.names import HOUR_S, NAMES
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
+
+pytestmark = pytest.mark.jumping
 
 SENSORS = 255
 TEXT = "more than 1024 different names within an hour: the others are not published"
@@ -116,59 +117,56 @@ async def serving() -> AsyncIterator[Webots]:
             await task
 
 
+webots = scene_of(serving)
+
+
 def names_of(connection: int) -> list[str]:
     return [f"c{connection}-s{number}" for number in range(SENSORS)]
 
 
-@jumping
-async def test_the_names_of_a_connection_that_is_gone_are_undeclared_and_those_above_the_bound_never_declared() -> None:
-    async with serving() as webots:
-        for connection in range(41):
-            names = names_of(connection)
-            webots.says(names)
-            published = connection < NAMES // SENSORS
-            assert webots.shown(names[-1]) == published
-            if published:
-                assert webots.bus.sensors == set(names)
-                assert webots.reason is None
-            await webots.goes()
-            assert webots.bus.sensors == set()
-        assert len(webots.device._publishers) < 10
-        assert webots.metrics.count("names_dropped").value == 41 * SENSORS - NAMES
-        assert webots.reason is not None
-        assert webots.reason.endswith(TEXT)
-
-
-@jumping
-async def test_a_robot_that_connects_again_with_its_names_is_published_as_before() -> None:
-    async with serving() as webots:
-        for connection in range(1, 41):
-            webots.says(names_of(0))
-            assert webots.shown("c0-s254") == connection
-            await webots.goes()
-        assert webots.metrics.count("names_dropped").value == 0
-
-
-@jumping
-async def test_an_hour_later_there_is_room_for_other_names_and_nothing_is_told_any_more() -> None:
-    async with serving() as webots:
-        for connection in range(5):
-            webots.says(names_of(connection))
-            await webots.goes()
-        assert TEXT in (webots.reason or "")
-        await asyncio.sleep(HOUR_S)
-        assert TEXT not in (webots.reason or "")
+async def test_the_names_of_a_connection_that_is_gone_are_undeclared_and_those_above_the_bound_never_declared(
+    webots: Webots,
+) -> None:
+    for connection in range(41):
+        names = names_of(connection)
+        webots.says(names)
+        published = connection < NAMES // SENSORS
+        assert webots.shown(names[-1]) == published
+        if published:
+            assert webots.bus.sensors == set(names)
+            assert webots.reason is None
         await webots.goes()
-        webots.says(names_of(5))
-        assert webots.shown("c5-s254") == 1
+        assert webots.bus.sensors == set()
+    assert len(webots.device._publishers) < 10
+    assert webots.metrics.count("names_dropped").value == 41 * SENSORS - NAMES
+    assert webots.reason is not None
+    assert webots.reason.endswith(TEXT)
 
 
-@jumping
-async def test_unregistered_devices_count_like_all_others() -> None:
-    async with serving() as webots:
-        webots.says(["front"])
-        for kind in range(256):
-            readings = b"".join(bytes((1, kind, number)) + struct.pack("<d", 1.0) for number in range(1, 256))
-            webots.conversations[-1].received(readings)
-        assert len(webots.bus.sensors) == NAMES
-        assert TEXT in (webots.reason or "")
+async def test_a_robot_that_connects_again_with_its_names_is_published_as_before(webots: Webots) -> None:
+    for connection in range(1, 41):
+        webots.says(names_of(0))
+        assert webots.shown("c0-s254") == connection
+        await webots.goes()
+    assert webots.metrics.count("names_dropped").value == 0
+
+
+async def test_an_hour_later_there_is_room_for_other_names_and_nothing_is_told_any_more(webots: Webots) -> None:
+    for connection in range(5):
+        webots.says(names_of(connection))
+        await webots.goes()
+    assert TEXT in (webots.reason or "")
+    await asyncio.sleep(HOUR_S)
+    assert TEXT not in (webots.reason or "")
+    await webots.goes()
+    webots.says(names_of(5))
+    assert webots.shown("c5-s254") == 1
+
+
+async def test_unregistered_devices_count_like_all_others(webots: Webots) -> None:
+    webots.says(["front"])
+    for kind in range(256):
+        readings = b"".join(bytes((1, kind, number)) + struct.pack("<d", 1.0) for number in range(1, 256))
+        webots.conversations[-1].received(readings)
+    assert len(webots.bus.sensors) == NAMES
+    assert TEXT in (webots.reason or "")

@@ -1,7 +1,5 @@
 """Sessions of WC2EC in both roles and dialects: bytes from the protocol page, by hand; time is an argument."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np
@@ -19,7 +17,7 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ControllerSession, ExternalSession, Wc2EcSession
+from gateways.wc2ec.session import ControllerRole, ExternalRole, Wc2EcSession
 from zbridge.errors import EncodeError
 from zbridge.protocol.session import Role, State
 
@@ -31,14 +29,14 @@ WHEEL_MESSAGE, DIST_MESSAGE = RegisterSensor(53, 0, b"wheel1"), RegisterSensor(3
 READING_MESSAGE = SensorData(37, 6, 750.5)
 
 
-def external(dialect: Dialect = DEPLOYED) -> ExternalSession:
-    session = ExternalSession(dialect)
+def external(dialect: Dialect = DEPLOYED) -> ExternalRole:
+    session = ExternalRole(dialect)
     session.open(0.0)
     return session
 
 
-def controller(dialect: Dialect = DEPLOYED, values: int = 3) -> ControllerSession:
-    session = ControllerSession(dialect, values=values)
+def controller(dialect: Dialect = DEPLOYED, values: int = 3) -> ControllerRole:
+    session = ControllerRole(dialect, values=values)
     session.open(0.0)
     return session
 
@@ -171,9 +169,7 @@ def test_an_error_is_harmless_and_delivered_and_no_registration() -> None:
         (DRAFT, b"", "82 00 03 00 0000"),
     ],
 )
-def test_an_unknown_command_ends_the_session_with_its_bytes_in_the_reason(
-    dialect: Dialect, first: bytes, bad: str
-) -> None:
+def test_an_unknown_command_ends_the_session_with_its_bytes_in_the_reason(dialect, first, bad) -> None:
     session, wrong = external(dialect), bytes.fromhex(bad)
     before = session.receive(first + wrong, 0.1)
     assert len(before) == {0: 0, len(WHEEL): 1, len(WHEEL + READING): 2, 11: 1}[len(first)]

@@ -1,7 +1,5 @@
 """The simulated robot itself: what commands make it do and what it senses, by the kinematics of two wheels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names, units, kinematics and refusals of WC2EC, worked out by hand from the page and the design."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tomllib
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 
 from gateways.wc2ec import PROTOCOL
-from gateways.wc2ec.session import ExternalSession
+from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from zbridge.app import config
@@ -51,10 +49,7 @@ WHEELS: dict[str, Any] = {
     }
 }
 FACTORS: dict[str, Any] = {
-    "factors": {
-        "fl": {"forward": 10.0, "left": -4.0, "turn": -3.0},
-        "fr": {"forward": 10.0, "left": 4.0, "turn": 3.0},
-    }
+    "factors": {"fl": {"forward": 10.0, "left": -4.0, "turn": -3.0}, "fr": {"forward": 10.0, "left": 4.0, "turn": 3.0}}
 }
 NAN, INF = math.nan, math.inf
 
@@ -110,7 +105,7 @@ class Wire:
         self.metrics = Metrics()
         self.robot = Wc2EcRobot(options or options_of(), 1, self.metrics)
         self.now = 0.0
-        self.session: ExternalSession
+        self.session: ExternalRole
         self.begun: tuple[tuple[Topic, FleetMessage], ...] = ()
         self.connect()
         if greeting:
@@ -260,10 +255,7 @@ def test_numbers_mean_nothing_but_where_they_are_told_to() -> None:
             wire.motor(name, 1.0)
     wire.motor("k60", 1.5)
     wire.motor("k62", 1.5)
-    assert wire.frames() == [
-        bytes.fromhex("82 3c 3c 000000000000f83f"),
-        bytes.fromhex("82 3e 3e 000000000000f83f"),
-    ]
+    assert wire.frames() == [bytes.fromhex("82 3c 3c 000000000000f83f"), bytes.fromhex("82 3e 3e 000000000000f83f")]
 
 
 def test_motors_may_be_listed_by_name_whatever_their_type() -> None:
@@ -413,8 +405,7 @@ def test_a_zero_as_a_bound_is_a_bound() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "metres"),
-    [(0.0, 1.0), (500.0, 0.51), (1000.0, 0.02), (250.0, 0.755), (-50.0, 1.0), (2000.0, 0.02)],
+    ("value", "metres"), [(0.0, 1.0), (500.0, 0.51), (1000.0, 0.02), (250.0, 0.755), (-50.0, 1.0), (2000.0, 0.02)]
 )
 def test_a_lookup_table_interpolates_and_ends_where_it_ends(value: float, metres: float) -> None:
     wire = Wire(options_of(tables={"front": [[0.0, 1.0], [1000.0, 0.02]]}), CAR)
@@ -625,9 +616,7 @@ def test_it_cannot_be_asked(wire: Wire, topic: Topic) -> None:
         ({}, 0.0, 0.0),
     ],
 )
-def test_a_drive_is_what_two_sides_of_wheels_make_of_it(
-    car: Wire, command: dict[str, float], left: float, right: float
-) -> None:
+def test_a_drive_is_what_two_sides_of_wheels_make_of_it(car: Wire, command, left, right) -> None:
     assert car.drive(**command) is None
     assert car.values() == pytest.approx({0: left, 2: left, 1: right, 3: right})
     car.later(10.0)

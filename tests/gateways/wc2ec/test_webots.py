@@ -1,7 +1,5 @@
 """The controller script for Webots, with a stand-in for Webots' own ``controller`` module and a real socket."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import socket
@@ -160,9 +158,7 @@ def test_what_is_no_motor_or_no_number_is_ignored(bridge: Any, gateway: socket.s
 
 
 @pytest.mark.parametrize("goes", [b"", bytes.fromhex("05") + bytes(10)])
-def test_motors_stand_when_the_gateway_goes_and_another_may_come(
-    bridge: Any, gateway: socket.socket, goes: bytes
-) -> None:
+def test_motors_stand_when_the_gateway_goes_and_another_may_come(bridge: Any, gateway: socket.socket, goes) -> None:
     gateway.sendall(bytes.fromhex("823500") + struct.pack("<d", 2.5))
     stepped(bridge, lambda: bridge.robot.wheel.velocity == 2.5)
     gateway.sendall(goes) if goes else gateway.close()

@@ -2,10 +2,9 @@
 
 import asyncio
 import contextlib
-import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -13,8 +12,8 @@ import pytest
 from gateways.alf.conformance.fragile_hq import FragileHq, simulate_fragile_hq
 from gateways.alf.conformance.parser import Dialect
 from tests.captures import stream
+from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
 
-LONG_S = 5.0
 DIALECTS: tuple[Dialect, ...] = ("text", "binary")
 POINTS = 5
 """Of a measurement in most tests."""
@@ -37,72 +36,16 @@ END: dict[Dialect, bytes] = {"text": b"255|1;", "binary": b"\xff\x01"}
 NEUTRAL: dict[Dialect, bytes] = {"text": b"3|0|0|0|0;", "binary": bytes.fromhex("03 00 00 5a 00")}
 
 
-class Vehicle:
-    """A plain listening socket and its one connection."""
-
-    def __init__(self) -> None:
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.server.setblocking(False)
-        self.port: int = self.server.getsockname()[1]
-        self.tcp = socket.socket()
-
-    async def accept(self) -> None:
-        self.tcp.close()
-        self.tcp, _ = await asyncio.get_running_loop().sock_accept(self.server)
-        self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    async def send(self, data: bytes) -> None:
-        await asyncio.get_running_loop().sock_sendall(self.tcp, data)
-
-    async def recv(self, most: int = 65536) -> bytes:
-        async with asyncio.timeout(LONG_S):
-            return await asyncio.get_running_loop().sock_recv(self.tcp, most)
-
-    async def read(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
-            part = await self.recv(size - len(data))
-            assert part, data
-            data += part
-        return data
-
-    async def read_until(self, words: bytes) -> None:
-        data = b""
-        while words not in data:
-            data += await self.read(1)
-
-    async def read_to_the_end(self) -> bytes:
-        data = b""
-        with contextlib.suppress(ConnectionError):
-            while part := await self.recv():
-                data += part
-        return data
-
-    def close(self) -> None:
-        self.tcp.close()
-        self.server.close()
+class Vehicle(Listening):
+    send = Listening.send_bytes
 
 
 @contextlib.asynccontextmanager
 async def facing(hq: FragileHq) -> AsyncIterator[tuple[Vehicle, "asyncio.Task[None]"]]:
-    vehicle = Vehicle()
-    task = asyncio.create_task(hq.run("127.0.0.1", vehicle.port))
-    try:
-        await vehicle.accept()
+    async with calling(hq, Vehicle(), Scene) as scene:
+        await scene.peer.accept()
         await hq.connected.wait()
-        yield vehicle, task
-    finally:
-        vehicle.close()
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(holds: Callable[[], Any], what: object) -> None:
-    deadline = time.monotonic() + LONG_S
-    while not holds():
-        assert time.monotonic() < deadline, what
-        await asyncio.sleep(0.002)
+        yield scene.peer, scene.task
 
 
 def viewer(dialect: Dialect = "text", **options: Any) -> FragileHq:
@@ -258,17 +201,13 @@ async def test_an_end_of_the_connection_without_end_is_a_violation(dialect: Dial
 
 async def test_an_end_of_the_connection_within_a_message_is_a_violation_more() -> None:
     hq = await after(INIT["text"] + b"4|10", viewer())
-    assert hq.violations == [
-        "the connection ended within a message: '4|10'",
-        "the vehicle closed without END: EOF",
-    ]
+    assert hq.violations == ["the connection ended within a message: '4|10'", "the vehicle closed without END: EOF"]
 
 
 async def test_a_reset_without_end_is_a_violation() -> None:
     hq = viewer()
     async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        vehicle.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        vehicle.tcp.close()
+        vehicle.reset()
         await task
     assert len(hq.violations) == 1
     assert hq.violations[0].startswith("the vehicle closed without END: ConnectionResetError")
@@ -356,8 +295,7 @@ async def test_it_stands_at_first_and_repeats_its_command_for_ever(dialect: Dial
 
 
 @pytest.mark.parametrize(
-    ("dialect", "told"),
-    [("text", b"3|255|1|-90|1;"), ("binary", bytes.fromhex("03 64 01 00 01"))],
+    ("dialect", "told"), [("text", b"3|255|1|-90|1;"), ("binary", bytes.fromhex("03 64 01 00 01"))]
 )
 async def test_drive_and_idle_change_what_is_repeated(dialect: Dialect, told: bytes) -> None:
     hq = FragileHq(dialect=dialect, repeat_s=0.002)
@@ -467,9 +405,7 @@ async def test_nobody_listening_is_an_error() -> None:
         await viewer().run("127.0.0.1", vehicle.port)
 
 
-async def test_the_program_logs_and_prints_what_it_died_of(
-    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     vehicle = Vehicle()
     task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", vehicle.port, dialect="text", points=POINTS))
     async with asyncio.timeout(LONG_S):

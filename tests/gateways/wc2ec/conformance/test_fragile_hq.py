@@ -2,17 +2,15 @@
 
 import asyncio
 import contextlib
-import socket
-import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 
 from gateways.wc2ec.conformance.fragile_hq import FragileController, simulate_fragile_hq
 from tests.captures import stream
+from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
 
-LONG_S = 5.0
 WHEEL1 = bytes.fromhex("00 35 00 06 77 68 65 65 6c 31")
 SLIDER = bytes.fromhex("00 2e 04 0e 73 6c 69 64 65 72 5f 63 75 72 62 5f 6c 66")
 MID_FRONT = bytes.fromhex("00 25 06 06 6d 69 73 74 5f 66")
@@ -25,60 +23,16 @@ LIGHT = bytes.fromhex("00 00 02 00 00 00 00 00 00 f8 3f")
 ERROR = bytes.fromhex("7f 00 00")
 
 
-class Webots:
-    """A plain listening socket and its one connection."""
-
-    def __init__(self) -> None:
-        self.server = socket.create_server(("127.0.0.1", 0))
-        self.server.setblocking(False)
-        self.port: int = self.server.getsockname()[1]
-        self.tcp = socket.socket()
-
-    async def accept(self) -> None:
-        self.tcp.close()
-        self.tcp, _ = await asyncio.get_running_loop().sock_accept(self.server)
-        self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    async def send(self, data: bytes) -> None:
-        await asyncio.get_running_loop().sock_sendall(self.tcp, data)
-
-    async def recv(self) -> bytes:
-        async with asyncio.timeout(LONG_S):
-            return await asyncio.get_running_loop().sock_recv(self.tcp, 65536)
-
-    async def read(self, size: int) -> bytes:
-        data = b""
-        while len(data) < size:
-            part = await self.recv()
-            assert part, data
-            data += part
-        return data
-
-    def close(self) -> None:
-        self.tcp.close()
-        self.server.close()
+class Webots(Listening):
+    send = Listening.send_bytes
 
 
 @contextlib.asynccontextmanager
 async def facing(controller: FragileController) -> AsyncIterator[tuple[Webots, "asyncio.Task[None]"]]:
-    webots = Webots()
-    task = asyncio.create_task(controller.run("127.0.0.1", webots.port))
-    try:
-        await webots.accept()
+    async with calling(controller, Webots(), Scene) as scene:
+        await scene.peer.accept()
         await controller.connected.wait()
-        yield webots, task
-    finally:
-        webots.close()
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(holds: Callable[[], Any], what: object) -> None:
-    deadline = time.monotonic() + LONG_S
-    while not holds():
-        assert time.monotonic() < deadline, what
-        await asyncio.sleep(0.002)
+        yield scene.peer, scene.task
 
 
 async def after(data: bytes, **options: Any) -> FragileController:
@@ -227,8 +181,7 @@ async def test_a_measurement_that_is_no_number_is_an_event() -> None:
 async def test_a_reset_is_an_event_too() -> None:
     controller = FragileController()
     async with facing(controller) as (webots, task), asyncio.timeout(LONG_S):
-        webots.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
-        webots.tcp.close()
+        webots.reset()
         await task
     assert controller.violations == []
     assert "ConnectionResetError" in controller.events[0]
@@ -338,9 +291,7 @@ async def test_nobody_listening_is_an_error() -> None:
         await FragileController().run("127.0.0.1", webots.port)
 
 
-async def test_the_program_logs_and_prints_what_it_died_of(
-    capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     webots = Webots()
     task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", webots.port, dialect="deployed", split=True))
     async with asyncio.timeout(LONG_S):

@@ -8,7 +8,7 @@ import random
 import socket
 import struct
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
@@ -16,10 +16,10 @@ import pytest
 from gateways.wc2ec.conformance import parser
 from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Motor, Reader, Robot, Times
+from tests.conformance.scene import LONG_S, Peer, Scene, serving, until
 
 QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""
-LONG_S = 5.0
 DIALECTS: tuple[Dialect, ...] = ("deployed", "draft")
 FORWARD = bytes.fromhex("82 35 08 00 00 00 00 00 00 f8 3f")
 """The left wheel motor to 1.5 rad/s."""
@@ -34,65 +34,32 @@ NAN, INFINITY = bytes.fromhex("00 00 00 00 00 00 f8 7f"), bytes.fromhex("00 00 0
 ONE = bytes.fromhex("00 00 00 00 00 00 f0 3f")
 
 
-class External:
-    """A plain socket and the few habits of an external controller."""
+class External(Peer):
+    """The few habits of an external controller."""
 
-    def __init__(self, port: int) -> None:
-        self.port = port
-        self.tcp = socket.socket()
-        self.tcp.setblocking(False)
-        self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.stream = b""
-
-    async def connect(self) -> None:
-        await asyncio.get_running_loop().sock_connect(self.tcp, ("127.0.0.1", self.port))
-
-    async def send(self, data: bytes) -> None:
-        await asyncio.get_running_loop().sock_sendall(self.tcp, data)
-
-    async def read(self, size: int) -> bytes:
-        while len(self.stream) < size:
-            async with asyncio.timeout(LONG_S):
-                data = await asyncio.get_running_loop().sock_recv(self.tcp, 65536)
-            if not data:
-                raise EOFError
-            self.stream += data
-        data, self.stream = self.stream[:size], self.stream[size:]
-        return data
-
-    async def registration(self) -> tuple[int, int, str]:
-        command, node_type, number, length = await self.read(4)
-        assert command == 0
-        return node_type, number, (await self.read(length)).decode()
+    send = Peer.send_bytes
 
     async def registrations(self, count: int = 11) -> list[tuple[int, int, str]]:
-        return [await self.registration() for _ in range(count)]
+        registered = []
+        for _ in range(count):
+            command, node_type, number, length = await self.read(4)
+            assert command == 0
+            registered.append((node_type, number, (await self.read(length)).decode()))
+        return registered
 
     async def measurement(self) -> tuple[int, int, int, float]:
         command, node_type, number, value = struct.unpack("<BBBd", await self.read(11))
         return command, node_type, number, value
 
-    async def read_to_the_end(self) -> None:
-        with contextlib.suppress(EOFError, ConnectionError):
-            while True:
-                await self.read(1)
-
-    def close(self) -> None:
-        self.tcp.close()
-
 
 @contextlib.asynccontextmanager
 async def facing(controller: FragileController) -> AsyncIterator[tuple[External, "asyncio.Task[None]"]]:
-    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-    task = asyncio.create_task(controller.serve("127.0.0.1", 0, port.set_result))
-    external = External(await port)
-    try:
-        yield external, task
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-        external.close()
+    async with serving(controller, External, Scene) as scene:
+        try:
+            yield scene.peer, scene.task
+        finally:  # before the connection is closed, which would be an event
+            scene.task.cancel()
+            await asyncio.wait([scene.task])
 
 
 @contextlib.asynccontextmanager
@@ -106,13 +73,6 @@ async def connected(controller: FragileController) -> AsyncIterator[External]:
 
 def quick(dialect: Dialect = "deployed", **options: Any) -> FragileController:
     return FragileController(dialect, **{"times": QUICK, **options})
-
-
-async def until(holds: Callable[[], Any], what: object) -> None:
-    deadline = time.monotonic() + LONG_S
-    while not holds():
-        assert time.monotonic() < deadline, what
-        await asyncio.sleep(0.005)
 
 
 async def violated(controller: FragileController, words: str) -> None:
@@ -451,9 +411,7 @@ LOST = [
 
 
 @pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(
-    dialect: Dialect, data: str, words: str
-) -> None:
+async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(dialect, data, words) -> None:
     controller = quick(dialect)
     async with connected(controller) as external:
         await external.send(bytes.fromhex(data))
@@ -471,9 +429,7 @@ async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(
 
 
 @pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_after_a_valid_one_in_the_same_read_kills(
-    dialect: Dialect, data: str, words: str
-) -> None:
+async def test_an_unknown_command_after_a_valid_one_in_the_same_read_kills(dialect, data, words) -> None:
     controller = quick(dialect)
     async with facing(controller) as (external, task):
         await external.connect()
@@ -566,8 +522,7 @@ async def test_a_reset_is_an_end() -> None:
         await external.connect()
         await external.send(CHANGE)
         await heard(controller, 1)
-        external.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        external.close()
+        external.reset()
         await over(task)
     assert len(controller.events) == 1
     assert controller.events[0].startswith("the external controller left the robot at rest: ")
@@ -668,9 +623,7 @@ async def test_the_simulator_ends_with_its_external_controller(capsys: pytest.Ca
     assert capsys.readouterr().out == "the external controller left the robot at rest: closed\n"
 
 
-async def test_the_simulator_logs_violations_and_says_what_it_died_of(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
     task, port = await simulating("draft")
     with contextlib.closing(External(port)) as external:
         await external.connect()

@@ -195,7 +195,7 @@ PARTS: dict[str, Any] = {"version": "1.4", "parts": 4}
         "a 7 that denies the answer is an event, and all goes by TCP": (
             UDP,
             ["probing", "by_udp PROBE", "> NOT_CONNECTED", "wait 0.1", "> FORWARD", "ok"]
-            + ["? 7(false) though 6(true) was sent by UDP", "events 1"],
+            + ["? 7(false) though 6(true) was sent by UDP", "told 1"],
         ),
         "a connection that breaks is an event": (
             {"times": Times(unasked_s=0.005)},

@@ -118,9 +118,6 @@ class Hq(Scene):
     async def took(self, kinds: str) -> None:
         assert [row[2] for row in self.judge.received] == [int(kind) for kind in kinds.split()]
 
-    async def events(self, count: str) -> None:
-        assert len(self.judge.events) == int(count), self.judge.events
-
     async def silent(self, _: str) -> None:
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.1):

@@ -1,19 +1,19 @@
-"""Every error zbridge raises on purpose.
+"""All errors that zbridge raises on purpose.
 
 ZbridgeError
 ├── ProtocolError    a peer's bytes are not what its protocol says
-├── EncodeError      we were asked to send what the protocol cannot say
-├── PayloadError     a payload on the bus is not the message its key promises
-├── Refused          a command or query was understood and will not be carried out
-│   ├── Held         ... because somebody else holds the robot                       held
+├── EncodeError      a message holds a value that the protocol cannot carry
+├── PayloadError     a payload on the bus is not the message that its key announces
+├── Refused          a command or query is not carried out
+│   ├── Held         ... because another program holds the lease                     held
 │   ├── LeaseLost    ... because there is no lease, or it has ended                  no_lease, lease_ended
-│   ├── NeutralFirst ... because motion must wait for a neutral                      neutral_first
-│   ├── NotReady     ... because the robot or its gateway takes none now             not_ready, busy, closing
+│   ├── NeutralFirst ... because a neutral must come before motion                   neutral_first
+│   ├── NotReady     ... because the robot or its gateway accepts none now           not_ready, busy, closing
 │   ├── Unsupported  ... because this robot cannot do it                             unsupported
-│   ├── Malformed    ... because it cannot be read, or is not the next of its lease  malformed, out_of_order
-│   └── TooFast      ... because too many came                                       rate
-├── LinkError        a transport connection could not be made
-├── BusError         the bus could not be opened or asked
+│   ├── Malformed    ... because it cannot be read, or its number is out of order    malformed, out_of_order
+│   └── TooFast      ... because commands come faster than allowed                   rate
+├── LinkError        an address is not valid, or a connection cannot be made
+├── BusError         the bus cannot be opened, or a query has no answer
 └── ConfigError      a configuration cannot be used
 """
 
@@ -24,7 +24,7 @@ from typing import ClassVar
 
 
 class Code(StrEnum):
-    """Why something was refused: what programs act on, while people read the text."""
+    """Why a command is refused: programs act on the code, people read the text."""
 
     NO_LEASE = "no_lease"
     LEASE_ENDED = "lease_ended"
@@ -44,26 +44,26 @@ class ZbridgeError(Exception):
 
 
 class ProtocolError(ZbridgeError):
-    """A peer's bytes break its protocol; decoding raises nothing else."""
+    """A peer's bytes are not what its protocol says. Decoding raises nothing else."""
 
 
 class EncodeError(ZbridgeError):
-    """A message holds a value its wire type cannot carry."""
+    """A message holds a value that its wire type cannot carry."""
 
 
 class PayloadError(ZbridgeError):
-    """A payload on the bus is not the fleet message its key promises."""
+    """A payload on the bus is not the fleet message that its key announces."""
 
 
 class Refused(ZbridgeError):
-    """A command will not be carried out: ``code`` says why for programs, the text for people.
+    """A command is not carried out: ``code`` says why to programs, the text to people.
 
-    Raise one of the classes below. holder: who has the robot, where that is why. who: whose command it was, where its
-    proof shows that.
+    Raise one of the classes below. holder: who holds the lease, if that is the reason. who: who sent the command, if
+    its proof shows it.
     """
 
     codes: ClassVar[tuple[Code, ...]]
-    """The codes of this family, the usual one first."""
+    """The codes of this class; the first is the default."""
 
     def __init__(
         self, text: str, code: Code | None = None, *, holder: str | None = None, who: str | None = None
@@ -75,25 +75,25 @@ class Refused(ZbridgeError):
 
 
 class Held(Refused):
-    """Somebody else holds the robot; ``holder`` names them."""
+    """Another program holds the lease; ``holder`` names it."""
 
     codes = (Code.HELD,)
 
 
 class LeaseLost(Refused):
-    """There is no lease, or it has ended; the text says why, and who holds the robot now."""
+    """There is no lease, or it has ended; the text says why, and who holds one now."""
 
     codes = (Code.LEASE_ENDED, Code.NO_LEASE)
 
 
 class NeutralFirst(Refused):
-    """The robot was stopped: motion must wait for a neutral."""
+    """The robot was stopped: a neutral must come before motion."""
 
     codes = (Code.NEUTRAL_FIRST,)
 
 
 class NotReady(Refused):
-    """The robot or its gateway takes no commands now."""
+    """The robot or its gateway accepts no commands now."""
 
     codes = (Code.NOT_READY, Code.BUSY, Code.CLOSING)
 
@@ -105,13 +105,13 @@ class Unsupported(Refused):
 
 
 class Malformed(Refused):
-    """It cannot be read, or its number was used or passed."""
+    """The command cannot be read, or its number is not above the last one."""
 
     codes = (Code.MALFORMED, Code.OUT_OF_ORDER)
 
 
 class TooFast(Refused):
-    """Too many came."""
+    """Commands come faster than allowed."""
 
     codes = (Code.RATE,)
 
@@ -120,7 +120,7 @@ _FAMILIES: dict[str, type[Refused]] = {code: family for family in Refused.__subc
 
 
 def refusal(code: str, text: str, *, holder: str | None = None) -> Refused:
-    """Make the exception of a code that came from elsewhere; one that is not known here is Unsupported."""
+    """Return the exception for a code received from the bus; Unsupported for an unknown one."""
     family = _FAMILIES.get(code)
     if family is None:
         return Unsupported(text, holder=holder)
@@ -128,12 +128,12 @@ def refusal(code: str, text: str, *, holder: str | None = None) -> Refused:
 
 
 class LinkError(ZbridgeError):
-    """A connection to a peer failed or was not possible."""
+    """An address is not valid, or a connection to a peer cannot be made."""
 
 
 class BusError(ZbridgeError):
-    """The bus could not be opened, or a query on it got no answer."""
+    """The bus cannot be opened, or a query on it has no answer."""
 
 
 class ConfigError(ZbridgeError):
-    """A configuration cannot be used; the text names file, key, value and what was expected."""
+    """A configuration is not valid; the text names file, key, value and what was expected."""

@@ -1,4 +1,4 @@
-"""Text that others wrote, made safe to show to people: on a terminal, in a table, in a log. Sans-IO."""
+"""Makes text of others safe to print: on a terminal, in a table, in a log. Sans-IO."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import json
 from typing import Any
 
 LINE = 2000
-"""Characters of a line, unless told otherwise."""
+"""Characters of a line, by default."""
 _CUT = "..."
 
 
 def shown(text: object, most: int = LINE) -> str:
-    """Write ``text`` on one line of at most ``most`` characters (3 or more), with all escaped that does not print.
+    """Return ``text`` as one line of at most ``most`` characters (3 or more), with non-printing characters escaped.
 
-    That is control characters (C0, DEL, C1), so that no terminal takes a part of it for a command, line breaks, and
-    what turns or hides the text around it. Markup is the business of who shows it: it must not be interpreted.
+    Escaped are control characters (C0, DEL, C1), line breaks, and characters that turn or hide the text around them: no
+    part reaches a terminal as a command. Markup is left as it is: the caller must not interpret it.
     """
     raw = str(text)
     safe = raw[: most + 1]
@@ -24,7 +24,7 @@ def shown(text: object, most: int = LINE) -> str:
 
 
 def as_json(value: Any) -> str:
-    """Write ``value`` as one line of JSON that holds printable ASCII only; it is not cut."""
+    """Return ``value`` as one line of JSON, printable ASCII only, of any length."""
     return json.dumps(value).replace("\x7f", "\\u007f")
 
 

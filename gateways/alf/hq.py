@@ -1,4 +1,4 @@
-"""What HQ programs of ALF are shown of a robot of any protocol, and what they command. Sans-IO.
+"""ALF towards HQ programs: what they are shown of any robot, and what they command. Sans-IO.
 
 Source: "The gateway as vehicle", "Translation" and the dialects of the protocol page.
 """
@@ -28,7 +28,7 @@ from gateways.alf.messages import (
 from gateways.alf.session import VehicleSession
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.protocol import EncodeError, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
@@ -36,11 +36,11 @@ from zbridge.protocol import EncodeError, HqSide, Limits, Metrics, ProtocolError
 DEADMAN_S = 0.3
 """Deployed HQ programs repeat their command every 20 ms."""
 COUNTER_ENDS = 2**31
-"""Deployed receivers break on larger integers."""
+"""One more than the largest integer that deployed receivers can read."""
 FULL_INFO = 100
 """The speed of drive info at full scale."""
 _FULL_SPEED = {Dialect.TEXT: 255, Dialect.BINARY: 100}
-"""The speed of HQ programs that is full scale."""
+"""The speed that HQ programs send at full scale."""
 _MM_PER_M = 1000
 _RAW_16 = 32767
 
@@ -59,9 +59,10 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HqClient(VehicleSession):
-    """The session of one client, and the scanner init that it was sent last.
+    """The session of one client.
 
-    laser: it is shown measurements and scanner init. drive: it is shown drive info.
+    scanner: the scanner init that it was sent last, encoded. laser: whether it is shown measurements and scanner init.
+    drive: whether it is shown drive info.
     """
 
     scanner: bytes | None = None
@@ -69,28 +70,31 @@ class HqClient(VehicleSession):
     drive = True
 
     def show_drive(self) -> None:
-        """Show drive info instead of measurements from now on; what waits of those is not sent."""
+        """Show drive info instead of measurements from now on; drop the measurements that are queued."""
         self.laser, self.drive = False, True
         self.outbox.clear("scan")
         if self.scanner is not None:
             self.outbox.withdraw(self.scanner)
 
     def know(self, scanner: bytes | None) -> None:
-        """Send scanner init where the client does not have this one: before any measurement by it."""
+        """Send a scanner init that the client does not have yet, before any measurement that needs it."""
         if scanner is not None and scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
             self.outbox.put_exempt(scanner)
             self.scanner = scanner
 
     def close(self, reason: str, now: float) -> None:
-        """Say END, and let it be the last word: telemetry that still waits is not sent."""
+        """Send END as the last message: drop the telemetry that is queued."""
         self.outbox.clear("scan")
         self.outbox.clear("info")
         super().close(reason, now)
 
 
 class Sweep:
-    """How scans of one geometry become measurements: the scanner that is announced, and the points that are taken."""
+    """Turns scans of one geometry into measurements of ``points`` points; ``init`` is the scanner init to send before.
+
+    Scans of another number of points are resampled by angle. Raises EncodeError for a geometry that is not finite.
+    """
 
     def __init__(
         self, scan: Scan | Scanner, points: int, scanner: Scanner | None, write: Callable[[Any], bytes]
@@ -109,7 +113,7 @@ class Sweep:
             increment = increment * (count - 1) / (points - 1) or math.radians(1.0)
         time_s = scanner.time_increment_s if scanner is not None else 0.0
         angles = (angle_min, angle_max, increment)
-        if not all(map(math.isfinite, map(math.degrees, angles))):  # receivers break on NaN
+        if not all(map(math.isfinite, map(math.degrees, angles))):  # receivers cannot read NaN
             raise EncodeError(f"scanner with angles {angles}")
         self.init = write(
             ScannerInit(
@@ -123,7 +127,7 @@ class Sweep:
         )
 
     def measurement(self, scan: Scan, sequence: int) -> Measurement:
-        """Make a measurement: mm, 0 where nothing was measured; valid indices are the first and last of the rest."""
+        """Return a measurement: ranges in mm, 0 = not measured; valid indices: of the first and last range."""
         ranges = scan.ranges if self._places is None else scan.ranges[self._places]
         with np.errstate(invalid="ignore"):
             points_mm = np.rint(ranges.astype(np.float64) * _MM_PER_M)
@@ -140,7 +144,6 @@ class AlfHq(HqSide):
 
     name = NAME
     deadman_s = DEADMAN_S
-    steers = True
 
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
@@ -168,7 +171,7 @@ class AlfHq(HqSide):
         if session.laser and known is not None:
             session.know(self._sweep_of(known).init)
 
-    # The robot, shown
+    # What is shown
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         if isinstance(message, Scan):
@@ -210,7 +213,11 @@ class AlfHq(HqSide):
         value = _finite(value)
         return value if self._dialect is Dialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
 
-    # What clients command
+    # What is understood
+
+    def is_motion(self, command: Drive | Motor) -> bool:
+        """A turn without speed only sets the wheels, and so is neutral."""
+        return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
     def take(self, session: HqClient, message: AlfMessage) -> tuple[Telemetry, ...]:
         if not isinstance(message, DriveCommand):
@@ -218,12 +225,12 @@ class AlfHq(HqSide):
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
-        if self._auto and not session.drive:  # no deployed program bears both ("The gateway as vehicle")
+        if self._auto and not session.drive:  # no deployed program can read both kinds ("The gateway as vehicle")
             session.show_drive()
         straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
         speed = min(1.0, message.speed / self._full_speed)
-        if not speed and self.view.protocol != NAME:  # it sets the wheels, and others would turn on the spot
+        if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot
             right = 0.0
         backward = bool(message.direction) and speed > 0
         turn = right if backward else 0.0 - right
@@ -244,5 +251,5 @@ def _finite(value: float) -> float:
 
 
 def _whole(value: float) -> int:
-    """Give an integer that every receiver can read."""
+    """Return a value as an integer that every receiver can read."""
     return round(max(0.0, min(value, COUNTER_ENDS - 1))) if math.isfinite(value) else 0

@@ -1,4 +1,4 @@
-"""Maps as HQ programs can take them: square, of an announced size, small enough for what carries them. Sans-IO.
+"""Resamples maps to what HQ programs can read: square, of the announced size, short enough for one packet. Sans-IO.
 
 Source: "Packets" (map bytes) and "The gateway as robot" of the protocol page.
 """
@@ -14,20 +14,20 @@ from zbridge.fleet.messages import Cells, Map
 from zbridge.protocol import EncodeError
 
 TCP_BYTES = 2199
-"""Bytes of the longest packet that HQ programs take by TCP: they lose those of 2.2 kB and more."""
+"""Bytes of the longest packet that HQ programs read by TCP: they lose packets of 2.2 kB and more."""
 UDP_BYTES = 60_000
-"""Bytes of the longest packet that passes by UDP."""
+"""Bytes of the longest packet that is sent by UDP."""
 _AROUND = 10
-"""Bytes of a map packet that are no cells: header and count."""
+"""Bytes of a map packet besides its cells: header and count."""
 _CELL_M = (1e-6, 1e6)
-"""Sides of a cell, metres, that can be calculated with; whatever is on the bus."""
+"""Least and greatest side of a cell, metres, that is accepted from the bus."""
 _MOST_UNITS = 2**31 - 1
 _MOST_M = 1e9
 _OCCUPIED = 2
 
 
 class Geometry(msgspec.Struct, frozen=True):
-    """A square grid as it is announced: SLAMMapSize and SLAMMapIntervall, in the robot's unit of length."""
+    """A square grid as it is announced: SLAMMapSize and SLAMMapIntervall, both in the robot's unit of length."""
 
     size: int
     interval: int
@@ -39,22 +39,22 @@ class Geometry(msgspec.Struct, frozen=True):
 
 
 def most_side(packet_bytes: int) -> int:
-    """Give the side of the largest map that fits a packet."""
+    """Return the side, in cells, of the largest map that fits a packet."""
     return math.isqrt(packet_bytes - _AROUND)
 
 
 class Frame(msgspec.Struct, frozen=True):
-    """Where HQ programs take a square grid to lie, which nothing in the protocol tells.
+    """Where HQ programs assume a square grid to lie; the protocol does not say.
 
-    own: the map is of a robot of this protocol, so its programs see it as they always did: the robot's zero stays at
-    the same fraction of the grid. Else the grid is centred on zero. origin: x, y of its first cell, metres, instead.
+    own: the map is of a robot of this protocol, whose programs expect its zero at the same fraction of the grid as
+    before; else the grid is centred on zero. origin: x, y of the first cell, metres; it overrides both.
     """
 
     own: bool = False
     origin: tuple[float, float] | None = None
 
     def size_m(self, grid: Map) -> float:
-        """Give the side of the smallest grid that has the whole map in it, as far as it can."""
+        """Return the side, metres, of the smallest grid that holds the map; less if ``origin`` lies inside the map."""
         (x, y), width, height = grid.origin, grid.columns * grid.cell, grid.rows * grid.cell
         if self.origin is not None:
             return max(x + width - self.origin[0], y + height - self.origin[1], grid.cell)
@@ -63,7 +63,7 @@ class Frame(msgspec.Struct, frozen=True):
         return 2 * max(abs(x), abs(x + width), abs(y), abs(y + height))
 
     def begin(self, grid: Map, size_m: float) -> tuple[float, float]:
-        """Give where a grid begins, x and y in metres from the map's first cell."""
+        """Return where a grid of this size begins: x, y in metres from the map's first cell."""
         extents = (grid.columns * grid.cell, grid.rows * grid.cell)
         if self.origin is not None:
             x, y = self.origin
@@ -79,9 +79,10 @@ _OWN = Frame(own=True)
 
 
 def announceable(grid: Map, unit_m: float, most: int, frame: Frame = _OWN) -> Geometry:
-    """Choose what to announce for a map: its own cells where they are whole units and few enough, else larger ones.
+    """Return the geometry to announce for a map: its own cells if whole units and few enough, else larger ones.
 
-    Raises EncodeError where its cells are of no size that can be announced.
+    unit_m: the robot's unit of length. most: cells along a side at most. Raises EncodeError for cells of a size that
+    cannot be announced.
     """
     check(grid)
     extent = frame.size_m(grid) / unit_m
@@ -95,17 +96,18 @@ def announceable(grid: Map, unit_m: float, most: int, frame: Frame = _OWN) -> Ge
 
 
 def squared(grid: Map, most: int) -> bytes:
-    """Give the cells, x-major, of the smallest square around a map, with at most so many cells along a side."""
+    """Return the cells, x-major, of the smallest square around a map; ``most``: cells along a side at most."""
     side = max(grid.rows, grid.columns)
     fitting = max(1, min(side, most))
     return resampled(grid, fitting, grid.cell * side / fitting)
 
 
 def resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float] = (0.0, 0.0)) -> bytes:
-    """Give a map's cells, x-major, on a square grid of other cells that begins at ``begin`` from the map's first.
+    """Return a map's cells, x-major, on a square grid that begins ``begin`` metres from the map's first cell.
 
-    A cell is an obstacle where any it covers is, else free where any is, else unknown; so is what lies outside.
-    One that lies across a border counts where it ends. Raises EncodeError where the map's cells are of no size.
+    side: cells of the grid along a side, ``cell_m`` metres each. A cell is an obstacle if any that it covers is, else
+    free if any is, else unknown; cells outside the map are unknown. A cell across a border counts where it ends.
+    Raises EncodeError as :func:`check`.
     """
     cells: Cells = np.zeros((side, side), np.uint8)
     if grid.cells.size:
@@ -124,7 +126,7 @@ def resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float] = 
 
 
 def check(grid: Map) -> None:
-    """Raise EncodeError for a map that cannot be calculated with, whatever is on the bus."""
+    """Raise EncodeError for a map whose cells or origin are out of bounds."""
     if not _CELL_M[0] <= grid.cell <= _CELL_M[1] or not all(abs(at) <= _MOST_M for at in grid.origin):
         raise EncodeError(f"map with cells of {grid.cell:g} m at {grid.origin}")
 
@@ -132,9 +134,10 @@ def check(grid: Map) -> None:
 def _starts(
     count: int, side: int, ratio: float, begin: float
 ) -> tuple[int, np.ndarray[tuple[int], np.dtype[np.intp]], int]:
-    """Say how many of ``count`` cells ``side`` other ones cover, where each begins, and which is the first.
+    """Return along one axis: how many map cells the grid covers, where each grid cell begins, the first one inside.
 
-    ``begin``: where the first of them begins, in cells of the map.
+    count: cells of the map. side: cells of the grid, each ``ratio`` map cells wide. begin: start of the grid, in map
+    cells.
     """
     edges = np.round(begin + np.arange(side + 1) * ratio, 6)
     starts = np.floor(edges[:-1]).astype(np.intp)

@@ -150,6 +150,13 @@ def test_stop_needs_one_robot_or_all() -> None:
     assert zbridge("stop", "r1", "--all").returncode == 2
 
 
+@pytest.mark.parametrize("command", ["stop", "drive"])
+def test_a_robot_that_cannot_be_one_ends_with_2_and_one_line(command: str) -> None:
+    ran = zbridge(command, "a b")
+    line = "zbridge: ROBOT = 'a b': expected letters, digits, '_', '.' and '-' only\n"
+    assert (ran.returncode, ran.stdout, ran.stderr) == (2, "", line)
+
+
 def test_the_demo_shows_data_and_ends_by_itself() -> None:
     shown = zbridge("demo", "--seconds", "4")
     assert shown.returncode == 0, shown.stdout + shown.stderr

@@ -105,7 +105,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         await soon(lambda: "the robot is there" in program.texts[told:], "told that it came again")
         assert sum(text in _GONE for text in program.texts[told:]) == 1
         before = bench.fleet.last("r1/pose")
-        await soon(lambda: _mentions(program.texts[told:], "let go of the stick first"), "told why it does not move")
+        await soon(lambda: _mentions(program.texts[told:], "release the stick first"), "told why it does not move")
         after = await soon(lambda: _newer(bench, before), "a pose")
         assert (after["x"], after["y"]) == pytest.approx((before["x"], before["y"]))
         program.idle()
@@ -133,7 +133,7 @@ async def test_what_a_listener_refuses_shows_on_control_of_the_robot_whose_proce
         assert (no_mode["who"], no_mode["command"], no_mode["by"]) == ("hq.tcp.2", "drive", "hq.tcp")
         assert no_mode["reason"] == "control mode is none"
         stuck = await soon(lambda: _refusal(bench, "neutral_first"), "the stick that was pushed all the time refused")
-        assert (stuck["who"], stuck["reason"]) == ("hq.tcp.2", "control mode is none: let go of the stick first")
+        assert (stuck["who"], stuck["reason"]) == ("hq.tcp.2", "control mode is none: release the stick first")
         await soon(lambda: (_refusal(bench, "neutral_first") or stuck)["count"] > 2, "and counted")
         assert bench.fleet.last("r1/control")["state"] == "free"
 
@@ -444,7 +444,7 @@ async def test_a_captured_program_that_drives_at_once_is_told_to_let_go_first_an
     hi, *lidar = replaying.commands()
     assert hi == HI
     assert [key for key, _ in lidar] == ["scan"] * (where == "v13")
-    assert b"connected: let go of the stick first" in came
+    assert b"connected: release the stick first" in came
     came = await replaying.replay(where, _hq_half(where), first=NEUTRAL)
     assert replaying.commands() == [HI, MANUAL, MOVE, TURN, STOP, *lidar]
     assert b"let go" not in came

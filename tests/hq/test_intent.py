@@ -14,9 +14,17 @@ from zbridge.hq.intent import EARLY_S, LEASE_S, TOGETHER_S, Action, Intent
 DEADMAN_S = 1.25
 
 
+def connected(*, modes: bool = False) -> Intent:
+    """A program that has just connected. modes: it must choose a control mode before it drives."""
+    intent = Intent(DEADMAN_S)
+    if modes:
+        assert intent.choose("none", 0.0) is Action.NOTHING
+    return intent
+
+
 def ready(*, modes: bool = False) -> Intent:
     """A program that has said neutral."""
-    intent = Intent(DEADMAN_S, modes=modes)
+    intent = connected(modes=modes)
     assert intent.neutral(0.0) is Action.NOTHING
     return intent
 
@@ -70,7 +78,7 @@ def test_a_neutral_that_is_owed_is_sent_in_mode_3_too() -> None:
 def test_a_new_program_must_say_neutral_before_motion() -> None:
     intent = Intent(DEADMAN_S)
     for now in (0.0, 0.5, 100.0):
-        with pytest.raises(Refused, match="connected: let go of the stick first"):
+        with pytest.raises(Refused, match="connected: release the stick first"):
             intent.motion(now)
     assert not intent.asking
     assert intent.neutral(101.0) is Action.NOTHING
@@ -99,7 +107,7 @@ def test_whoever_lost_the_robot_or_was_refused_it_must_say_neutral(why: str) -> 
     intent = driving()
     intent.lost(why)
     assert not intent.held
-    with pytest.raises(Refused, match="let go of the stick first") as caught:
+    with pytest.raises(Refused, match="release the stick first") as caught:
         intent.motion(0.5)
     assert str(caught.value).startswith(why)
     assert intent.neutral(0.6) is Action.NOTHING
@@ -122,7 +130,7 @@ def test_a_refused_motion_holds_back_and_leaves_the_lease() -> None:
     intent.refused("busy: map")
     assert intent.held
     assert not intent.may_steer
-    with pytest.raises(Refused, match="busy: map: let go of the stick first"):
+    with pytest.raises(Refused, match="busy: map: release the stick first"):
         intent.motion(0.5)
     assert intent.neutral(0.6) is Action.SEND
     assert intent.motion(0.7) is Action.SEND
@@ -140,7 +148,7 @@ def test_a_program_that_gave_the_robot_back_need_not_say_neutral_anew() -> None:
 
 def test_motion_that_is_not_repeated_within_the_deadman_has_ended() -> None:
     intent = driving()
-    with pytest.raises(Refused, match="deadman: let go of the stick first"):
+    with pytest.raises(Refused, match="deadman: release the stick first"):
         intent.motion(DEADMAN_S)
     assert intent.neutral(DEADMAN_S + 0.1) is Action.SEND
     assert intent.motion(DEADMAN_S + 0.2) is Action.SEND
@@ -205,7 +213,7 @@ def test_after_motion_in_mode_none_neutral_must_come_although_the_mode_has() -> 
     with pytest.raises(Refused):
         intent.motion(0.5)
     assert intent.choose("manual", 0.61) is Action.NOTHING
-    with pytest.raises(Refused, match="let go of the stick first"):
+    with pytest.raises(Refused, match="release the stick first"):
         intent.motion(0.7)
     intent.neutral(0.8)
     assert intent.motion(0.9) is Action.ACQUIRE
@@ -252,25 +260,25 @@ def test_a_mode_while_the_robot_is_held_is_sent_and_while_it_is_asked_for_waits(
 
 
 def test_a_mode_that_motion_has_overtaken_is_no_mode_that_came_too_late() -> None:
-    intent = Intent(DEADMAN_S, modes=True)
+    intent = connected(modes=True)
     intent.neutral(0.0)
     with pytest.raises(Refused, match="control mode is none"):
         intent.motion(1.0)
     intent.choose("manual", 1.05)
     assert intent.motion(1.5) is Action.ACQUIRE
-    late = Intent(DEADMAN_S, modes=True)
+    late = connected(modes=True)
     late.neutral(0.0)
     for now in (1.0, 1.5):
         with pytest.raises(Refused, match="control mode is none"):
             late.motion(now)
     late.choose("manual", 1.55)
-    with pytest.raises(Refused, match="control mode is none: let go"):
+    with pytest.raises(Refused, match="control mode is none: release the stick"):
         late.motion(2.0)
 
 
 def test_mode_autonomous_is_motion() -> None:
-    intent = Intent(DEADMAN_S, modes=True)
-    with pytest.raises(Refused, match="connected: let go of the stick first"):
+    intent = connected(modes=True)
+    with pytest.raises(Refused, match="connected: release the stick first"):
         intent.choose("autonomous", 0.0)
     assert (intent.mode, intent.asking) == ("autonomous", False), "it stands: programs say it once"
     intent.neutral(0.1)
@@ -378,7 +386,7 @@ def test_neutral_of_one_part_does_not_end_the_deadman_of_the_others() -> None:
 
 
 def test_an_intent_prints_itself() -> None:
-    assert repr(Intent(1.0, modes=True)) == "<Intent none idle connected>"
+    assert repr(connected(modes=True)) == "<Intent none idle connected>"
     assert repr(driving()) == "<Intent manual held None>"
 
 
@@ -400,7 +408,7 @@ class Program(RuleBasedStateMachine):
 
     @initialize(modes=st.booleans())
     def begin(self, modes: bool) -> None:
-        self.intent = Intent(DEADMAN_S, modes=modes)
+        self.intent = connected(modes=modes)
         self.mode = "none" if modes else "manual"
         self.overtaken_until = -math.inf
 

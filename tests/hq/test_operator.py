@@ -36,7 +36,8 @@ from zbridge.fleet.view import RobotView
 from zbridge.hq.bridge import PUBLISHERS, Bridge
 from zbridge.hq.command_queue import WAITING
 from zbridge.hq.intent import LEASE_S, Intent
-from zbridge.hq.operator import REPEAT_S, Operator
+from zbridge.hq.operator import Operator
+from zbridge.protocol.plugin import ATTEND_S
 
 KEYS = KeySpace("fleet", "r1")
 DEADMAN_S = 1.25
@@ -119,6 +120,18 @@ class Gateway:
         return commands
 
 
+class RepeatingOperator(Operator):
+    """The operator of a program that sets motion once."""
+
+    def tick(self) -> None:
+        self.repeat()
+        super().tick()
+
+
+def is_motion_of_wheels(command: Drive | Motor) -> bool:
+    return bool(command.value if isinstance(command, Motor) else command.forward or command.left)
+
+
 class Scene:
     """A robot, its gateway, and any number of programs; nothing is answered before :meth:`settle`."""
 
@@ -150,20 +163,23 @@ class Scene:
         who: str = "hq.toy.1",
         *,
         needs_mode: bool = False,
-        modes: str | None = None,
+        protocol: str = "toy",
         steers: bool = False,
         hold: bool = False,
     ) -> Operator:
-        return Operator(
-            Intent(DEADMAN_S, modes=needs_mode),
+        kind = RepeatingOperator if hold else Operator
+        operator = kind(
+            Intent(DEADMAN_S),
             self.bridge,
             who=who,
-            modes=modes,
-            steers=steers,
-            hold=hold,
+            protocol=protocol,
+            is_motion=is_motion_of_wheels if steers else lambda command: command.moving,
             tell=self.told.append,
             clock=lambda: self.now,
         )
+        if needs_mode:
+            operator.command(topics.CMD_MODE, Mode("none"))
+        return operator
 
     def look(self, *helms: Operator) -> None:
         """Let the gateway say how things stand."""
@@ -202,7 +218,7 @@ async def test_nothing_moves_and_nothing_is_asked_before_neutral() -> None:
     scene = Scene()
     helm = scene.helm()
     for _ in range(3):
-        with pytest.raises(Refused, match="connected: let go of the stick first"):
+        with pytest.raises(Refused, match="connected: release the stick first"):
             helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert (scene.gateway.asked, scene.bus.values("fleet/r1/@cmd/**")) == ([], [])
@@ -264,7 +280,7 @@ async def test_a_robot_that_somebody_else_drives_is_refused_and_neutral_must_com
     assert scene.told == ["not driving: held by operator (priority 0)"]
     assert scene.gateway.taken() == []
     assert not helm.active
-    with pytest.raises(Refused, match=r"held by operator \(priority 0\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"held by operator \(priority 0\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert len(scene.told) == 1, "the refusal of the question itself is not told again"
@@ -299,7 +315,7 @@ async def test_a_robot_that_is_not_there_is_not_asked_for(status: Status, alive:
         helm.command(topics.CMD_DRIVE, GO)
     scene.view.note(topics.STATUS, Status(state="established", protocol="toy"))
     scene.view.alive = True
-    with pytest.raises(Refused, match=f"{reason}: let go of the stick first"):
+    with pytest.raises(Refused, match=f"{reason}: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.asked == []
 
@@ -519,7 +535,7 @@ async def test_turning_is_motion_to_a_program_that_does_not_steer() -> None:
 
 async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     await scene.settle()
@@ -531,7 +547,7 @@ async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> N
 
 async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -544,7 +560,7 @@ async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
 
 async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -561,7 +577,7 @@ async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
 
 async def test_mode_none_is_told_although_another_command_is_still_on_its_way() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
@@ -580,7 +596,7 @@ async def test_mode_none_is_told_although_another_command_is_still_on_its_way() 
 
 async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="manual"))
     helm.command(topics.CMD_DRIVE, GO)
@@ -594,13 +610,13 @@ async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted
 
 async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
     assert scene.gateway.taken() == [("mode", Mode(mode="autonomous"))]
     for _ in range(200):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.intent.heard(scene.now)
         helm.tick()
         await scene.settle()
@@ -608,7 +624,7 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     renewals = scene.gateway.asked.count("renew")
     assert 15 <= renewals <= 21, "once in a third of the lease"
     for _ in range(31):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.report().state == "free", "total silence"
@@ -624,7 +640,7 @@ async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     scene.look(helm)
     await scene.settle()
     assert scene.told == ["not driving: the lease has ended (stop)"]
-    with pytest.raises(Refused, match=r"the lease has ended \(stop\): let go of the stick first"):
+    with pytest.raises(Refused, match=r"the lease has ended \(stop\): release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "renew"]
@@ -665,7 +681,7 @@ async def test_the_gateway_going_away_ends_the_drive() -> None:
     helm.gateway_lost()
     helm.gateway_lost()
     assert scene.told == ["not driving: the robot's gateway is gone"]
-    with pytest.raises(Refused, match="the robot's gateway is gone: let go of the stick first"):
+    with pytest.raises(Refused, match="the robot's gateway is gone: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
 
 
@@ -722,7 +738,7 @@ async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> Non
 
 async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True, modes="toy")
+    helm = scene.helm(needs_mode=True)
     helm.command(topics.CMD_DRIVE, STAND)
     with pytest.raises(Refused, match="does not move by itself"):
         helm.command(topics.CMD_MODE, Mode("autonomous"))
@@ -747,7 +763,7 @@ async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -
     helm.command(topics.CMD_DRIVE, GO)
     scene.look(helm)
     assert scene.told == ["drive: busy: map: send a neutral drive first"]
-    with pytest.raises(Refused, match="motion was refused: let go of the stick first"):
+    with pytest.raises(Refused, match="motion was refused: release the stick first"):
         helm.command(topics.CMD_DRIVE, GO)
     helm.command(topics.CMD_DRIVE, STAND)
     helm.command(topics.CMD_DRIVE, GO)
@@ -765,7 +781,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
     await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))]
     for _ in range(100):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))] * 100
@@ -774,7 +790,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
     helm.command(LEFT, Motor(value=0.0))
     await scene.settle()
     scene.gateway.taken()
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     await scene.settle()
     assert scene.gateway.taken() == [], "neutral is not repeated"
@@ -783,7 +799,7 @@ async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
 async def test_what_other_programs_set_is_not_repeated() -> None:
     scene = Scene()
     helm = await scene.driving()
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     await scene.settle()
     assert scene.gateway.taken() == []
@@ -798,7 +814,7 @@ async def test_every_motor_there_can_be_is_set_and_held() -> None:
         helm.command(motor, Motor(value=1.0))
     await scene.settle()
     assert len(scene.gateway.taken()) == 255
-    scene.now += REPEAT_S
+    scene.now += ATTEND_S
     helm.tick()
     helm.tick()
     await scene.settle()
@@ -818,8 +834,8 @@ async def test_one_motor_at_rest_is_no_neutral_while_another_is_still_set() -> N
     await scene.settle()
     scene.gateway.taken()
     for _ in range(10):
-        scene.now += REPEAT_S
-        with pytest.raises(Refused, match="let go of the stick first"):
+        scene.now += ATTEND_S
+        with pytest.raises(Refused, match="release the stick first"):
             helm.command(LEFT, Motor(value=5.0))
         helm.command(RIGHT, Motor(value=0.0))
         helm.tick()
@@ -896,13 +912,13 @@ async def test_neutral_for_the_time_of_the_lease_gives_the_robot_back() -> None:
     scene = Scene()
     helm = await scene.driving()
     for _ in range(26):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.command(topics.CMD_DRIVE, STAND)
         helm.tick()
         await scene.settle()
         assert helm.intent.held
     for _ in range(2):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
     await scene.settle()
     assert scene.gateway.report().state == "free"
@@ -917,7 +933,7 @@ async def test_silence_lets_the_motion_lapse_and_gives_the_robot_back() -> None:
     scene = Scene()
     helm = await scene.driving()
     for _ in range(31):
-        scene.now += REPEAT_S
+        scene.now += ATTEND_S
         helm.tick()
         await scene.settle()
     assert scene.gateway.report().state in ("free", "stopped")

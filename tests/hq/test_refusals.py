@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Coroutine
 from typing import Any
 
 import msgpack
@@ -15,7 +14,8 @@ from zbridge.bus.fake import FakeBus
 from zbridge.errors import Code, LeaseLost, NeutralFirst, NotReady, Refused
 from zbridge.fleet.messages import TOLD
 from zbridge.fleet.topics import KeySpace
-from zbridge.hq.refusals import EVERY_S, Teller
+from zbridge.hq.refusals import EVERY_S, RefusalReports
+from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Metrics
 
 pytestmark = pytest.mark.jumping
@@ -31,10 +31,10 @@ class Scene:
         self.loop = asyncio.get_running_loop()
         self.bus = FakeBus()
         self.told: list[tuple[float, list[dict[str, Any]]]] = []
-        self.tasks: set[asyncio.Task[None]] = set()
+        self.tasks = Tasks()
         self.metrics = Metrics()
         untold = self.metrics.count("untold")
-        self.teller = Teller(self.bus.join("hq"), KeySpace("fleet", "r1"), "hq.desk", self.spawn, untold)
+        self.reports = RefusalReports(self.bus.join("hq"), KeySpace("fleet", "r1"), "hq.desk", self.tasks, untold)
 
     def serve(self, refusal: Refused | None = None) -> None:
         def hear(question: IncomingQuery) -> None:
@@ -46,16 +46,11 @@ class Scene:
 
         self.bus.answer("fleet/r1/@rpc/control/refused/*", hear)
 
-    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        task = self.loop.create_task(work)
-        self.tasks.add(task)
-        task.add_done_callback(self.tasks.discard)
-
 
 async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reason() -> None:
     scene = Scene()
     scene.serve()
-    scene.teller.note("hq.desk.3", "drive", NeutralFirst("connected: let go of the stick first"))
+    scene.reports.note("hq.desk.3", "drive", NeutralFirst("connected: release the stick first"))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     ((_, told),) = scene.told
@@ -64,7 +59,7 @@ async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reaso
             "who": "hq.desk.3",
             "command": "drive",
             "code": "neutral_first",
-            "reason": "connected: let go of the stick first",
+            "reason": "connected: release the stick first",
             "count": 1,
             "by": None,
         }
@@ -76,8 +71,8 @@ async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> 
     scene.serve()
     began = scene.loop.time()
     for _ in range(100):  # two seconds of a stick that is held down
-        scene.teller.note("hq.desk.3", "drive", OFFLINE)
-        scene.teller.note("hq.desk.4", "drive", OFFLINE)
+        scene.reports.note("hq.desk.3", "drive", OFFLINE)
+        scene.reports.note("hq.desk.4", "drive", OFFLINE)
         await asyncio.sleep(0.02)
     await asyncio.sleep(2 * EVERY_S)
     assert scene.loop.time() - began < 3.1
@@ -93,7 +88,7 @@ async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> 
 
 async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> None:
     scene = Scene()
-    scene.teller.note("hq.desk.3", "drive", OFFLINE)
+    scene.reports.note("hq.desk.3", "drive", OFFLINE)
     scene.serve()
     for command, refusal in (
         ("drive", NotReady("busy: map")),
@@ -102,7 +97,7 @@ async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> No
         ("drive", LeaseLost("offline")),
         ("mode", OFFLINE),
     ):
-        scene.teller.note("hq.desk.3", command, refusal)
+        scene.reports.note("hq.desk.3", command, refusal)
     await asyncio.sleep(2 * EVERY_S)
     (*_, (_, told)) = scene.told
     assert [(entry["command"], entry["code"], entry["count"]) for entry in told] == [
@@ -117,7 +112,7 @@ async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted(
     scene = Scene()
     scene.serve()
     for number in range(200):
-        scene.teller.note(f"hq.desk.{number}", "drive", OFFLINE)
+        scene.reports.note(f"hq.desk.{number}", "drive", OFFLINE)
     await asyncio.sleep(2 * EVERY_S)
     assert [len(told) for _, told in scene.told] == [1, TOLD]
     assert scene.metrics.total("untold") == 200 - 1 - TOLD
@@ -125,22 +120,22 @@ async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted(
 
 async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_again() -> None:
     scene = Scene()
-    scene.teller.note("hq.desk.3", "drive", OFFLINE)
+    scene.reports.note("hq.desk.3", "drive", OFFLINE)
     await asyncio.sleep(2 * EVERY_S)
     scene.serve(NotReady("later"))
-    scene.teller.note("hq.desk.3", "drive", OFFLINE)
+    scene.reports.note("hq.desk.3", "drive", OFFLINE)
     await asyncio.sleep(5 * EVERY_S)
     assert [[entry["count"] for entry in told] for _, told in scene.told] == [[1]]
-    assert not scene.tasks
+    assert not scene.tasks.running
 
 
 async def test_a_teller_that_is_closed_tells_nothing_more() -> None:
     scene = Scene()
     scene.serve()
-    scene.teller.note("hq.desk.3", "drive", OFFLINE)
-    scene.teller.note("hq.desk.3", "drive", OFFLINE)
-    scene.teller.close()
-    scene.teller.close()
+    scene.reports.note("hq.desk.3", "drive", OFFLINE)
+    scene.reports.note("hq.desk.3", "drive", OFFLINE)
+    scene.reports.close()
+    scene.reports.close()
     await asyncio.sleep(5 * EVERY_S)
     assert len(scene.told) == 1
-    assert repr(scene.teller) == f"<Teller at {KEY}, 0 wait>"
+    assert repr(scene.reports) == f"<RefusalReports at {KEY}, 0 wait>"

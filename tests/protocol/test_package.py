@@ -10,7 +10,9 @@ import pytest
 import zbridge.protocol
 
 ROOT = Path(__file__).parents[2]
-GATEWAYS = sorted(path for path in (ROOT / "gateways").glob("*/*.py") if path.name not in ("__main__.py",))
+GATEWAYS = sorted(
+    path for depth in ("*/*.py", "*/hq/*.py") for path in (ROOT / "gateways").glob(depth) if path.name != "__main__.py"
+)
 AUTHORS = {"zbridge.protocol", "zbridge.wire", "zbridge.fleet"}
 SIMULATORS = {"zbridge.simulation", "zbridge.transport"}
 
@@ -37,7 +39,7 @@ def test_it_exports_what_it_says() -> None:
     assert [name for name in zbridge.protocol.__all__ if not hasattr(zbridge.protocol, name)] == []
 
 
-@pytest.mark.parametrize("path", GATEWAYS, ids=lambda path: f"{path.parent.name}.{path.stem}")
+@pytest.mark.parametrize("path", GATEWAYS, ids=lambda path: ".".join(path.relative_to(ROOT).parts))
 def test_a_gateway_is_written_with_the_authors_packages_alone(path: Path) -> None:
     allowed = AUTHORS | (SIMULATORS if path.stem == "simulator" else set())
     imported = {

@@ -1,7 +1,8 @@
-"""The configuration of one process: a TOML file, checked whole before anything starts.
+"""Reads the configuration of one process: a TOML file, checked as a whole before anything starts.
 
-Unknown keys are errors. ``${VAR}`` in a string is replaced from the environment. Knows no protocol: ``options`` tables
-are checked against the declaration of the named protocol.
+Unknown keys are errors; ``${VAR}`` in a string is replaced from the environment. Knows no protocol: an ``options``
+table is checked against the options that the named protocol declares. Every ConfigError names key, value and what was
+expected.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from zbridge.bus import BusSettings
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
-from zbridge.hq.settings import HqSettings, ListenerPlan, Network
+from zbridge.hq import HqSettings, ListenerPlan
+from zbridge.hq.settings import Network
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 
@@ -34,14 +36,14 @@ _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
 class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[robot]``: how the robot is named on the bus."""
+    """``[robot]``: the robot's name on the bus, and the first chunk of its keys."""
 
     name: str
     realm: str = "fleet"
 
 
 class MetricsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[metrics]``: where Prometheus finds the counters."""
+    """``[metrics]``: host:port at which Prometheus reads the counters."""
 
     listen: str
 
@@ -58,7 +60,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Plan(msgspec.Struct, frozen=True):
-    """A configuration with everything its names refer to: what a gateway is started from."""
+    """A configuration with the protocols, options and addresses that it names: what a gateway starts from."""
 
     config: Config
     device: DevicePlan | None
@@ -67,7 +69,7 @@ class Plan(msgspec.Struct, frozen=True):
 
 
 def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
-    """Read and check a configuration file; raise ConfigError naming file, key, value and what was expected."""
+    """Read and check a configuration file; raise ConfigError, which names the file as well."""
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -81,7 +83,7 @@ def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
 
 
 def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:
-    """Check a configuration given as a plain map; raise ConfigError naming key, value and what was expected."""
+    """Check a configuration given as a dict; raise ConfigError."""
     raw = _substituted(raw, environment, "")
     config = _convert(raw, Config, "")
     for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
@@ -182,12 +184,12 @@ def _convert(raw: Any, kind: type[T], prefix: str) -> T:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(prefix + _explain(raw, kind, str(error))) from error
-    except ConfigError as error:  # what cannot go together
+    except ConfigError as error:  # options that contradict each other
         raise ConfigError(f"{prefix}{error}") from error
 
 
 def _explain(raw: Any, kind: type[Any], text: str) -> str:
-    """Turn msgspec's message into ``key = value: what was expected``."""
+    """Rewrite msgspec's message as ``key = value: what was expected``."""
     match = _PATH.search(text)
     path = (match["path"] or match["index"] or "") if match else ""
     what = text[: match.start()] if match else text
@@ -219,7 +221,7 @@ def _value(raw: Any, path: str) -> Any:
 
 
 def _type_at(kind: type[Any], path: str) -> inspect.Type:
-    """Find the type that a path of a configuration is declared with."""
+    """Return the declared type at a path of a configuration."""
     at = _plain_type(inspect.type_info(kind))
     for part in _parts(path):
         if isinstance(at, inspect.StructType):
@@ -231,7 +233,7 @@ def _type_at(kind: type[Any], path: str) -> inspect.Type:
 
 
 def _plain_type(at: inspect.Type) -> inspect.Type:
-    """Look through ``X | None``."""
+    """Return X for ``X | None``."""
     if isinstance(at, inspect.UnionType):
         types = [member for member in at.types if not isinstance(member, inspect.NoneType)]
         return types[0] if len(types) == 1 else at

@@ -1,4 +1,9 @@
-"""One gateway process: the bus, the claim on the robot, its device side, and the counters' endpoint."""
+"""One gateway process, from its plan to its end. Knows no protocol.
+
+Theory of operation. The bus is opened first, and again until that succeeds. Listeners run from then on. The device side
+runs only while this process owns the robot (:class:`Ownership`): it waits while another gateway does. What one part
+raises ends all others; each part leaves its peers in order before the bus is closed.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +30,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
-from zbridge.hq.listener import Listener
-from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
@@ -36,24 +40,27 @@ from zbridge.robot.settings import DevicePlan
 log = logging.getLogger("zbridge.app.gateway")
 
 _ZID = 6
-"""Characters of the session id that tell listeners of different processes apart."""
+"""Characters of the bus session's id in a listener's name: they differ between processes."""
 RETRY_S = 1.0
 """Seconds between attempts to open the bus."""
 TELL_S = 60.0
-"""Seconds between two lines of the log about other gateways that serve the robot."""
+"""Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
-"""Other gateways that are named."""
+"""Other gateways that a log line names."""
 _RIVALS = "rivals"
 
 
 class Gateway:
-    """A gateway from its plan to its end."""
+    """A gateway of one robot: its device side, its listeners, or both, as the plan says.
+
+    metrics, sessions, conditions: of this process, shared by all parts.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
-        """Whether the bus was left in order; if not, its threads may hang."""
+        """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
         self.sessions = SessionTable()
         self.conditions = Conditions()
@@ -62,7 +69,7 @@ class Gateway:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
-        """Serve the robot and its HQ programs until cancelled; leave the robot standing still and the bus in order."""
+        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
         with self._audit() as audit:
             bus = await self._open_bus()
             try:
@@ -74,14 +81,14 @@ class Gateway:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
-            audience = RobotSubscription(bus, self._keys, self.metrics)
+            robot = RobotSubscription(bus, self._keys, self.metrics)
             work: list[Coroutine[Any, Any, None]] = [
-                Listener(listener, name, audience, bus, self._keys, self.sessions, self.metrics, time.monotonic).run()
+                Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
                 for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
             ]
             if work:
-                audience.open()
-                stack.callback(audience.close)
+                robot.open()
+                stack.callback(robot.close)
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
@@ -89,7 +96,7 @@ class Gateway:
             await together(*work)
 
     def _listener_names(self, bus: Bus) -> list[str]:
-        """Name the listeners as nobody else on the bus does, where the configuration does not."""
+        """Return the names of the listeners on the bus: as configured, else unique by the id of the bus session."""
         names: list[str] = []
         for number, listener in enumerate(self._plan.listeners, 1):
             own = f"{listener.protocol.name}-{bus.zid[:_ZID]}"
@@ -98,33 +105,33 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        claim = Ownership(bus, self._keys)
+        ownership = Ownership(bus, self._keys)
         try:
             while True:
                 shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
-                await claim.take()
+                await ownership.take()
                 if shown is not None:
                     shown.close()
                 shown = self._show_sessions(bus, "gateway")
                 try:
-                    await self._serve(claim, self._device(bus, audit, plan))
+                    await self._serve(ownership, self._device(bus, audit, plan))
                 finally:
                     shown.close()
         finally:
-            claim.release()
+            ownership.release()
 
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
-        """Answer who asks for the session table of this process."""
+        """Answer queries for the session table of this process; ``who`` names the process."""
 
         def answer(question: IncomingQuery) -> None:
             question.answer(payloads.encode(Sessions(self.sessions.snapshots())))
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, claim: Ownership, device: Device) -> None:
-        """Serve the robot until it has to be left to another gateway."""
+    async def _serve(self, ownership: Ownership, device: Device) -> None:
+        """Serve the robot until another gateway has to take it."""
         serving = asyncio.ensure_future(device.run())
-        watching = asyncio.ensure_future(claim.watch(lambda: device.reached, self._rival_teller(device)))
+        watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
             for task in (serving, watching):
@@ -137,7 +144,7 @@ class Gateway:
             self.conditions.set(_RIVALS, None)
 
     def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:
-        """Make the function that tells of other gateways: ``status`` always, ``control`` and the log once a while."""
+        """Return what reports other gateways: on ``status`` always, on ``control`` and in the log every TELL_S."""
         robot, told_at = self._plan.config.robot.name, -math.inf
 
         def tell(zids: tuple[str, ...]) -> None:
@@ -169,12 +176,12 @@ class Gateway:
             audit=audit,
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
-            clock=time.monotonic,  # the time line of every event loop on Linux, without its rounding
+            clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 
     @contextlib.contextmanager
     def _audit(self) -> Iterator[Audit]:
-        """Keep the audit log open: a file where the configuration names one, always the gateway's own log."""
+        """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
         control, name = self._plan.config.control, self._plan.config.robot.name
         if control.audit is None or self._plan.device is None:
             yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
@@ -210,7 +217,7 @@ class Gateway:
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until all have ended, or one fails: then cancel the others, and raise what failed."""
+    """Run coroutines until all have ended, or one fails: then cancel the others and raise its exception."""
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
@@ -224,13 +231,13 @@ async def together(*work: Coroutine[Any, Any, None]) -> None:
 
 
 async def until_signal(work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine until it ends or SIGTERM or SIGINT comes; then cancel it and wait for it to tidy up."""
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended."""
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []
 
     def end(number: int) -> None:
-        """Cancel once: a second signal must not cut the tidying up short."""
+        """Cancel once: a second signal must not interrupt the end."""
         if not asked:
             task.cancel()
         asked.append(number)

@@ -1,4 +1,4 @@
-"""Shows the counters to Prometheus: one page over HTTP/1.0, nothing else."""
+"""Serves the counters to Prometheus: one page over HTTP/1.0, nothing else. Knows no bus and no robot."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from zbridge.metrics import Metrics
 log = logging.getLogger("zbridge.metrics")
 
 REQUEST_S = 2.0
-"""Seconds a client has to send its request and to take the answer."""
+"""Longest time a client may take to send its request and read the answer."""
 CLIENTS = 4
-"""Clients that are served at a time."""
+"""Clients served at a time."""
 WAITING = 16
-"""Clients that may wait for their turn, in the operating system; the others have to come again."""
+"""Clients that wait in the operating system's queue; further ones are refused."""
 _REQUEST_BYTES = 8192
 
 
 @contextlib.asynccontextmanager
 async def serve_metrics(address: Address, metrics: Metrics) -> AsyncIterator[None]:
-    """Serve ``GET /metrics`` while the context lasts; without the address the gateway runs all the same.
+    """Serve ``GET /metrics`` while the context lasts. An address in use is logged as an error and otherwise ignored.
 
-    Connections are accepted only while there is room: a server of asyncio's takes in all that come, and nobody else has
-    a turn meanwhile.
+    Connections are accepted only while fewer than CLIENTS are served: a server of asyncio accepts all at once and
+    starves the rest of the process meanwhile.
     """
     try:
         sockets = await _listen(address)
@@ -48,7 +48,7 @@ async def serve_metrics(address: Address, metrics: Metrics) -> AsyncIterator[Non
 
 
 async def _listen(address: Address) -> list[socket.socket]:
-    """Listen at every address that the host's name stands for; raise OSError where one cannot be had."""
+    """Listen at every address of the host; raise OSError if one of them is not available."""
     loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
     try:
         for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
@@ -62,7 +62,7 @@ async def _listen(address: Address) -> list[socket.socket]:
 
 
 async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics) -> None:
-    """Serve whoever connects, while there is room, until cancelled."""
+    """Accept and serve clients, while there is room, until cancelled."""
     loop, clients = asyncio.get_running_loop(), dict[asyncio.Task[None], socket.socket]()
 
     def gone(task: asyncio.Task[None]) -> None:
@@ -74,7 +74,7 @@ async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Me
             await room.acquire()
             try:
                 client, _ = await loop.sock_accept(listening)
-            except OSError as error:  # no descriptor left: asked again at once, it would be all this process does
+            except OSError as error:  # no descriptor left: an immediate retry would use up the processor
                 log.debug("metrics endpoint: %s", error)
                 room.release()
                 await asyncio.sleep(REQUEST_S)

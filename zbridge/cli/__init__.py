@@ -1,7 +1,8 @@
 """The command line: ``zbridge run, check, init, simulate, probe, demo, ls, echo, drive, stop``.
 
-Only this package imports typer and rich, and this module does not: a gateway runs for months, and carries none
-of the command line's libraries. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
+Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
+``app`` declares the commands, ``bus``, ``demo``, ``drive`` and ``probe`` carry them out, ``keyboard`` turns keys into
+drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
 """
 
 from __future__ import annotations
@@ -15,14 +16,13 @@ from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, NoReturn
 
-from zbridge.app.config import load
-from zbridge.app.gateway import Gateway, until_signal
+from zbridge.app import Gateway, load, until_signal
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.text import shown
 
 
 def main() -> None:
-    """Run the command line; errors of zbridge's own become one line on stderr."""
+    """Run the command line; print a ZbridgeError as one line on stderr."""
     try:
         match sys.argv[1:]:
             case ["run", file] if not file.startswith("-"):
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def run_only(protocol: str) -> None:
-    """Run ``python -m gateways.<protocol> FILE``: a gateway of that protocol and no other."""
+    """Run ``python -m gateways.<protocol> FILE``: a gateway of that protocol only."""
     try:
         if len(sys.argv) != 2:
             raise ConfigError(f"usage: python -m gateways.{protocol} FILE")
@@ -55,13 +55,13 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
-    gc.freeze()  # what start-up made stays, and need not be looked through again
+    gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     gateway = Gateway(plan)
     try:
         run_loop(until_signal(gateway.run()))
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
-    if not gateway.left:  # a thread of the bus hangs, and would keep the process from ending
+    if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)
 
@@ -76,14 +76,14 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
 
 
 def set_up_log(*, verbose: bool, level: int = logging.INFO) -> None:
-    """Log to stderr; ``verbose`` shows every frame."""
+    """Log to stderr from ``level`` on; ``verbose`` logs every frame."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if verbose else level, handlers=[handler])
 
 
 class LineFormatter(logging.Formatter):
-    """Writes a record as one line that is safe to show, whatever peers wrote into it; a traceback on lines below it."""
+    """Writes a record as one line that is safe to print, whatever peers sent; a traceback on lines below it."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the library's names
         return shown(super().formatMessage(record))

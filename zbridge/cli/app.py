@@ -1,4 +1,4 @@
-"""Put robots that speak legacy protocols on a Zenoh bus, see them there, and stop them."""
+"""Connect robots that speak legacy protocols to a Zenoh bus, list them, drive them and stop them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import Annotated
 import typer
 
 from zbridge.address import Address, parse_device_address
-from zbridge.app.config import load
-from zbridge.app.gateway import until_signal
-from zbridge.app.templates import listener_template, robot_template
+from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
+from zbridge.fleet.topics import is_name
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
 app = typer.Typer(
@@ -45,7 +44,7 @@ def run(file: File, verbose: Verbose = False) -> None:
 
 @app.command()
 def check(file: File) -> None:
-    """Check a configuration and say what it would do."""
+    """Check a configuration and print what it would run."""
     plan = load(file)
     robot, parts = plan.config.robot, []
     if plan.device is not None:
@@ -59,7 +58,7 @@ def check(file: File) -> None:
 def init(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     name: Annotated[str, typer.Option(help="the robot's name on the bus")] = "r1",
-    hq: Annotated[bool, typer.Option("--hq", help="of a process that serves HQ programs of that protocol")] = False,
+    hq: Annotated[bool, typer.Option("--hq", help="for a process that only serves HQ programs")] = False,
 ) -> None:
     """Print a commented configuration to start from."""
     found = find_protocol(protocol)
@@ -73,19 +72,20 @@ def init(
 def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     listen: Annotated[
-        list[str], typer.Option(help="address to serve, tcp://host:port; port 0 takes a free one; one for each link")
+        list[str],
+        typer.Option(help="address to listen at, tcp://host:port; port 0: any free one; once for each link"),
     ] = [],
     hq: Annotated[
-        str, typer.Option(help="be an HQ program instead, as fragile as a deployed one, and connect there")
+        str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
     ] = "",
-    seed: Annotated[int, typer.Option(help="the same seed gives the same world")] = 1,
+    seed: Annotated[int, typer.Option(help="the same seed makes the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
-    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as a deployed robot")] = False,
+    fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as deployed robots")] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Be a robot to play with, or an HQ program, until SIGTERM or SIGINT."""
+    """Simulate a robot, or an HQ program, until SIGTERM or SIGINT."""
     set_up_log(verbose=verbose)
     simulated = find_protocol(protocol)
     if bool(listen) == bool(hq):
@@ -106,9 +106,9 @@ def simulate(
 
 
 def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
-    """Be an HQ program until SIGTERM or SIGINT, or until it dies or is left."""
+    """Simulate an HQ program until SIGTERM or SIGINT, or until it dies or its connection ends."""
     if simulated.simulate_hq is None:
-        give_up(2, f"there is no HQ program of {simulated.name} to play with")
+        give_up(2, f"there is no simulated HQ program of {simulated.name}")
     try:
         run_loop(until_signal(simulated.simulate_hq(simulation)))
     except OSError as error:
@@ -119,11 +119,13 @@ def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:
 def probe(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     address: Annotated[str, typer.Argument(help="tcp://host:port or serial:///path?baud=N", show_default=False)],
-    yes: Annotated[bool, typer.Option("--yes", help="talk to it although that may use up its connection")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="connect to the device although that may use up its only connection")
+    ] = False,
     connect: Connect = [],
     realm: Realm = "fleet",
 ) -> None:
-    """Say what a device is: from its gateway on the bus, else, with --yes, by talking to it."""
+    """Print what a device is: from its gateway on the bus, else, with --yes, by a handshake with it."""
     from zbridge.cli.probe import probe as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
@@ -135,9 +137,9 @@ def probe(
 
 @app.command()
 def demo(
-    seconds: Annotated[float, typer.Option(help="end after so many seconds; 0: until interrupted")] = 0.0,
+    seconds: Annotated[float, typer.Option(help="end after this many seconds; 0: run until interrupted")] = 0.0,
 ) -> None:
-    """Show a simulated robot, its gateway, a router and a live table; loopback only."""
+    """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
     from zbridge.cli.demo import run_demo
 
     set_up_log(verbose=False, level=logging.WARNING)
@@ -148,9 +150,7 @@ def demo(
 def ls(
     connect: Connect = [],
     realm: Realm = "fleet",
-    sessions: Annotated[
-        bool, typer.Option("--sessions", help="list sessions: with robots, and with HQ programs")
-    ] = False,
+    sessions: Annotated[bool, typer.Option("--sessions", help="list the sessions with robots and HQ programs")] = False,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
 ) -> None:
     """List the robots on the bus, or the sessions of their gateways and listeners."""
@@ -166,9 +166,9 @@ def echo(
     key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
     connect: Connect = [],
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
-    count: Annotated[int, typer.Option(help="end after so many messages; 0: until interrupted")] = 0,
+    count: Annotated[int, typer.Option(help="end after this many messages; 0: run until interrupted")] = 0,
 ) -> None:
-    """Print what comes on a key, decoded."""
+    """Print the messages on a key, decoded."""
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
@@ -180,14 +180,15 @@ def drive(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)],
     speed: Annotated[float, typer.Option(help="fraction of full scale", min=0.1, max=1.0)] = 0.3,
     who: Annotated[str, typer.Option(help="shown to others as the driver; user@host by default")] = "",
-    takeover: Annotated[bool, typer.Option("--takeover", help="take it from whoever drives it")] = False,
+    takeover: Annotated[bool, typer.Option("--takeover", help="take the robot from whoever drives it")] = False,
     connect: Connect = [],
     realm: Realm = "fleet",
 ) -> None:
-    """Drive a robot by keyboard: it moves only while a key is held; space stops it."""
+    """Drive a robot by keyboard: it moves only while a key is held down; space stops it."""
     from zbridge.cli.drive import drive_robot
 
     set_up_log(verbose=False, level=logging.ERROR)
+    check_name("ROBOT", robot)
     work = drive_robot(bus_settings(connect), realm, robot, speed, who=who or None, takeover=takeover)
     run_loop(until_signal(work))
 
@@ -205,5 +206,13 @@ def stop(
     set_up_log(verbose=False, level=logging.ERROR)
     if bool(robot) == everything:
         give_up(2, "name one ROBOT, or give --all")
+    if robot:
+        check_name("ROBOT", robot)
     if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):
         raise typer.Exit(1)
+
+
+def check_name(argument: str, name: str) -> None:
+    """End the process with exit code 2 if ``name`` cannot be a robot's name."""
+    if not is_name(name):
+        give_up(2, f"{argument} = {name!r}: expected letters, digits, '_', '.' and '-' only")

@@ -1,4 +1,4 @@
-"""The commands that look at the bus: robots, messages, and the stop for everyone."""
+"""``zbridge ls, echo, stop``: the commands that read the bus, and the stop that is open to everyone."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from zbridge.text import as_json as to_json
 from zbridge.text import shown
 
 _SHOWN = 8
+"""Bytes of a value that are printed."""
 _TABLE = 180
-"""Characters of the widest table that is printed to a file."""
-
+"""Characters of a line of a session table, at least, also where the terminal has fewer."""
 _CELL = 200
-"""Characters of a cell of a table."""
+"""Characters of a cell of a table, at most."""
 _MESSAGE = 20_000
-"""Characters of a message that is printed to be read."""
+"""Characters of a message that is printed as text, at most."""
 _DEPTH = 32
-"""Maps and arrays within one another that are printed."""
+"""Levels of nested maps and arrays that are printed."""
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -43,7 +43,7 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emo
 
 @contextlib.asynccontextmanager
 async def joined(settings: BusSettings) -> AsyncIterator[Bus]:
-    """Be on the bus while the context lasts."""
+    """Open the bus while the context lasts; raise BusError."""
     bus = await open_bus(settings, Metrics(), wait_for_peers=True)
     try:
         yield bus
@@ -52,7 +52,7 @@ async def joined(settings: BusSettings) -> AsyncIterator[Bus]:
 
 
 async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> None:
-    """Print every robot that has a gateway or a status."""
+    """Print the robots that have a gateway or a status."""
     async with connect(settings=settings, realm=realm) as fleet:
         robots = await fleet.robots()
     if as_json:
@@ -66,7 +66,7 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
 
 
 async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> None:
-    """Print the session table of every process that serves a robot or HQ programs."""
+    """Print the session tables of all processes that serve a robot or HQ programs."""
     async with connect(settings=settings, realm=realm) as fleet:
         tables = await fleet.sessions()
     if as_json:
@@ -111,7 +111,7 @@ def _session_table(tables: dict[tuple[str, str], tuple[SessionEntry, ...]]) -> T
 
 
 def cell(text: str) -> Text:
-    """Make a cell of a table: text that is safe to show, and never markup."""
+    """Return a cell of a table: text that is safe to print, not interpreted as markup."""
     return Text(shown(text, _CELL))
 
 
@@ -128,7 +128,7 @@ def _robot_table(robots: dict[str, Status | None]) -> Table:
 
 
 async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) -> None:
-    """Print the messages that come on ``key``; the last value of a state first."""
+    """Print the messages on ``key``, the last value of each state first; count: end after so many, 0 = never."""
     seen, done = 0, asyncio.Event()
 
     def show(sample: Sample) -> None:
@@ -177,7 +177,7 @@ def _short(value: Any) -> str:
 
 
 def _plain(value: Any, depth: int = _DEPTH) -> Any:
-    """Make anything JSON can hold: arrays as lists, bytes as hex, what is no number as null, the rest as it prints."""
+    """Return a value that JSON can hold: arrays as lists, bytes as hex, NaN and infinity as null, the rest as text."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     if isinstance(value, np.ndarray):
@@ -196,7 +196,7 @@ def _plain(value: Any, depth: int = _DEPTH) -> Any:
 
 
 async def stop(settings: BusSettings, realm: str, robot: str | None) -> bool:
-    """Stop one robot or all; tell whether every one of them confirmed it."""
+    """Stop one robot, or all; return whether every gateway confirmed it."""
     async with connect(settings=settings, realm=realm) as fleet:
         outcomes = await fleet.stop([robot] if robot is not None else None)
     for name, error in outcomes.items():

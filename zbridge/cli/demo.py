@@ -1,4 +1,4 @@
-"""The demo: simulated robots, a gateway with a listener each, an embedded router, a live table. Loopback only."""
+"""``zbridge demo``: a simulated robot of each protocol, their gateways, an embedded router, a table. Loopback only."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from zbridge.app.gateway import until_signal
+from zbridge.app import until_signal
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
@@ -39,9 +39,9 @@ START_S = 20.0
 """Longest time a simulator may take to start."""
 REALM = "fleet"
 FIGURE_S = 2.0
-"""Seconds the robots go straight on, then turn, then go straight on."""
+"""Seconds that the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
-"""Less than everybody's, so that whoever asks for a robot is given it."""
+"""Below the default of 0: anybody else who asks for a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
 _NO_DATA = (topics.STATUS.path, topics.CONTROL.path)
 
@@ -57,7 +57,7 @@ class Row(msgspec.Struct):
 
 
 class Watch:
-    """Collects what the robots publish, for the table."""
+    """Collects what the robots publish and draws the table."""
 
     def __init__(self, robots: list[str]) -> None:
         self.rows = {robot: Row() for robot in robots}
@@ -96,7 +96,7 @@ class Watch:
 
 
 async def run_demo(seconds: float) -> None:
-    """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError when no robot ever got ready."""
+    """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data."""
     robots = {f"{protocol}1": protocol for protocol in protocol_names()}
     watch = Watch(list(robots))
     async with contextlib.AsyncExitStack() as stack:
@@ -112,29 +112,29 @@ async def run_demo(seconds: float) -> None:
         for key_expr in ("*", "sensor/*"):
             bus.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}")  # noqa: T201
-        print("HQ programs connect to a robot here, for example one to play with:")  # noqa: T201
+        print("HQ programs connect to the robots here; to simulate one:")  # noqa: T201
         for robot, protocol in robots.items():
             print(f"  {robot}: {_how_to_connect(find_protocol(protocol), listeners[robot])}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
-        for gateway in gateways:  # all at once: each takes its time to leave its robot standing
+        for gateway in gateways:  # all at once: each needs about a second to stop its robot
             with contextlib.suppress(ProcessLookupError):
                 gateway.terminate()
         silent = [robot for robot, row in watch.rows.items() if not row.heard]
         if seconds and silent:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
                 print(shown(line), file=sys.stderr)  # noqa: T201
-            raise ZbridgeError(f"no data from {', '.join(silent)}; the processes' last words are above")
+            raise ZbridgeError(f"no data from {', '.join(silent)}; the end of the processes' log is above")
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:
-    """Say how an HQ program comes to the robot; a protocol of another package may have none, or none to play with."""
+    """Return how an HQ program connects to the robot; not every protocol has one, or a simulated one."""
     if protocol.hq is None:
         return "serves no HQ programs"
     return f"zbridge simulate {protocol.name} --hq {listener}" if protocol.simulate_hq is not None else listener
 
 
 async def _router() -> tuple[Bus, str]:
-    """Open the embedded router, at Zenoh's usual port where that is free."""
+    """Open the embedded router, at Zenoh's usual port if that is free."""
     for endpoint in (LOCAL_ROUTER, f"tcp/127.0.0.1:{_free_port()}"):
         try:
             settings = BusSettings(mode="router", listen=(endpoint,), multicast=False)
@@ -145,7 +145,7 @@ async def _router() -> tuple[Bus, str]:
 
 
 def _free_port() -> int:
-    """Find a port, for TCP and UDP, that nobody is given by chance before it is used."""
+    """Return a port that is free for TCP and UDP, outside the range from which the system assigns ports."""
     while True:
         port = random.randrange(20_000, 32_000)
         with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
@@ -158,7 +158,7 @@ def _free_port() -> int:
 async def _robot(
     folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str, listener: str
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a simulator and its gateway with a listener, each a process of its own; give the gateway's."""
+    """Run a simulator and its gateway with a listener, one process each; yield the gateway's."""
     found = find_protocol(protocol)
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
@@ -180,7 +180,7 @@ async def _robot(
 
 
 def _inline(value: object) -> str:
-    """Write a value of a configuration: as JSON, but for tables."""
+    """Write a value as TOML: as JSON, except tables."""
     if isinstance(value, list):
         return f"[{', '.join(map(_inline, value))}]"
     if isinstance(value, dict):
@@ -212,7 +212,7 @@ async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> Async
 
 
 async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
-    """Draw the table, and drive the robots about until somebody else does."""
+    """Draw the table, and drive each robot until somebody else does."""
     fleet = Fleet(bus, REALM)
     loop = asyncio.get_running_loop()
     started = loop.time()
@@ -229,7 +229,7 @@ async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
 
 
 async def _wander(robot: Robot) -> None:
-    """Drive straight on, turn, and so on, until anybody else takes the robot: anybody may."""
+    """Drive straight on, turn, and so on, until somebody else takes the robot."""
     with contextlib.suppress(Refused, BusError):
         async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
             while True:

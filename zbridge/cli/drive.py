@@ -1,4 +1,4 @@
-"""``zbridge drive``: one robot by keyboard. The lease is held while the command runs."""
+"""``zbridge drive``: drives one robot by keyboard, and holds its lease while it runs."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from zbridge.text import shown
 EVERY_S = 0.05
 DEADMAN_S = 0.3
 _READ_BYTES = 1024
-_HELP = """hold a key to move, let go to stand
+_HELP = """hold a key down to move, release it to stop
   w s, arrows  forward, backward     a d  turn left, right     q e  sideways
   space  STOP (whoever drives)       + -  speed                Enter  take the lease again     x  end"""
 
 
 class Session:
-    """One sitting at the keyboard."""
+    """One run of ``zbridge drive``: keys in, drives out, one line of state on the terminal."""
 
     def __init__(self, robot: Robot, speed: float, *, who: str | None, takeover: bool) -> None:
         self._robot = robot
@@ -53,7 +53,7 @@ class Session:
                     return
 
     async def _drive(self, drive: Driver) -> None:
-        """Send what the keys say until ``x``."""
+        """Send the drive that the keys stand for, until ``x``."""
         while True:
             while not self._keys.empty():
                 key, at = self._keys.get_nowait()
@@ -91,7 +91,7 @@ class Session:
             self._say(str(error))
 
     def _take(self, text: str) -> None:
-        for key, _ in itertools.groupby(split_keys(text)):  # what came at once was not held: it waited somewhere
+        for key, _ in itertools.groupby(split_keys(text)):  # repeated within one read: queued, not held
             with contextlib.suppress(asyncio.QueueFull):
                 self._keys.put_nowait((key, self._loop.time()))
 
@@ -116,7 +116,7 @@ class Session:
 async def drive_robot(
     settings: BusSettings, realm: str, name: str, speed: float, *, who: str | None, takeover: bool
 ) -> None:
-    """Drive one robot by keyboard; raise ZbridgeError where there is no terminal, Held where somebody has it."""
+    """Drive one robot by keyboard; raise ZbridgeError without a terminal, Held if another program holds the lease."""
     if not sys.stdin.isatty():
         raise ZbridgeError("drive needs a terminal to read keys from")
     async with connect(settings=settings, realm=realm) as fleet:
@@ -126,7 +126,7 @@ async def drive_robot(
 
 @contextlib.contextmanager
 def _raw_keys(loop: asyncio.AbstractEventLoop, take: Callable[[str], None]) -> Iterator[None]:
-    """Have keys delivered one by one, unechoed, while the context lasts."""
+    """Read keys one by one, without echo, while the context lasts."""
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
 

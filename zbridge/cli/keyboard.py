@@ -1,4 +1,4 @@
-"""Keys to drive commands: motion only while a key repeats. Knows no terminal; time is an argument."""
+"""Turns keys into drive commands: motion only while a key repeats. Knows no terminal; time is an argument."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import msgspec
 from zbridge.fleet.messages import Drive
 
 FIRST_REPEAT_S = 0.8
-"""Longest time a keyboard waits before it begins to repeat a key that is held."""
+"""Longest time a keyboard waits before it repeats a key that is held down."""
 NEXT_REPEAT_S = 0.15
-"""Longest time between two repetitions, a slow network included."""
+"""Longest time between two repetitions, including a slow network."""
 STEP = 0.1
-"""What ``+`` and ``-`` change the speed by."""
+"""Change of speed of one ``+`` or ``-``, a fraction of full scale."""
 
 DRIVES = {
     "w": Drive(forward=1.0),
@@ -25,20 +25,23 @@ DRIVES = {
 }
 ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
 _KEYS = re.compile(r"\x1b\[[0-?]*[!-/]*[@-~]|\x1bO[A-Za-z]|\x1b[^\x1b \[]?|.", re.DOTALL)
-"""One key: a whole escape sequence, so that its letters are not taken for keys, or a character.
+"""One key: a whole escape sequence, so that its letters do not count as keys, or one character.
 
-A space is never part of a sequence: it stops the robot, whatever came before it.
+A space is never part of a sequence: it stops the robot whatever precedes it.
 """
 
 
 def split_keys(text: str) -> list[str]:
-    """Cut what a terminal sent into keys; the arrows, three characters each, become their letters."""
+    """Split what a terminal sent into keys; arrows, three characters each, become their letters."""
     keys = [ARROWS.get(key, key) for key in _KEYS.findall(text)]
     return [key for key in keys if not key.startswith("\x1b")]
 
 
 class Keyboard:
-    """What the keys pressed until now mean. A single press moves nothing: a stuck terminal sends no repetition."""
+    """The command that the keys pressed so far stand for.
+
+    A single press moves nothing: a terminal that hangs sends no repetition.
+    """
 
     def __init__(self, speed: float) -> None:
         self.speed = speed
@@ -47,7 +50,7 @@ class Keyboard:
         self._moves_until = 0.0
 
     def press(self, key: str, now: float) -> None:
-        """Take one key."""
+        """Record one key press."""
         if key in ("+", "-"):
             self.speed = min(1.0, max(STEP, round(self.speed + (STEP if key == "+" else -STEP), 2)))
             return
@@ -58,7 +61,7 @@ class Keyboard:
         self._key, self._pressed_at = key, now
 
     def drive(self, now: float) -> Drive:
-        """Give the command for now."""
+        """Return the command to send at ``now``."""
         wanted = DRIVES.get(self._key)
         if wanted is None or now >= self._moves_until:
             return Drive()

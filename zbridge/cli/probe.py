@@ -1,4 +1,4 @@
-"""``zbridge probe``: say what a device is; from its gateway if it has one, else by talking to it."""
+"""``zbridge probe``: prints what a device is, from its gateway if it has one, else after a handshake."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PROBE_S = 15.0
 """Longest time a handshake may take."""
 WARNING = (
     "{address} has no gateway on the bus. Deployed robots give one usable connection per start of the robot program: "
-    "probing uses it up, and the robot must be restarted before a gateway can connect. Say --yes to do it."
+    "probing uses it up, and the robot must be restarted before a gateway can connect. Give --yes to probe."
 )
 
 
 async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddress, *, realm: str, sure: bool) -> int:
-    """Print what the device is; give the exit code: 0 known, 1 it did not answer, 2 not asked without ``sure``."""
+    """Print what the device is; return the exit code: 0 known, 1 no handshake, 2 not probed without ``sure``."""
     served = await _served(settings, address, realm)
     if served is not None:
         robot, status = served
@@ -45,7 +45,7 @@ async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddres
 
 
 async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> tuple[str, Status] | None:
-    """Look on the bus for a gateway that is connected to the address."""
+    """Return the robot and status of the gateway on the bus that is connected to the address; None without one."""
     with contextlib.suppress(BusError):
         async with joined(settings) as bus:
             answers = await bus.ask(f"{realm}/*/status")
@@ -59,7 +59,7 @@ async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> 
 
 
 async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
-    """Shake hands with the device, say what was agreed, and leave."""
+    """Do a handshake with the device, print what was agreed, and disconnect; return the exit code."""
     loop = asyncio.get_running_loop()
     robot = protocol.robot(protocol.options(), 1, Metrics())
     session = robot.session(robot.link_names[0], str(address))

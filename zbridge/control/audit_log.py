@@ -8,7 +8,7 @@ What repeats itself is folded, so that noise neither fills the disk nor pushes o
   actor may take any name. Each kind of event has budgets of its own, so that no flood of one hides another.
 - Counts have a budget too (:data:`COUNTS`); where it is used up, they go on and are written later. None is lost.
 
-Lines are written by a thread of their own: a disk that stands still delays no stop. What cannot be written waits, and
+Lines are written by a thread of their own: a stalled disk delays no stop. What cannot be written waits, and
 people are told so.
 """
 

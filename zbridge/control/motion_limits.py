@@ -50,7 +50,7 @@ class MotionLimits:
         """Note what the robot was told."""
         self._last, self._last_at = drive, now
 
-    def stands(self) -> None:
+    def at_rest(self) -> None:
         """Note that the robot is at rest, whatever it was told last."""
         self._last = Drive()
 

@@ -75,12 +75,12 @@ Row = dict[Input, tuple[Action, State]]
 class Intent:
     """The intent of one program.
 
-    deadman_s: silence after which its motion has ended, seconds. modes: whether it must choose a control mode before
-    motion.
+    deadman_s: silence after which its motion has ended, seconds.
     """
 
-    def __init__(self, deadman_s: float, *, modes: bool = False) -> None:
-        self.mode = "none" if modes else "manual"
+    def __init__(self, deadman_s: float) -> None:
+        self.mode = "manual"
+        """The control mode; a protocol whose programs must choose one first begins with ``choose("none")``."""
         self.held_back: str | None = "connected"
         """Why the program owes neutral; None while it does not."""
         self.lease_s = LEASE_S
@@ -200,7 +200,7 @@ class Intent:
         """Carry out the table; raise NeutralFirst if its action is to refuse. A missing pair changes nothing."""
         action, self._state = self.TABLE[self._state].get(said, (Action.NOTHING, self._state))
         if action is Action.REFUSE:
-            raise NeutralFirst(f"{self.held_back}: let go of the stick first")
+            raise NeutralFirst(f"{self.held_back}: release the stick first")
         return action
 
     TABLE: ClassVar[dict[State, Row]] = {

@@ -2,8 +2,9 @@
 
 Knows no protocol and no link. :class:`Intent` decides what is said to the robot; :class:`LeaseHolder` gets and keeps
 the lease; :class:`CommandQueue` keeps commands in order; the operator connects the three, and tells the program's
-people what was refused. The listener calls :meth:`Operator.command`, :meth:`Operator.tick` every :data:`REPEAT_S`
-while :attr:`Operator.active`, and :meth:`Operator.look` for news from ``control``.
+people what was refused. The client calls :meth:`Operator.command`, :meth:`Operator.tick` every ``ATTEND_S`` while
+:attr:`Operator.active`, and :meth:`Operator.repeat` where its protocol says so; the broadcast calls
+:meth:`Operator.look` for news from ``control``.
 """
 
 from __future__ import annotations
@@ -26,8 +27,6 @@ from zbridge.protocol.rate_limit import RateLimit
 
 log = logging.getLogger("zbridge.hq")
 
-REPEAT_S = 0.1
-"""Seconds between repetitions of what a client set once."""
 OPEN_HZ = 50.0
 """Commands a second of one client that need no lease: they share the robot's queue with those of all programs."""
 OURS_S = 1.0
@@ -37,8 +36,9 @@ OURS_S = 1.0
 class Operator:
     """The commands of one client, and its lease. ``tell`` shows a text to its people.
 
-    who: the client's name on the bus and its liveliness token. modes: the protocol whose robots are told the control
-    mode. steers, hold: see :class:`zbridge.protocol.plugin.HqSide`. clock: seconds.
+    who: the client's name on the bus and its liveliness token. protocol: of the client; only robots of the same one are
+    told a control mode, and only once the client has chosen one. is_motion: whether a command is motion, see
+    :meth:`zbridge.protocol.plugin.HqSide.is_motion`. clock: seconds.
     """
 
     def __init__(
@@ -47,18 +47,17 @@ class Operator:
         bridge: Bridge,
         *,
         who: str,
-        modes: str | None,
-        steers: bool,
-        hold: bool,
+        protocol: str,
+        is_motion: Callable[[Drive | Motor], bool],
         tell: Callable[[str], None],
         clock: Callable[[], float],
     ) -> None:
         self.intent = intent
         self.who = who
         self._bridge = bridge
-        self._modes = modes
-        self._steers = steers
-        self._hold = hold
+        self._protocol = protocol
+        self._is_motion = is_motion
+        self._chose_mode = False
         self._tell = tell
         self._clock = clock
         request = Acquire(who=who, deadman_s=intent.deadman_s, alive=who)
@@ -104,22 +103,27 @@ class Operator:
             self._bridge.put(topic, message)
 
     def tick(self) -> None:
-        """Repeat what is held, keep the lease or give it back; to be called every :data:`REPEAT_S` while active."""
+        """Keep the lease, or release it; to be called every ``ATTEND_S`` while active."""
         now, intent = self._clock(), self.intent
         intent.expire(now)
         if not intent.held:
             return
         if intent.held_back is not None:
             self._set.clear()
-        elif self._hold:
-            for topic, message in tuple(self._set.values()):
-                intent.motion(now)
-                self._queue.send(topic, message)
         if intent.wants_release(now):
             self._release("unused")
             return
         self._lease.client.renews = intent.mode == "autonomous"  # else motion and neutral renew it
         self._lease.expire()
+
+    def repeat(self) -> None:
+        """Send again what is in motion, unless neutral is owed."""
+        now, intent = self._clock(), self.intent
+        intent.expire(now)
+        if intent.held and intent.held_back is None:
+            for topic, message in tuple(self._set.values()):
+                intent.motion(now)
+                self._queue.send(topic, message)
 
     def let_go(self, why: str) -> None:
         """Release the robot: the client may not mean any more what it said last."""
@@ -160,12 +164,9 @@ class Operator:
         intent.expire(now)
         if intent.held_back is not None:
             self._set.clear()
-        moves = message.moving
-        if moves and self._steers and isinstance(message, Drive) and not (message.forward or message.left):
-            if not intent.may_steer:
+        if not self._is_motion(message):
+            if isinstance(message, Drive) and message.moving and not intent.may_steer:
                 message = Drive(light=message.light)
-            moves = False
-        if not moves:
             self._set.pop(topic.path, None)
             self._pushed.pop(topic.path, None)
             whole = all(now - said_at >= intent.deadman_s for said_at in self._pushed.values())
@@ -178,9 +179,10 @@ class Operator:
         self._follow(do, topic, message)
 
     def _choose(self, message: Mode, now: float) -> None:
+        self._chose_mode = True
         if message.mode == "autonomous":
             self._require_robot()
-            if self._bridge.view.protocol != self._modes:
+            if self._bridge.view.protocol != self._protocol:
                 self._choose(Mode("manual"), now)
                 raise Unsupported("the robot does not move by itself, only by the stick")
         do = self.intent.choose(message.mode, now)
@@ -210,7 +212,7 @@ class Operator:
 
     def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
         """Tell the robot its control mode, if it is of a protocol that has any."""
-        if self.intent.held and self._modes is not None and self._bridge.view.protocol == self._modes:
+        if self.intent.held and self._chose_mode and self._bridge.view.protocol == self._protocol:
             send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
 
     # The lease

@@ -1,4 +1,4 @@
-"""What the listeners of a process follow of a robot: subscribed once, decoded once. Knows no protocol."""
+"""What the listeners of a process follow of one robot: subscribed once, decoded once. Knows no protocol."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ log = logging.getLogger("zbridge.hq")
 
 Follow = Callable[[Topic, FleetMessage], None]
 _KNOWN = 1024
-"""Keys whose topics are known at a time."""
+"""Keys whose topics are cached."""
 _STATES = (topics.STATUS.path, topics.CONTROL.path)
 
 
 class RobotSubscription:
-    """Keeps the view of one robot, and tells those who follow it."""
+    """Keeps the view of one robot up to date and calls its followers. Call :meth:`open` first."""
 
     def __init__(self, bus: Bus, keys: KeySpace, metrics: Metrics) -> None:
         self.view = RobotView()
-        self._bus = bus
-        self._keys = keys
+        self.bus = bus
+        self.keys = keys
         self._followers: dict[str, list[Follow]] = {}
         self._topics: dict[str, Topic] = {}
         self._gateway: list[Callable[[bool], None]] = []
@@ -37,17 +37,20 @@ class RobotSubscription:
         self._malformed = metrics.count("telemetry_malformed")
 
     def __repr__(self) -> str:
-        return f"<RobotSubscription of {self._keys.robot}, {sorted(self._followers)}>"
+        return f"<RobotSubscription of {self.keys.robot}, {sorted(self._followers)}>"
 
     def follow(self, paths: Iterable[str], follower: Follow, gateway: Callable[[bool], None]) -> None:
-        """Tell ``follower`` of what is published on these paths, ``gateway`` whether the robot is served."""
+        """Call ``follower`` for each message on these paths, ``gateway`` now and when a gateway comes or goes.
+
+        ``status`` and ``control`` are always followed.
+        """
         self._gateway.append(gateway)
         gateway(self.view.alive)
         for path in (*_STATES, *paths):
             self.also_follow(path, follower)
 
     def unfollow(self, path: str, follower: Follow) -> None:
-        """Tell ``follower`` no more of one path; what nobody follows is not subscribed to."""
+        """Call ``follower`` no longer for one path; unsubscribe if nobody else follows it."""
         followers = self._followers.get(path, [])
         if follower in followers:
             followers.remove(follower)
@@ -56,17 +59,17 @@ class RobotSubscription:
                 del self._followers[path]
 
     def also_follow(self, path: str, follower: Follow) -> None:
-        """Tell ``follower`` of one more path."""
+        """Call ``follower`` for one more path too."""
         self._followers.setdefault(path, []).append(follower)
         if path not in self._handles:
             self._subscribe(path)
 
     def open(self) -> None:
-        """Begin to watch the robot's gateway."""
-        self._watch = self._bus.watch_alive(self._keys.alive("gateway"), self._on_gateway)
+        """Watch the liveliness token of the robot's gateway."""
+        self._watch = self.bus.watch_alive(self.keys.alive("gateway"), self._on_gateway)
 
     def close(self) -> None:
-        """Follow nothing any more."""
+        """Unsubscribe from everything."""
         for handle in (*self._handles.values(), *((self._watch,) if self._watch is not None else ())):
             handle.close()
         self._handles.clear()
@@ -79,7 +82,7 @@ class RobotSubscription:
         def take(sample: Sample) -> None:
             self._take(sample, followers)
 
-        self._handles[path] = self._bus.subscribe(self._keys.key(path), take, history=history)
+        self._handles[path] = self.bus.subscribe(self.keys.key(path), take, history=history)
 
     def _take(self, sample: Sample, followers: list[Follow]) -> None:
         topic = self._topics.get(sample.key) or self._topic(sample.key)
@@ -96,9 +99,9 @@ class RobotSubscription:
             follower(topic, message)
 
     def _topic(self, key: str) -> Topic | None:
-        topic = topics.find(self._keys.path(key))
+        topic = topics.find(self.keys.path(key))
         if topic is not None:
-            if len(self._topics) >= _KNOWN:  # a robot may make up new names for ever
+            if len(self._topics) >= _KNOWN:  # a robot may invent new names without end
                 self._topics.clear()
             self._topics[key] = topic
         return topic
@@ -106,6 +109,6 @@ class RobotSubscription:
     def _on_gateway(self, key: str, alive: bool) -> None:
         self.view.alive = alive
         if not alive:
-            self.view.status = None  # what it said last is nothing its successor says
+            self.view.status = None  # it says nothing about the next gateway
         for tell in self._gateway:
             tell(alive)

@@ -1,4 +1,4 @@
-"""The settings of one listener, as a configuration has them, and the plan made of them."""
+"""The settings of one listener as the configuration holds them, and the plan made of them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and what bounds them.
+    """One ``[[hq]]``: where HQ programs of one protocol connect as if this were the robot, and their limits.
 
-    name: of the listener on the bus, the protocol's and this process's where left out. clients: most at a time.
-    accept_hz: connections a second that are taken from one address. handshake_s, idle_s: seconds a client has for its
-    handshake, and may be silent (None: for ever). rate_hz: messages a second of one client. allow: networks clients may
-    come from, all where empty.
+    name: of the listener on the bus; None: made of the protocol and the process. clients: most at a time. accept_hz:
+    connections a second that are accepted from one address. handshake_s: longest time for a client's handshake.
+    idle_s: longest silence of a client; None: no limit. rate_hz: messages a second of one client. allow: networks that
+    clients may connect from; empty: all.
     """
 
     protocol: str
@@ -36,7 +36,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ListenerPlan(msgspec.Struct, frozen=True):
-    """One listener for HQ programs."""
+    """What one listener is made of: its protocol, that protocol's options, where it listens, and for whom."""
 
     protocol: Protocol
     options: Any

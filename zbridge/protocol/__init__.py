@@ -3,7 +3,8 @@
 
 =============== ===================================================================================================
 plugin          :class:`Protocol`: what an entry point names. :class:`Robot` and :class:`HqSide`: its two sides, with
-                :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`.
+                :class:`Outcome`, :data:`Telemetry`, :data:`Translate` and :data:`Send`; :class:`RobotUser`: what a
+                side may do for a client every ``ATTEND_S`` seconds.
                 :class:`Simulation`, :class:`HqSimulation`: how its simulators are started.
 session         :class:`Session`: one conversation, in a :class:`Role`, within :class:`Limits`, in a :class:`State`,
                 with its :class:`Traffic`; a :class:`Datagram` is a frame that goes by UDP.
@@ -47,11 +48,13 @@ from zbridge.protocol.negotiation import agree, newest, parse_versions
 from zbridge.protocol.odometry import Odometry
 from zbridge.protocol.outbox import LIMIT, Outbox
 from zbridge.protocol.plugin import (
+    ATTEND_S,
     HqSide,
     HqSimulation,
     Outcome,
     Protocol,
     Robot,
+    RobotUser,
     Send,
     Simulation,
     Telemetry,
@@ -63,6 +66,7 @@ from zbridge.protocol.session_table import ClientIds
 from zbridge.protocol.udp_probe import Probe, Verdict
 
 __all__ = [
+    "ATTEND_S",
     "LIMIT",
     "Address",
     "BearingScan",
@@ -94,6 +98,7 @@ __all__ = [
     "RateLimit",
     "Refused",
     "Robot",
+    "RobotUser",
     "Role",
     "Sectors",
     "Send",

@@ -6,6 +6,7 @@ A package adds a protocol by an entry point in the group ``zbridge.protocols`` t
 from __future__ import annotations
 
 import math
+import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, ClassVar
@@ -14,12 +15,13 @@ import msgspec
 
 from zbridge.address import Address
 from zbridge.errors import ConfigError, Unsupported
-from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
+from zbridge.protocol.session_table import ClientIds
 
 GROUP = "zbridge.protocols"
 
@@ -102,6 +104,24 @@ Send = Callable[[Any, float], object]
 """``send(session, now)``: puts encoded frames into the outbox of one client's session; raises Refused."""
 
 
+ATTEND_S = 0.1
+"""Seconds between two calls of :meth:`HqSide.attend`."""
+
+
+class RobotUser(typing.Protocol):
+    """A client that holds the robot, as :meth:`HqSide.attend` sees it."""
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the client's machine has owed an acknowledgement."""
+
+    def repeat(self) -> None:
+        """Send the robot again what the client has in motion, unless neutral is owed."""
+
+    def let_go(self, why: str) -> None:
+        """Give the robot back; the client must send neutral before it drives again."""
+
+
 class HqSide(ABC):
     """Shows a robot to the HQ programs (clients) of one listener, and translates what they send. Sans-IO.
 
@@ -113,18 +133,8 @@ class HqSide(ABC):
     """The protocol's name. Clients get the raw messages of a robot of the same protocol too."""
     deadman_s: ClassVar[float]
     """Seconds after which the motion of a silent client ends."""
-    modes: ClassVar[bool] = False
-    """Whether a client must announce by :class:`Mode` that it drives; motion before that is refused."""
-    steers: ClassVar[bool] = False
-    """Whether a turn with ``forward`` 0 only sets the wheels, and so is neutral."""
-    hold: bool = False
-    """Whether the last command of a client is repeated while its link lives."""
     datagrams: bool = False
     """Whether clients send datagrams too."""
-    numbers: range = range(1, 1_000_000)
-    """The ids of clients."""
-    quiet_s: float = 0.0
-    """Seconds before a released id is given again."""
     follows: tuple[str, ...]
     """Paths (``pose``, ``sensor/*``) whose messages :meth:`show` gets."""
 
@@ -167,6 +177,28 @@ class HqSide(ABC):
     def wanted(self) -> tuple[Topic, ...]:
         """List the topics that clients want now besides ``follows``."""
         return ()
+
+    def numbers(self, clients: int) -> ClientIds:
+        """Make the numbers that clients are given, at most ``clients`` at a time; 1 and up unless overridden."""
+        return ClientIds(range(1, clients + 1), quiet_s=0.0)
+
+    def initial_commands(self) -> tuple[Telemetry, ...]:
+        """List the commands that a client counts as having sent when it connects."""
+        return ()
+
+    def is_motion(self, command: Drive | Motor) -> bool:
+        """Return whether a command of this protocol's programs is motion, False for neutral.
+
+        What a side calls neutral although it sets something (wheels) is carried out only for who drives the robot.
+        """
+        return command.moving
+
+    def attend(self, client: RobotUser) -> None:
+        """Look after a client that holds the robot; called every :data:`ATTEND_S`.
+
+        Deployed programs repeat their motion, or the deadman ends it. For those that set it once, override this.
+        """
+        return
 
 
 class HqSimulation(msgspec.Struct, frozen=True):

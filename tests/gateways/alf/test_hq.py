@@ -21,7 +21,7 @@ from tests.captures import payloads, stream
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as fleet_payload
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner, Status
+from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner, Status
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.intent import Action, Intent
@@ -586,7 +586,22 @@ def test_a_listener_is_auto_unless_told_otherwise() -> None:
 
 def test_what_its_programs_are_is_said_to_the_core() -> None:
     side = Scene().side
-    assert (side.name, side.deadman_s, side.steers, side.hold, side.modes) == ("alf", 0.3, True, False, False)
+    assert (side.name, side.deadman_s, side.initial_commands()) == ("alf", 0.3, ())
+
+
+@pytest.mark.parametrize(
+    ("command", "motion"),
+    [
+        (Drive(turn=0.5), False),
+        (Drive(light=True), False),
+        (Drive(forward=0.1, turn=0.5), True),
+        (Drive(left=0.1), True),
+        (Motor(0.5), True),
+        (Motor(0.0), False),
+    ],
+)
+def test_a_turn_without_speed_sets_the_wheels_and_is_no_motion(command: Drive | Motor, motion: bool) -> None:
+    assert Scene().side.is_motion(command) is motion
 
 
 # Drive, laser or both
@@ -759,7 +774,7 @@ def test_the_recorded_hq_says_neutral_and_then_drives_right() -> None:
 
 def test_the_recorded_hq_acquires_with_its_first_motion_and_keeps_the_robot_to_its_end() -> None:
     scene, done = Scene(), []
-    intent = Intent(scene.side.deadman_s, modes=scene.side.modes)
+    intent = Intent(scene.side.deadman_s)
     for record in payloads("alf-drive.hex", destination=16668):
         now = record.seconds
         intent.heard(now)

@@ -112,8 +112,8 @@ class Scene:
 @contextlib.asynccontextmanager
 async def serving(**options: Any) -> AsyncIterator[Scene]:
     scene = Scene()
-    audience = RobotSubscription(scene.bus, KEYS, scene.metrics)
-    audience.open()
+    robot = RobotSubscription(scene.bus, KEYS, scene.metrics)
+    robot.open()
     plan = ListenerPlan(
         PROTOCOL,
         HqOptions(**{"client_port": scene.client_port, **options}),
@@ -121,9 +121,7 @@ async def serving(**options: Any) -> AsyncIterator[Scene]:
         HqSettings(protocol="tcpudp", listen="tcp://127.0.0.1:0"),
         (),
     )
-    scene.listener = Listener(
-        plan, "tcpudp", audience, scene.bus, KEYS, scene.manager, scene.metrics, lambda: scene.now
-    )
+    scene.listener = Listener(plan, "tcpudp", robot, scene.manager, scene.metrics, lambda: scene.now)
     task = asyncio.create_task(scene.listener.run())
     await asyncio.wait_for(scene.listener.ready.wait(), SOON_S)
     try:
@@ -231,8 +229,8 @@ class Program:
         """Say neutral, and that the stick is to drive."""
         await self.send(13)
         await self.send(10, struct.pack("<i", 2))
-        helm = self.scene.listener.clients[self.number].helm
-        await self.scene.until(lambda: helm.intent.mode == "manual")
+        operator = self.scene.listener.clients[self.number].operator
+        await self.scene.until(lambda: operator.intent.mode == "manual")
 
     async def drive(self, *, by_udp: bool) -> None:
         """Drive until the robot does."""

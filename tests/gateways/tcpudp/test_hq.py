@@ -11,8 +11,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp import hq as hq_module
-from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq
+from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq, display
+from gateways.tcpudp.hq import client as client_module
 from gateways.tcpudp.maps import resampled, squared
 from gateways.tcpudp.messages import Packet, encode_packet
 from tests.captures import payloads
@@ -1023,9 +1023,10 @@ class Counts:
             self.maps += 1
             return squared(grid, most)
 
-        monkeypatch.setattr(hq_module, "encode_packet", count_packet)
-        monkeypatch.setattr(hq_module, "resampled", count_resampled)
-        monkeypatch.setattr(hq_module, "squared", count_squared)
+        for module in (client_module, display):
+            monkeypatch.setattr(module, "encode_packet", count_packet)
+        monkeypatch.setattr(display, "resampled", count_resampled)
+        monkeypatch.setattr(display, "squared", count_squared)
 
 
 def crowd(listener: TcpUdpHq, of_each: int = 5) -> list[Timed]:
@@ -1220,12 +1221,21 @@ def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]])
     return done
 
 
+def intent_of(listener: TcpUdpHq) -> Intent:
+    """The intent of a client that has just connected."""
+    intent = Intent(listener.deadman_s)
+    for topic, command in listener.initial_commands():
+        assert (topic, command) == (topics.CMD_MODE, Mode("none"))
+        assert intent.choose("none", 0.0) is Action.NOTHING
+    return intent
+
+
 @pytest.mark.parametrize("name", [OLD, NEW])
 def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> None:
     listener, client = captured(name)
-    assert (listener.deadman_s, listener.modes) == (1.3, True)
-    intent = Intent(listener.deadman_s, modes=listener.modes)
-    owed = "connected: let go of the stick first"
+    assert listener.deadman_s == 1.3
+    intent = intent_of(listener)
+    owed = "connected: release the stick first"
     assert carry_out(intent, replay(listener, client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
     again = replay(listener, client, name, late=10.0)
     assert carry_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]
@@ -1237,7 +1247,7 @@ def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> 
 @pytest.mark.parametrize("name", [OLD, NEW])
 def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> None:
     listener, client = captured(name)
-    intent = Intent(listener.deadman_s, modes=listener.modes)
+    intent = intent_of(listener)
     intent.neutral(0.0)
     commands = [entry for entry in replay(listener, client, name) if not isinstance(entry[2], Mode)]
     moved, rotated, stopped = carry_out(intent, commands)
@@ -1248,7 +1258,9 @@ def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> Non
 
 def test_ids_are_those_of_clients() -> None:
     listener = side(quiet_s=7.0)
-    assert (listener.numbers[0], listener.numbers[-1], len(listener.numbers)) == (2, 255, 254)
-    assert listener.quiet_s == 7.0
-    assert side().quiet_s == 2.0
+    numbers = listener.numbers(10)
+    assert [numbers.take(0.0) for _ in range(255)] == [*range(2, 256), None]
+    numbers.release(9, 100.0)
+    assert [numbers.take(now) for now in (106.9, 107.0)] == [None, 9]
+    assert HqOptions().quiet_s == 2.0
     assert connected(listener, 255).frames("tcp")[0][6] == 255

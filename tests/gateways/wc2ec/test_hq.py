@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateways.wc2ec import hq as module
 from gateways.wc2ec.conformance.fragile_hq import Reader
-from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq
+from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq, Wheels, device_table, display
 from gateways.wc2ec.messages import Dialect as WireDialect
 from gateways.wc2ec.messages import Wc2EcMessage
 from gateways.wc2ec.settings import DeviceOption, Options
@@ -694,7 +693,7 @@ def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(left
 
 
 def test_the_wheels_of_the_kinematics_are_settings() -> None:
-    wheels = module.Wheels(wheel_radius_m=0.1, track_m=0.5, speed_full_m_s=2.0, turn_full_rad_s=4.0)
+    wheels = Wheels(wheel_radius_m=0.1, track_m=0.5, speed_full_m_s=2.0, turn_full_rad_s=4.0)
     scene = Scene("alf", wheels=wheels)
     *_, (_, command) = scene.says(set_value(0, 5.0) + set_value(1, 15.0))
     assert isinstance(command, Drive)
@@ -781,10 +780,35 @@ def test_what_waited_is_nothing_for_a_robot_that_has_motors_by_now() -> None:
     assert scene.side.deadline(scene.clients[0]) == INF
 
 
-def test_what_is_held_and_for_how_long_is_said_to_the_core() -> None:
-    side = Scene("tcpudp").side
-    assert (side.name, side.hold, side.steers, side.modes) == ("wc2ec", True, False, False)
-    assert Scene("tcpudp", hold=False).side.hold is False
+class User:
+    """A client that holds the robot: what its side made it do."""
+
+    def __init__(self, silent_s: float) -> None:
+        self.silent_s = silent_s
+        self.did: list[str] = []
+
+    def repeat(self) -> None:
+        self.did.append("repeat")
+
+    def let_go(self, why: str) -> None:
+        self.did.append(why)
+
+
+@pytest.mark.parametrize(
+    ("hold", "silent_s", "did"),
+    [
+        (True, 0.0, ["repeat"]),
+        (True, 0.4, ["repeat"]),
+        (True, 0.41, ["the connection is silent"]),
+        (False, 0.0, []),
+        (False, 0.41, []),
+    ],
+)
+def test_values_are_repeated_until_the_machine_falls_silent(hold: bool, silent_s: float, did: list[str]) -> None:
+    side, user = Scene("tcpudp", hold=hold).side, User(silent_s)
+    assert (side.name, side.deadman_s, side.initial_commands()) == ("wc2ec", 0.5, ())
+    side.attend(user)
+    assert user.did == did
 
 
 @pytest.mark.parametrize(
@@ -943,13 +967,14 @@ def test_the_draft_must_have_its_devices_listed_each_once() -> None:
 
 
 def test_a_message_is_encoded_once_however_many_clients_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    write, encoded = module.write, []
+    write, encoded = display.write, []
 
     def counting(message: Wc2EcMessage, dialect: WireDialect) -> bytes:
         encoded.append(message)
         return write(message, dialect)
 
-    monkeypatch.setattr(module, "write", counting)
+    for module in (device_table, display):
+        monkeypatch.setattr(module, "write", counting)
     scene = Scene(devices=CAR, clients=250)
     assert len(encoded) == len(CAR) + 1
     scene.tell(topics.DEVICES, Devices((*CAR, Device("rear", 9, "distance"))))
@@ -1087,8 +1112,8 @@ def test_a_robot_that_makes_up_new_names_is_shown_to_controllers_that_come_later
         expected = b"".join(bytes((0, 37, n, len(name))) + name.encode() for n, name in enumerate(names))
         assert scene.told(connection).startswith(expected)
         client.lost("gone")
-    assert len(scene.side._by_name) <= 255
-    assert len(scene.side._registrations) <= 255
+    assert len(scene.side._table.by_name) <= 255
+    assert len(scene.side._table.registrations) <= 255
 
 
 def test_a_controller_that_stays_is_never_given_a_number_for_something_else() -> None:

@@ -1,10 +1,9 @@
-"""How many connections of an address are let in, and what a log tells of them."""
+"""Which connections a listener accepts."""
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zbridge.hq.arrivals import OTHERS, Arrivals, Folding
+from zbridge.hq.admission import Arrivals
 
 
 def test_so_many_are_let_in_in_a_second_and_no_more() -> None:
@@ -47,28 +46,3 @@ def test_the_addresses_that_are_kept_are_bounded_and_a_busy_one_is_not_forgotten
         arrivals.admit(f"a{number}", 0.0)
         assert not arrivals.admit("busy", 0.5)
     assert repr(arrivals) == "<Arrivals of 10 addresses, 1 in 1 s each>"
-
-
-def test_the_first_of_a_kind_is_told_at_once_and_the_others_after_a_second() -> None:
-    folding = Folding()
-    told = [(number, kind) for number in range(400) for kind in ("came", "went") if folding.first("a", kind, 5.0)]
-    assert told == [(0, "came"), (0, "went")]
-    assert folding.due(5.9) == []
-    assert folding.due(6.0) == ["a: 399 more came, 399 more went"]
-    assert folding.due(7.0) == []
-    assert folding.first("a", "came", 7.0)
-
-
-def test_what_came_once_is_not_told_again() -> None:
-    folding = Folding()
-    assert folding.first("a", "came", 0.0)
-    assert folding.due(10.0) == []
-    assert repr(folding) == "<Folding of 0 addresses>"
-
-
-@pytest.mark.parametrize("addresses", [1, 64])
-def test_many_addresses_share_a_line(addresses: int) -> None:
-    folding = Folding(addresses)
-    told = sum(folding.first(f"a{number}", "came", 0.0) for number in range(1000))
-    assert told == addresses + 1
-    assert folding.due(1.0) == [f"{OTHERS}: {1000 - addresses - 1} more came"]

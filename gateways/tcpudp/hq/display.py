@@ -1,0 +1,181 @@
+"""What HQ programs of TCP/UDP are shown of any robot: fleet messages as packets, each encoded once. Sans-IO.
+
+Source: "The gateway as robot" and "Translation" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from gateways.tcpudp.hq.client import HqClient, each_once, newest_of
+from gateways.tcpudp.hq.options import HqOptions
+from gateways.tcpudp.maps import (
+    TCP_BYTES,
+    UDP_BYTES,
+    Frame,
+    Geometry,
+    announceable,
+    check,
+    most_side,
+    resampled,
+    squared,
+)
+from gateways.tcpudp.messages import (
+    PACKETS,
+    ChatMessage,
+    DebugMessage,
+    OpaquePacket,
+    ServerCamMode,
+    ServerGetSimulatedLidarData,
+    ServerLidarStatus,
+    ServerPosition,
+    ServerSLAMMap,
+    encode_packet,
+)
+from gateways.tcpudp.session import RobotSession
+from gateways.tcpudp.settings import Feature
+from gateways.tcpudp.translate import NAME, OFF, ON
+from zbridge.fleet import topics
+from zbridge.fleet.messages import FleetMessage, Map, Pose, Raw, Switch, Text
+from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
+from zbridge.protocol import Datagram, EncodeError, Send
+
+TEXT_CHARACTERS = 1000
+MOST_SIDE = most_side(UDP_BYTES)
+NO_MAP = Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
+_NEARLY = 1 + 1e-9
+_SIZES = ("1.3", "1.4")
+"""Versions whose clients are announced the size of the map."""
+
+
+class Display:
+    """Shows one robot to the clients of one listener."""
+
+    def __init__(self, options: HqOptions, view: RobotView) -> None:
+        self._options = options
+        self._view = view
+        self._unit_m = options.length_unit_m
+        self._most_side = MOST_SIDE if options.udp else most_side(TCP_BYTES)
+        self._last: dict[str, tuple[FleetMessage, Send | None]] = {}
+        """What was shown last of each path: clients that connect or ask later get the same bytes."""
+
+    def __repr__(self) -> str:
+        return f"<Display of {sorted(self._last)}>"
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        """Encode a message for all clients; None if there is no packet for it. Raises EncodeError."""
+        translate = _SHOWN.get(topic.path)
+        if translate is None:
+            return None
+        last, send = self._last.get(topic.path, (None, None))
+        if last is not message:
+            send = translate(self, message)
+            self._last[topic.path] = message, send
+        return send
+
+    def geometry(self) -> Geometry:
+        """Choose the geometry that a new client is announced: of the robot's map, else of the options."""
+        if self._view.map is not None and self._view.map.cells.size:
+            with contextlib.suppress(EncodeError):
+                return announceable(self._view.map, self._unit_m, self._most_side, self._frame)
+        size, interval = self._options.slam_map_size, self._options.slam_map_interval
+        return Geometry(min(size, self._most_side * interval), interval)
+
+    def _pose(self, message: Pose) -> Send:
+        if not math.isfinite(message.x + message.y + message.heading):
+            raise EncodeError(f"position {message.x:g}, {message.y:g}, {message.heading:g}")
+        heading_deg = math.degrees(message.heading - self._options.heading_offset)
+        return newest_of("pose", ServerPosition(message.x / self._unit_m, message.y / self._unit_m, heading_deg))
+
+    def _map(self, message: Map) -> Send:
+        """Show a map to each client in the size that it was announced, or that fits its transport."""
+        frames: dict[tuple[Geometry | None, int], tuple[bytes, Datagram]] = {}
+        larger: set[tuple[Geometry | None, int]] = set()
+
+        def send(session: HqClient, now: float) -> None:
+            most = most_side(UDP_BYTES if session.by_udp else TCP_BYTES)
+            announced = session.version in _SIZES and session.geometry.side <= most
+            key = (session.geometry if announced else None, most)
+            if key not in frames:
+                cells, to_scale = self._cells(message, *key)
+                frame = encode_packet(ServerSLAMMap(cells), session.sender_id)
+                frames[key] = (frame, Datagram(frame))
+                larger.update(() if to_scale else (key,))
+            if key in larger:
+                session.left_out["map to scale"] += 1
+            session.show("map", ServerSLAMMap.spec.id, frames[key][session.by_udp], now)
+
+        return send
+
+    def _cells(self, grid: Map, geometry: Geometry | None, most: int) -> tuple[bytes, bool]:
+        """Return the cells of the whole map, and whether they have the announced size.
+
+        geometry: what was announced; None: the map's own. most: cells along a side at most.
+        """
+        if not grid.cells.size:
+            return b"", True
+        check(grid)
+        frame = self._frame
+        size_m = frame.size_m(grid)
+        if geometry is None:
+            if frame.own and frame.origin is None:
+                return squared(grid, most), True
+            side = max(1, min(most, math.ceil(round(size_m / grid.cell, 6))))
+            cell_m = max(grid.cell, size_m / side)
+            return resampled(grid, side, cell_m, frame.begin(grid, side * cell_m)), True
+        side, cell_m = geometry.side, geometry.interval * self._unit_m
+        to_scale = size_m <= side * cell_m * _NEARLY
+        cell_m = cell_m if to_scale else size_m / side
+        return resampled(grid, side, cell_m, frame.begin(grid, side * cell_m)), to_scale
+
+    @property
+    def _frame(self) -> Frame:
+        return Frame(own=self._view.protocol in (NAME, None), origin=self._options.map_origin)
+
+    def _lidar(self, message: Switch) -> Send:
+        return newest_of("lidar", ServerLidarStatus(ON if message.on else OFF))
+
+    def _camera(self, message: Switch) -> Send:
+        return newest_of("camera", ServerCamMode(ON if message.on else OFF))
+
+    def _text(self, message: Text) -> Send | None:
+        if message.kind == "request":
+            return _request
+        return each_once(DebugMessage(ascii_text(message.text))) if message.text else None
+
+    def _raw(self, message: Raw) -> Send | None:
+        """Pass on what the robot said in packets that no fleet message holds."""
+        spec = PACKETS.get(message.id)
+        if spec is not None and spec.packet is ChatMessage:
+            return each_once(ChatMessage(message.body))
+        return each_once(OpaquePacket(message.id, message.body)) if spec is None else None
+
+
+def ascii_text(text: str) -> str:
+    """Return a text as the protocol's strings hold it, cut to the length of one packet."""
+    return text.encode("ascii", "backslashreplace").decode()[:TEXT_CHARACTERS]
+
+
+def _request(session: HqClient, now: float) -> None:
+    """Ask a client that announced simulated lidar data for it."""
+    if Feature.LIDAR_SIM in (session.client.features if session.client is not None else ()):
+        session.show("request", ServerGetSimulatedLidarData.spec.id, _REQUEST, now)
+    else:
+        session.leave_out(ServerGetSimulatedLidarData.spec.id)
+
+
+_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotSession.sender_id)
+_SHOWN: dict[str, Callable[[Display, Any], Send | None]] = {
+    topics.POSE.path: Display._pose,
+    topics.MAP.path: Display._map,
+    topics.LIDAR.path: Display._lidar,
+    topics.CAMERA.path: Display._camera,
+    topics.TEXT.path: Display._text,
+    topics.RAW(NAME).path: Display._raw,
+}

@@ -1,0 +1,38 @@
+"""What a listener for HQ programs of TCP/UDP can be told in a configuration."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+from gateways.tcpudp.session import CLIENT_PORT
+from gateways.tcpudp.translate import Angle, Length, PacketId, Scale
+
+VersionName = Literal["1.1", "1.2", "1.3", "1.4"]
+
+
+class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
+
+    versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = ("1.1", "1.2", "1.3")
+    udp: bool = True
+    client_port: Annotated[int, msgspec.Meta(ge=0, le=65535)] = CLIENT_PORT
+    gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.01
+    quiet_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 2.0
+    known: tuple[PacketId, ...] = ()
+    unasked: bool = False
+    skip_map_flag: bool = False
+    slam_map_size: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 1000
+    slam_map_interval: Annotated[int, msgspec.Meta(ge=1, le=2**31 - 1)] = 10
+    speed_full: Scale = 1.0
+    turn_full: Scale = 1.0
+    length_unit_m: Scale = 0.01
+    heading_offset: Angle = math.pi / 2
+    map_origin: tuple[Length, Length] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a map without cells."""
+        if self.slam_map_size < self.slam_map_interval:
+            raise ValueError("slam_map_size is smaller than slam_map_interval: a map of no cells")

@@ -1,0 +1,145 @@
+"""What controllers are shown of any robot: device registrations and sensor values, each encoded once. Sans-IO.
+
+Source: "The gateway as Webots controller" of the protocol page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from gateways.wc2ec.devices import DISTANCE
+from gateways.wc2ec.hq.client import HqClient
+from gateways.wc2ec.hq.device_table import DeviceTable, ShownDevice
+from gateways.wc2ec.hq.sectors import SectorSensors
+from gateways.wc2ec.messages import Dialect, SensorData, write
+from gateways.wc2ec.translate import NAME
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Devices, FleetMessage, Reading, Scan, Scanner, Status
+from zbridge.fleet.topics import Topic
+from zbridge.fleet.view import RobotView
+from zbridge.protocol import Send
+
+FAULT = -1.0
+"""What a distance sensor shows when nothing is known: deployed controllers take it as a fault, while anything from
+0 to 1000 would be a false distance ("The gateway as Webots controller")."""
+
+
+class Display:
+    """Shows one robot to the controllers of one listener."""
+
+    def __init__(self, dialect: Dialect, view: RobotView, table: DeviceTable, sectors: SectorSensors) -> None:
+        self._dialect = dialect
+        self._draft = dialect is Dialect.DRAFT
+        self._view = view
+        self._table = table
+        self._sectors = sectors
+        self._frames: dict[int, tuple[float, bytes]] = {}
+        """The value that was encoded last of each device."""
+        self._readings_gone: dict[str, Reading] = {}
+        self._scan_gone: Scan | None = None
+        """The last readings and scan of a robot that was lost since: they say nothing about it now."""
+
+    def __repr__(self) -> str:
+        return f"<Display of {self._table!r}>"
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        """Encode a message for all controllers; None if there is nothing to show."""
+        if isinstance(message, Reading):
+            return self._reading(topics.unescape(topic.path.rpartition("/")[2]), message)
+        if isinstance(message, Scan):
+            return self._scan(message)
+        if isinstance(message, Devices | Scanner | Status):
+            before = len(self._table.by_name)
+            self._table.learn()
+            return self.register if len(self._table.by_name) > before else None
+        return None
+
+    def presence(self, there: bool) -> Send | None:
+        """Show what is known of a robot that is there; faults for one that is lost."""
+        devices = self._table.by_name.values()
+        if there:
+            return self._data((device, self._known(device)) for device in devices)
+        self._readings_gone, self._scan_gone = dict(self._view.readings), self._view.scan
+        return self._data((device, FAULT) for device in devices if device.kind == DISTANCE)
+
+    def register(self, session: HqClient, now: float) -> None:
+        """Register the devices that the controller does not know yet; a value of each sensor follows at once."""
+        table = self._table
+        new = [device for device in table.by_number.values() if device.number not in session.registered]
+        if new and not self._draft:
+            session.outbox.put_exempt(b"".join(table.registrations[device.number] for device in new))
+        session.registered.update(device.number for device in new)
+        for device in new:
+            value = self._first(device)
+            if value is not None:
+                self._queue(session, device, self._frame(device, value), now)
+
+    def _first(self, device: ShownDevice) -> float | None:
+        """Return the first value a controller gets of a sensor, which is ready only then; None for a motor."""
+        if device.motor:
+            return None
+        known = self._known(device) if self._view.missing is None else None
+        return known if known is not None else FAULT if device.kind == DISTANCE else 0.0
+
+    def _known(self, device: ShownDevice) -> float | None:
+        """Return the last value of a device since the robot is there; None if there is none."""
+        reading, scan = self._view.readings.get(device.name), self._view.scan
+        if reading is not None and reading is not self._readings_gone.get(device.name):
+            return _shown(device, reading.value, fault=reading.fault)
+        if scan is None or scan is self._scan_gone or self._view.protocol in (None, NAME):
+            return None
+        nearest = self._sectors.values(scan).get(device.name)
+        return None if nearest is None else _shown(device, nearest)
+
+    def _reading(self, name: str, message: Reading) -> Send | None:
+        table = self._table
+        if name not in table.by_name:
+            table.learn()
+        device = table.by_name.get(name)
+        if device is None or self._view.missing is not None:
+            return None
+        return self._data(((device, _shown(device, message.value, fault=message.fault)),))
+
+    def _scan(self, scan: Scan) -> Send | None:
+        """Show a scan of a robot of another protocol as distance sensors, one for each sector."""
+        if self._view.protocol in (None, NAME) or not len(scan.ranges):
+            return None
+        self._table.learn()
+        if self._view.missing is not None:
+            return None
+        shown = [(self._table.by_name.get(name), value) for name, value in self._sectors.values(scan).items()]
+        return self._data((device, _shown(device, value)) for device, value in shown if device is not None)
+
+    def _data(self, values: Iterable[tuple[ShownDevice, float | None]]) -> Send | None:
+        """Encode values once for all controllers; None if there is none."""
+        frames = [(device, self._frame(device, value)) for device, value in values if value is not None]
+        if not frames:
+            return None
+
+        def send(session: HqClient, now: float) -> None:
+            for device, frame in frames:
+                self._queue(session, device, frame, now)
+
+        return send
+
+    def _frame(self, device: ShownDevice, value: float) -> bytes:
+        last = self._frames.get(device.number)
+        if last is None or last[0] != value:
+            last = (value, write(SensorData(device.type, device.number, value), self._dialect))
+            self._frames[device.number] = last
+        return last[1]
+
+    def _queue(self, session: HqClient, device: ShownDevice, frame: bytes, now: float) -> None:
+        """Queue a value as the newest of its device, if the controller wants it."""
+        if device.number not in session.registered:
+            self.register(session, now)
+        if not self._draft or device.number in session.enabled:
+            session.outbox.set(f"sensor {device.number}", (frame,), now)
+
+
+def _shown(device: ShownDevice, value: float, *, fault: bool = False) -> float | None:
+    """Return the value that a controller is shown: FAULT for a distance that is none, None for other non-numbers."""
+    if device.kind == DISTANCE:
+        return FAULT if fault or not math.isfinite(value) else value
+    return value if math.isfinite(value) else None

@@ -1,0 +1,307 @@
+"""One listener with a toy protocol on a fake bus, its links played by hand, on a clock that jumps.
+
+A frame is a length byte and so many bytes. A client says ``hi`` first; ``go`` and ``stand`` drive, ``map?`` asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import numpy as np
+
+from tests.hq.test_operator import Gateway
+from zbridge.address import Address
+from zbridge.bus.fake import FakeBus
+from zbridge.errors import EncodeError, ProtocolError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import (
+    Drive,
+    FleetMessage,
+    Map,
+    Pose,
+    Query,
+    Scan,
+    Status,
+    Stop,
+    Switch,
+    Text,
+)
+from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.view import RobotView
+from zbridge.hq.listener import Listener
+from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.hq.settings import HqSettings, ListenerPlan
+from zbridge.metrics import Metrics
+from zbridge.protocol.plugin import ATTEND_S, HqSide, Protocol, RobotUser, Send, Telemetry
+from zbridge.protocol.session import Limits, Role, Session, State
+from zbridge.protocol.session_table import ClientIds, SessionTable
+from zbridge.transport.fake import FakeLink
+from zbridge.transport.link import Receiver
+
+KEYS = KeySpace("fleet", "r1")
+STATUS = Status(state="established", protocol="toy")
+MAP = Map(rows=2, columns=3, cell=0.1, origin=(0.0, 0.0), cells=np.zeros((2, 3), np.uint8))
+
+
+def framed(body: bytes) -> bytes:
+    return bytes([len(body)]) + body
+
+
+def frame_end(data: bytes, start: int) -> int:
+    if data[start] == 255:
+        raise ProtocolError("length 255")
+    return start + 1 + data[start]
+
+
+class ToySession(Session[bytes]):
+    role = Role.ROBOT
+    frame_end = staticmethod(frame_end)
+    scans = False
+    said_at = half_at = 0.0
+
+    def encode(self, message: bytes) -> bytes:
+        return framed(message)
+
+    def decode(self, frame: bytes) -> bytes:
+        if frame[1:] == b"?":
+            raise ProtocolError("what is ?")
+        return frame[1:]
+
+    def opened(self, now: float) -> None:
+        self.send_first(b"who are you")
+
+    def accept(self, message: bytes, now: float) -> bool:
+        self.said_at = now
+        if self.state is State.ESTABLISHED:
+            return True
+        if message != b"hi":
+            raise ProtocolError("hi was expected")
+        self.establish("2.0", ("wings",))
+        return False
+
+
+class ToySide(HqSide):
+    name = "toy"
+    deadman_s = 1.25
+    follows = ("pose", "text", "lidar")
+    quiet_s = 0.0
+    hold = False
+
+    def __init__(self, options: Any, view: RobotView, metrics: Metrics) -> None:
+        self.view = view
+        self.encoded = 0
+        self.made: list[ToySession] = []
+
+    def numbers(self, clients: int) -> ClientIds:
+        return ClientIds(range(2, 256), self.quiet_s)
+
+    def attend(self, client: RobotUser) -> None:
+        if self.hold:
+            if client.silent_s > self.deadman_s - ATTEND_S:
+                client.let_go("the connection is silent")
+            else:
+                client.repeat()
+
+    def session(self, number: int, bounds: Limits) -> ToySession:
+        self.made = [session for session in self.made if not session.over]
+        self.made.append(session := ToySession(bounds))
+        return session
+
+    def begin(self, session: ToySession, now: float) -> None:
+        session.send(b"welcome")
+
+    def show(self, topic: Topic, message: FleetMessage) -> Send | None:
+        if isinstance(message, Switch):
+            raise EncodeError("no switch can be shown")
+        if not isinstance(message, Pose | Text | Scan):
+            return None
+        self.encoded += 1
+        if isinstance(message, Text):
+            text = framed(message.text.encode())
+            return lambda session, now: session.outbox.put(text)
+        frame = framed(b"scan" if isinstance(message, Scan) else b"at %g" % message.x)
+
+        def send(session: ToySession, now: float) -> None:
+            if isinstance(message, Pose) or session.scans:
+                session.outbox.set(topic.path, (frame,), now)
+
+        return send
+
+    def take(self, session: ToySession, message: bytes) -> tuple[Telemetry, ...]:
+        if message in (b"scans on", b"scans off"):
+            session.scans = message == b"scans on"
+            return ()
+        taken = COMMANDS.get(message)
+        if taken is None:
+            raise ProtocolError(f"what is {message!r}")
+        return (taken,)
+
+    def answer(self, session: ToySession, topic: Topic, message: FleetMessage | None, now: float) -> None:
+        session.send(b"%s: %s" % (topic.path.encode(), type(message).__name__.encode()))
+
+    def tell(self, session: ToySession, text: str, now: float) -> None:
+        session.send(b"! " + text.encode())
+
+    def wanted(self) -> tuple[Topic, ...]:
+        return (topics.SCAN,) if any(session.scans for session in self.made if not session.over) else ()
+
+
+COMMANDS: dict[bytes, Telemetry] = {
+    b"go": (topics.CMD_DRIVE, Drive(forward=0.5)),
+    b"stand": (topics.CMD_DRIVE, Drive()),
+    b"stop": (topics.CMD_STOP, Stop()),
+    b"map?": (topics.RPC_MAP, Query()),
+    b"pose?": (topics.RPC_POSE, Query()),
+}
+
+
+class HandLink(FakeLink):
+    """A link that ends as a real one does: its receiver is told soon after it was closed."""
+
+    receiver: Receiver
+
+    def close(self) -> None:
+        if not self.closed:
+            super().close()
+            asyncio.get_running_loop().call_soon(self.receiver.lost, "closed by us")
+
+    def abort(self) -> None:
+        self.close()
+
+
+class Program:
+    """An HQ program at the other end of a link."""
+
+    def __init__(self, receiver: Receiver, peer: str) -> None:
+        self.receiver = receiver
+        self.link = HandLink(peer)
+        self.link.receiver = receiver
+        receiver.attached(self.link)
+
+    def say(self, *messages: bytes) -> None:
+        self.receiver.received(b"".join(map(framed, messages)))
+
+    def greeted(self) -> Program:
+        """Shake hands, and forget what was heard."""
+        self.say(b"hi")
+        self.heard()
+        return self
+
+    def heard(self) -> list[bytes]:
+        """What was heard since the last call."""
+        written, self.link.written = self.link.written, []
+        return [frame[1:] for frame in written]
+
+    def leave(self) -> None:
+        if not self.link.closed:
+            self.link.closed = True
+            self.receiver.lost("closed by peer")
+
+    def take_nothing(self) -> None:
+        self.link.ready = False
+
+    def take_all(self) -> None:
+        self.link.ready = True
+        self.receiver.writable()
+
+
+class Scene:
+    """A listener that runs, and the robot's gateway beside it."""
+
+    side_class = ToySide
+
+    def __init__(self, *, allow: tuple[str, ...] = (), robot: bool = True, **settings: Any) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.skipped_s = 0.0
+        self.bus = FakeBus("hq")
+        self.gateway = Gateway(self.bus.join("gw"), self)  # type: ignore[arg-type]
+        self.status = self.gateway.bus.publisher(KEYS.key("status"), topics.STATUS)
+        self.token = None
+        if robot:
+            self.come()
+        self.metrics = Metrics()
+        self.manager = SessionTable()
+        self.robot = RobotSubscription(self.bus, KEYS, self.metrics)
+        self.robot.open()
+        protocol = Protocol(
+            name="toy",
+            summary="",
+            options=HqSettings,
+            links=1,
+            robot=None,  # type: ignore[arg-type]
+            simulate=None,  # type: ignore[arg-type]
+            hq=self._side,
+        )
+        plan = ListenerPlan(
+            protocol,
+            None,
+            Address("127.0.0.1", 0),
+            HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings),
+            tuple(map(ipaddress.ip_network, allow)),
+        )
+        self.accept: Callable[[], Receiver]
+        self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now)
+        self.hosts = 0
+
+    def _side(self, options: Any, view: RobotView, metrics: Metrics) -> ToySide:
+        self.side = self.side_class(options, view, metrics)
+        return self.side
+
+    @property
+    def now(self) -> float:
+        return self.loop.time() + self.skipped_s
+
+    def come(self) -> None:
+        """Let the robot be there."""
+        self.status.put(payloads.encode(STATUS))
+        self.token = self.gateway.bus.announce(KEYS.alive("gateway"))
+
+    def go(self) -> None:
+        """Let the robot's gateway be gone."""
+        assert self.token is not None
+        self.token.close()
+
+    def say(self, topic: Topic, message: FleetMessage) -> None:
+        self.gateway.bus.publisher(KEYS.key(topic.path), topic).put(payloads.encode(message))
+
+    def report(self) -> None:
+        self.gateway.control.put(payloads.encode(self.gateway.report()))
+
+    def connect(self, host: str = "10.0.0.1") -> Program:
+        self.hosts += 1
+        return Program(self.accept(), f"tcp://{host}:{5000 + self.hosts}")
+
+    def count(self, name: str) -> int:
+        return self.metrics.total(name)
+
+    def reason(self, name: str) -> str | None:
+        """Why a session ended, or nothing while it lives."""
+        return next(shown.reason for shown in self.manager.snapshots() if shown.name == name)
+
+
+SCENES: list[list[Scene]] = []
+
+
+@contextlib.asynccontextmanager
+async def serving(**settings: Any) -> AsyncIterator[Scene]:
+    scene = Scene(**settings)
+    SCENES[-1].append(scene)
+    task = scene.loop.create_task(scene.listener.run())
+    await asyncio.wait_for(scene.listener.ready.wait(), 1.0)
+    try:
+        yield scene
+        assert not task.done(), task
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def soon() -> None:
+    """Let what was begun be done."""
+    await asyncio.sleep(0.001)

@@ -1,0 +1,58 @@
+"""What the parts of one listener share, as one frozen value. Knows no protocol and no client."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+
+from zbridge.hq.bridge import Bridge
+from zbridge.hq.freeze import FreezeWatch
+from zbridge.hq.listener_log import ConnectionLog, FailureLog
+from zbridge.hq.robot_subscription import RobotSubscription
+from zbridge.hq.settings import HqSettings
+from zbridge.hq.tasks import Tasks
+from zbridge.metrics import Count, Metrics
+from zbridge.protocol.plugin import HqSide
+
+
+class ListenerCounts(msgspec.Struct, frozen=True):
+    """The counters of one listener (metrics ``hq_<field>``, labelled with its name)."""
+
+    accepted: Count
+    turned_away: Count
+    dropped: Count
+    left_out: Count
+    commands: Count
+    refused: Count
+    malformed: Count
+    foreign_datagrams: Count
+    rival_sources: Count
+    refusals_untold: Count
+
+
+class ListenerContext(msgspec.Struct, frozen=True):
+    """One listener: its name on the bus, its protocol's side, the robot it shows, and what its parts report to.
+
+    clock: seconds on the event loop's time line.
+    """
+
+    name: str
+    settings: HqSettings
+    side: HqSide
+    robot: RobotSubscription
+    bridge: Bridge
+    tasks: Tasks
+    counts: ListenerCounts
+    connections: ConnectionLog
+    failures: FailureLog
+    freeze: FreezeWatch
+    clock: Callable[[], float]
+
+
+def listener_counts(metrics: Metrics, name: str) -> ListenerCounts:
+    """Return the counters of the listener of this name; made on first use."""
+    return ListenerCounts(**{field: metrics.count(f"hq_{field}", listener=name) for field in _COUNTS})
+
+
+_COUNTS = ListenerCounts.__struct_fields__

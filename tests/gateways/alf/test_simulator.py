@@ -8,10 +8,11 @@ import pytest
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
 from gateways.alf.session import HqRole, VehicleRole
-from gateways.alf.simulator import SCANNER, STEP_S, Car
+from gateways.alf.simulator import SCANNER, Car
 from zbridge.address import Address
 from zbridge.errors import ConfigError
 from zbridge.protocol.plugin import Simulation
+from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import BOXES, HALF_SIDE_M
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY

@@ -14,7 +14,7 @@ from tests.tables import documented, executed
 from zbridge.bus import Answer
 from zbridge.control.authority import Authority
 from zbridge.control.lease_client import ASK_S, LEASE_S, RETRY_S, LeaseClient, Question
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.proof import read
 from zbridge.errors import BusError, Code, Held, LeaseLost, NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads

@@ -14,8 +14,8 @@ from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.control.authority import Authority
 from zbridge.control.lease_client import LeaseClient
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
 from zbridge.control.proof import read
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads

@@ -161,7 +161,7 @@ class Scene:
                 done.result()
             await asyncio.sleep(0)
 
-    def helm(
+    def operator(
         self,
         who: str = "hq.toy.1",
         *,
@@ -184,21 +184,21 @@ class Scene:
             operator.command(topics.CMD_MODE, Mode("none"))
         return operator
 
-    def look(self, *helms: Operator) -> None:
+    def look(self, *operators: Operator) -> None:
         """Let the gateway say how things stand."""
         report = self.gateway.report()
         self.view.note(topics.CONTROL, report)
-        for helm in helms:
-            helm.look(report)
+        for operator in operators:
+            operator.look(report)
 
     async def driving(self, **kind: Any) -> Operator:
-        """Make a helm whose program drives."""
-        helm = self.helm(**kind)
-        helm.command(topics.CMD_DRIVE, STAND)
-        helm.command(topics.CMD_DRIVE, GO)
+        """Make an operator whose program drives."""
+        operator = self.operator(**kind)
+        operator.command(topics.CMD_DRIVE, STAND)
+        operator.command(topics.CMD_DRIVE, GO)
         await self.settle()
         assert self.gateway.taken() == [("drive", GO)]
-        return helm
+        return operator
 
 
 # Taking the robot
@@ -206,44 +206,44 @@ class Scene:
 
 async def test_motion_acquires_the_robot_and_is_then_carried_out() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.taken() == []
     await scene.settle()
     assert scene.gateway.requests == [Acquire(who="hq.toy.1", deadman_s=DEADMAN_S, alive="hq.toy.1")]
     assert scene.gateway.taken() == [("drive", GO)]
     assert await scene.bus.alive(KEYS.alive("*")) == [KEYS.alive("hq.toy.1")]
-    assert helm.active
+    assert operator.active
 
 
 async def test_nothing_moves_and_nothing_is_asked_before_neutral() -> None:
     scene = Scene()
-    helm = scene.helm()
+    operator = scene.operator()
     for _ in range(3):
         with pytest.raises(Refused, match="connected: release the stick first"):
-            helm.command(topics.CMD_DRIVE, GO)
+            operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert (scene.gateway.asked, scene.bus.values("fleet/r1/@cmd/**")) == ([], [])
     assert await scene.bus.alive(KEYS.alive("*")) == []
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_neutral_of_a_program_that_holds_nothing_is_sent_nowhere() -> None:
     scene = Scene()
-    helm = scene.helm()
+    operator = scene.operator()
     for _ in range(3):
-        helm.command(topics.CMD_DRIVE, STAND)
+        operator.command(topics.CMD_DRIVE, STAND)
     await scene.settle()
     assert (scene.gateway.asked, scene.bus.values("fleet/r1/@cmd/**")) == ([], [])
 
 
 async def test_of_what_is_said_while_the_answer_is_awaited_the_newest_counts() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
     for step in range(1, 10):
-        helm.command(topics.CMD_DRIVE, Drive(forward=step / 10))
+        operator.command(topics.CMD_DRIVE, Drive(forward=step / 10))
     await scene.settle()
     assert scene.gateway.asked == ["acquire"]
     assert scene.gateway.taken() == [("drive", Drive(forward=0.9))]
@@ -251,53 +251,53 @@ async def test_of_what_is_said_while_the_answer_is_awaited_the_newest_counts() -
 
 async def test_a_program_that_let_go_while_the_answer_was_awaited_does_not_move() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
     await scene.settle()
     assert scene.gateway.taken() == [("drive", STAND)]
-    assert helm.intent.held
+    assert operator.intent.held
 
 
 async def test_an_answer_that_comes_after_the_deadman_moves_nothing() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     scene.now += DEADMAN_S
     await scene.settle()
     assert scene.gateway.taken() == []
-    assert helm.intent.held
+    assert operator.intent.held
     with pytest.raises(Refused, match="deadman"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
 
 
 async def test_a_robot_that_somebody_else_drives_is_refused_and_neutral_must_come() -> None:
     scene = Scene()
     scene.gateway.authority.acquire(Acquire(who="operator"), scene.now)
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: held by operator (priority 0)"]
     assert scene.gateway.taken() == []
-    assert not helm.active
+    assert not operator.active
     with pytest.raises(Refused, match=r"held by operator \(priority 0\): release the stick first"):
-        helm.command(topics.CMD_DRIVE, GO)
-    scene.look(helm)
+        operator.command(topics.CMD_DRIVE, GO)
+    scene.look(operator)
     assert len(scene.told) == 1, "the refusal of the question itself is not told again"
 
 
 async def test_without_a_gateway_the_answer_is_no() -> None:
     scene = Scene()
     scene.gateway.vanish()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: no gateway answers"]
-    assert not helm.active
+    assert not operator.active
 
 
 @pytest.mark.parametrize(
@@ -313,13 +313,13 @@ async def test_an_answer_that_is_none_is_a_no(reply: Any, reason: str) -> None:
     scene = Scene()
     scene.gateway.vanish()
     scene.gateway.bus.answer(KEYS.key("@rpc/control/acquire/hq.toy"), reply)
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     (told,) = scene.told
     assert told.startswith(f"not driving: {reason}")
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_a_bus_that_cannot_be_asked_is_a_no(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -329,9 +329,9 @@ async def test_a_bus_that_cannot_be_asked_is_a_no(monkeypatch: pytest.MonkeyPatc
         raise BusError("the bus is closed")
 
     monkeypatch.setattr(scene.bus, "ask", fails)
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: the bus is closed"]
 
@@ -348,21 +348,21 @@ async def test_a_robot_that_is_not_there_is_not_asked_for(status: Status, alive:
     scene = Scene()
     scene.view.note(topics.STATUS, status)
     scene.view.alive = alive
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
     with pytest.raises(Refused, match=f"^{reason}$"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
     scene.view.note(topics.STATUS, Status(state="established", protocol="toy"))
     scene.view.alive = True
     with pytest.raises(Refused, match=f"{reason}: release the stick first"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.asked == []
 
 
 async def test_two_programs_share_a_robot_one_after_the_other() -> None:
     scene = Scene()
     first = await scene.driving()
-    second = scene.helm("hq.toy.2")
+    second = scene.operator("hq.toy.2")
     second.command(topics.CMD_DRIVE, STAND)
     second.command(topics.CMD_DRIVE, GO)
     await scene.settle()
@@ -381,20 +381,20 @@ async def test_two_programs_share_a_robot_one_after_the_other() -> None:
 
 async def test_commands_that_are_open_to_all_need_no_lease_and_no_neutral() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_STOP, Stop())
-    helm.command(topics.CMD_LIDAR, Switch(on=True))
-    helm.command(topics.CMD_SENSOR("front"), SensorSetting(enable=True))
+    operator = scene.operator()
+    operator.command(topics.CMD_STOP, Stop())
+    operator.command(topics.CMD_LIDAR, Switch(on=True))
+    operator.command(topics.CMD_SENSOR("front"), SensorSetting(enable=True))
     assert [path for path, _ in scene.gateway.taken()] == ["stop", "lidar", "sensor/front"]
     assert scene.gateway.asked == []
 
 
 async def test_numbers_rise_with_every_command_of_a_lease() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     for step in range(50):
-        helm.command(topics.CMD_DRIVE, Drive(forward=0.01 * step))
-        helm.command(RAW, Raw(id=40))
+        operator.command(topics.CMD_DRIVE, Drive(forward=0.01 * step))
+        operator.command(RAW, Raw(id=40))
         await scene.settle()
     assert scene.gateway.refused == []
     assert len(scene.gateway.taken()) == 100
@@ -403,11 +403,11 @@ async def test_numbers_rise_with_every_command_of_a_lease() -> None:
 async def test_a_drive_does_not_overtake_what_a_thread_carries() -> None:
     """Everything but a drive blocks, and goes by way of a thread: it is numbered when its turn comes."""
     scene = Scene()
-    helm = await scene.driving()
-    helm.command(RAW, Raw(id=40))
-    helm.command(RAW, Raw(id=41))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.1))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.2))
+    operator = await scene.driving()
+    operator.command(RAW, Raw(id=40))
+    operator.command(RAW, Raw(id=41))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.1))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.2))
     assert [path for path, _ in scene.gateway.taken()] == ["raw/toy"]
     await scene.settle()
     assert scene.gateway.taken() == [("raw/toy", Raw(id=41)), ("drive", Drive(forward=0.2))]
@@ -416,37 +416,37 @@ async def test_a_drive_does_not_overtake_what_a_thread_carries() -> None:
 
 async def test_what_waits_for_the_bus_is_bounded_and_motion_finds_a_place() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     for number in range(WAITING + 1):
-        helm.command(RAW, Raw(id=number))
+        operator.command(RAW, Raw(id=number))
     with pytest.raises(Refused, match="64 commands wait for the bus"):
-        helm.command(RAW, Raw(id=200))
-    helm.command(topics.CMD_DRIVE, STAND)
+        operator.command(RAW, Raw(id=200))
+    operator.command(topics.CMD_DRIVE, STAND)
     await scene.settle()
     assert [message for _, message in scene.gateway.taken()] == [*(Raw(id=n) for n in range(WAITING + 1)), STAND]
 
 
 async def test_raw_needs_the_lease_like_motion_and_acquires_it() -> None:
     scene = Scene()
-    helm = scene.helm()
+    operator = scene.operator()
     with pytest.raises(Refused, match="connected"):
-        helm.command(RAW, Raw(id=40))
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(RAW, Raw(id=40))
+        operator.command(RAW, Raw(id=40))
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(RAW, Raw(id=40))
     await scene.settle()
     assert scene.gateway.taken() == [("raw/toy", Raw(id=40))]
 
 
 async def test_a_flush_that_fails_does_not_stop_what_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
 
     async def fails() -> None:
         raise BusError("the bus is closed")
 
     monkeypatch.setattr(scene.bus, "flush", fails)
-    helm.command(RAW, Raw(id=40))
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator.command(RAW, Raw(id=40))
+    operator.command(topics.CMD_DRIVE, STAND)
     await scene.settle()
     assert scene.gateway.taken() == [("raw/toy", Raw(id=40)), ("drive", STAND)]
 
@@ -454,39 +454,39 @@ async def test_a_flush_that_fails_does_not_stop_what_waits(monkeypatch: pytest.M
 @pytest.mark.parametrize("late", [True, False])
 async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(late, monkeypatch) -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     taken = asyncio.Event()
 
     async def blocked() -> None:
         await taken.wait()
 
     monkeypatch.setattr(scene.bus, "flush", blocked)
-    helm.command(RAW, Raw(id=40))
-    helm.command(RAW, Raw(id=41))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.25))
+    operator.command(RAW, Raw(id=40))
+    operator.command(RAW, Raw(id=41))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.25))
     if late:
         scene.now += DEADMAN_S
     else:
-        helm.look(refusals(("hq.toy.1", "drive", "busy: map", 1), code=Code.NEUTRAL_FIRST))
+        operator.look(refusals(("hq.toy.1", "drive", "busy: map", 1), code=Code.NEUTRAL_FIRST))
     taken.set()
     await scene.settle()
     assert scene.gateway.taken() == [("raw/toy", Raw(id=40))]
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, STAND)
     assert scene.gateway.taken() == [("drive", STAND)]
 
 
 async def test_neutral_that_waited_for_the_bus_is_sent_however_late(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     taken = asyncio.Event()
 
     async def blocked() -> None:
         await taken.wait()
 
     monkeypatch.setattr(scene.bus, "flush", blocked)
-    helm.command(RAW, Raw(id=40))
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator.command(RAW, Raw(id=40))
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
     scene.now += 2.0
     taken.set()
     await scene.settle()
@@ -498,12 +498,12 @@ async def test_neutral_that_waited_for_the_bus_is_sent_however_late(monkeypatch:
 
 async def test_the_light_is_told_only_when_it_changes() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, Drive(light=False))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=False))
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, Drive(light=False))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=False))
     await scene.settle()
     for light in (True, True, False, False):
-        helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=light))
+        operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=light))
     assert [message for _, message in scene.gateway.taken()] == [
         GO,
         Drive(forward=0.5, light=True),
@@ -515,35 +515,35 @@ async def test_the_light_is_told_only_when_it_changes() -> None:
 
 async def test_a_light_switched_on_before_the_robot_was_had_is_told() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, Drive(light=True))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, Drive(light=True))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
     await scene.settle()
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
     lights = [message.light for _, message in scene.gateway.taken() if isinstance(message, Drive)]
     assert lights[0] is True
 
 
 async def test_a_light_switched_on_by_a_refused_command_is_told_with_the_next() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.now += DEADMAN_S
     with pytest.raises(Refused, match="deadman"):
-        helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
-    helm.command(topics.CMD_DRIVE, Drive(light=True))
+        operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
+    operator.command(topics.CMD_DRIVE, Drive(light=True))
     assert scene.gateway.taken() == [("drive", Drive(light=True))]
 
 
 async def test_the_light_of_a_new_lease_is_told_anew() -> None:
     scene = Scene()
-    helm = await scene.driving()
-    helm.command(topics.CMD_DRIVE, Drive(light=True))
+    operator = await scene.driving()
+    operator.command(topics.CMD_DRIVE, Drive(light=True))
     scene.gateway.authority.stop("stop")
-    scene.look(helm)
+    scene.look(operator)
     await scene.settle()
     scene.gateway.taken()
-    helm.command(topics.CMD_DRIVE, Drive(light=True))
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
+    operator.command(topics.CMD_DRIVE, Drive(light=True))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.5, light=True))
     await scene.settle()
     assert scene.gateway.taken() == [("drive", Drive(forward=0.5, light=True))]
 
@@ -553,31 +553,31 @@ async def test_the_light_of_a_new_lease_is_told_anew() -> None:
 
 async def test_turning_the_wheels_is_neutral_to_a_program_that_steers() -> None:
     scene = Scene()
-    helm = scene.helm(steers=True)
-    helm.command(topics.CMD_DRIVE, Drive(turn=0.5))
+    operator = scene.operator(steers=True)
+    operator.command(topics.CMD_DRIVE, Drive(turn=0.5))
     await scene.settle()
     assert scene.gateway.asked == []
-    helm.command(topics.CMD_DRIVE, Drive(forward=0.5, turn=0.5))
+    operator.command(topics.CMD_DRIVE, Drive(forward=0.5, turn=0.5))
     await scene.settle()
-    helm.command(topics.CMD_DRIVE, Drive(turn=-0.5))
+    operator.command(topics.CMD_DRIVE, Drive(turn=-0.5))
     assert scene.gateway.taken() == [("drive", Drive(forward=0.5, turn=0.5)), ("drive", Drive(turn=-0.5))]
 
 
 async def test_wheels_are_set_only_when_nothing_need_be_said_first() -> None:
     scene = Scene()
-    helm = await scene.driving(steers=True)
+    operator = await scene.driving(steers=True)
     scene.now += DEADMAN_S
-    helm.command(topics.CMD_DRIVE, Drive(turn=-0.5, light=True))
-    helm.command(topics.CMD_DRIVE, Drive(turn=-0.5, light=True))
+    operator.command(topics.CMD_DRIVE, Drive(turn=-0.5, light=True))
+    operator.command(topics.CMD_DRIVE, Drive(turn=-0.5, light=True))
     assert scene.gateway.taken() == [("drive", Drive(light=True)), ("drive", Drive(turn=-0.5))]
     assert scene.gateway.refused == []
 
 
 async def test_turning_is_motion_to_a_program_that_does_not_steer() -> None:
     scene = Scene()
-    helm = scene.helm()
+    operator = scene.operator()
     with pytest.raises(Refused, match="connected"):
-        helm.command(topics.CMD_DRIVE, Drive(turn=0.5))
+        operator.command(topics.CMD_DRIVE, Drive(turn=0.5))
 
 
 # Control modes
@@ -585,24 +585,24 @@ async def test_turning_is_motion_to_a_program_that_does_not_steer() -> None:
 
 async def test_the_mode_is_told_to_a_robot_that_has_any_before_the_motion() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
     await scene.settle()
     assert scene.gateway.asked == [], "a mode alone moves nothing"
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.taken() == [("mode", Mode(mode="manual")), ("drive", GO)]
 
 
 async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
     await scene.settle()
     assert scene.gateway.taken() == [("drive", GO)]
     assert scene.gateway.report().state == "free"
@@ -610,30 +610,30 @@ async def test_a_robot_of_another_protocol_is_told_no_mode() -> None:
 
 async def test_mode_none_is_told_and_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     scene.gateway.taken()
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
     await scene.settle()
     assert scene.gateway.taken() == [("mode", Mode(mode="none"))]
     assert scene.gateway.asked == ["acquire", "release"]
     assert scene.gateway.report().state == "free"
     with pytest.raises(Refused, match="control mode is none"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
 
 
 async def test_mode_none_is_told_although_another_command_is_still_on_its_way() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
     await scene.settle()
     assert [message for _, message in scene.gateway.taken()] == [
         Mode(mode="autonomous"),
@@ -646,67 +646,67 @@ async def test_mode_none_is_told_although_another_command_is_still_on_its_way() 
 
 async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
     await scene.settle()
     assert scene.gateway.taken() == []
     assert scene.gateway.asked == ["acquire", "release"]
     assert scene.gateway.report().state == "free"
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds_one_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.report().holder == "hq.toy.1"
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.refused == []
-    helm.close()
+    operator.close()
     await scene.settle()
     assert scene.gateway.report().state == "free"
 
 
 async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
     assert scene.gateway.taken() == [("mode", Mode(mode="autonomous"))]
     for _ in range(200):
         scene.now += ATTEND_S
-        helm.intent.heard(scene.now)
-        helm.tick()
+        operator.intent.heard(scene.now)
+        operator.tick()
         await scene.settle()
     assert scene.gateway.report().holder == "hq.toy.1"
     renewals = scene.gateway.asked.count("renew")
     assert 15 <= renewals <= 21, "once in a third of the lease"
     for _ in range(31):
         scene.now += ATTEND_S
-        helm.tick()
+        operator.tick()
         await scene.settle()
     assert scene.gateway.report().state == "free", "total silence"
 
 
 async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
+    operator = scene.operator(needs_mode=True)
     with pytest.raises(Refused, match="connected: release the stick first"):
-        helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
-    helm.command(topics.CMD_DRIVE, STAND)
+        operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
+    operator.command(topics.CMD_DRIVE, STAND)
     scene.view.alive = False
     with pytest.raises(Refused, match="no gateway serves the robot"):
-        helm.command(topics.CMD_MODE, Mode(mode="autonomous"))
+        operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
     await scene.settle()
     assert scene.gateway.asked == []
 
@@ -716,24 +716,24 @@ async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -
 
 async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.gateway.authority.stop("stop")
-    scene.look(helm)
+    scene.look(operator)
     await scene.settle()
     assert scene.told == ["not driving: the lease has ended (stop)"]
     with pytest.raises(Refused, match=r"the lease has ended \(stop\): release the stick first"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "renew"]
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.report().holder == "hq.toy.1"
 
 
 async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lease() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     answering = scene.gateway.serving[2]
     answering.close()
     again: list[IncomingQuery] = []
@@ -745,58 +745,58 @@ async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lea
         scene.gateway._decide(question)
 
     scene.gateway.bus.answer(KEYS.key(topics.RPC_RENEW.path), repeat)
-    helm.look(Control(state="free"))
+    operator.look(Control(state="free"))
     await scene.settle()
     assert len(again) == 1
     assert scene.gateway.report().refusals[-1].code == "out_of_order"
-    assert helm.intent.held
+    assert operator.intent.held
     assert scene.told == []
 
 
 @pytest.mark.parametrize("code", [Code.NEUTRAL_FIRST, Code.LEASE_ENDED, Code.NOT_READY])
 async def test_what_listeners_tell_of_refusals_is_nothing_to_a_program_whoever_they_name(code: Code) -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     renewals = scene.gateway.asked.count("renew")
     told = Refusal(who="hq.toy.1", command="drive", code=code, reason="somebody said so", count=1, by="hq.toy")
-    helm.look(msgspec.structs.replace(scene.gateway.report(), refusals=(told,)))
+    operator.look(msgspec.structs.replace(scene.gateway.report(), refusals=(told,)))
     await scene.settle()
     assert scene.told == []
     assert scene.gateway.asked.count("renew") == renewals
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, GO)
     assert scene.gateway.taken() == [("drive", GO)]
 
 
 async def test_a_takeover_is_noticed_and_told_once() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.gateway.authority.takeover(Acquire(who="operator"), scene.now)
     for _ in range(5):
-        scene.look(helm)
+        scene.look(operator)
         await scene.settle()
     assert scene.told == ["not driving: the lease has ended (taken over by operator)"]
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_news_older_than_the_lease_does_not_end_it() -> None:
     scene = Scene()
-    helm = scene.helm()
+    operator = scene.operator()
     old = scene.gateway.report()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
-    helm.look(old)
+    operator.look(old)
     await scene.settle()
-    assert helm.intent.held
+    assert operator.intent.held
     assert scene.told == []
 
 
 async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     ask, renewals = scene.bus.ask, list[Any]()
     held_anew = asyncio.Event()
@@ -809,59 +809,59 @@ async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one(monkeypatch
         return answers
 
     monkeypatch.setattr(scene.bus, "ask", late)
-    helm.look(Control(state="free"))
-    helm.command(topics.CMD_MODE, Mode(mode="none"))
+    operator.look(Control(state="free"))
+    operator.command(topics.CMD_MODE, Mode(mode="none"))
     scene.gateway.authority.stop("stop")
-    helm.command(topics.CMD_MODE, Mode(mode="manual"))
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_MODE, Mode(mode="manual"))
+    operator.command(topics.CMD_DRIVE, GO)
     for _ in range(20):
         await asyncio.sleep(0)
-    assert helm.intent.held
+    assert operator.intent.held
     held_anew.set()
     await scene.settle()
     assert [payloads.decode(Lease, answer.payload).ok for answer in renewals] == [False]
-    assert helm.intent.held
+    assert operator.intent.held
     assert scene.told == []
 
 
 async def test_a_lease_that_expired_is_noticed_by_the_refusal_of_the_next_command() -> None:
     scene = Scene()
-    helm = await scene.driving()
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = await scene.driving()
+    operator.command(topics.CMD_DRIVE, STAND)
     scene.now += 1.0
     scene.gateway.authority.expire(scene.now + LEASE_S)
-    helm.command(topics.CMD_DRIVE, GO)
-    scene.look(helm)
+    operator.command(topics.CMD_DRIVE, GO)
+    scene.look(operator)
     await scene.settle()
     assert scene.told == ["not driving: the lease has ended (lease expired)"]
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_the_gateway_going_away_ends_the_drive() -> None:
     scene = Scene()
-    helm = await scene.driving()
-    helm.gateway_lost()
-    helm.gateway_lost()
+    operator = await scene.driving()
+    operator.gateway_lost()
+    operator.gateway_lost()
     assert scene.told == ["not driving: the robot's gateway is gone"]
     with pytest.raises(Refused, match="the robot's gateway is gone: release the stick first"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
 
 
 async def test_a_lease_granted_after_the_gateway_was_lost_is_given_back() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.gateway_lost()
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.gateway_lost()
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "release"]
-    assert not helm.active
+    assert not operator.active
     assert scene.gateway.taken() == []
 
 
-async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_helm() -> None:
+async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_operator() -> None:
     scene = Scene()
-    scene.helm().gateway_lost()
+    scene.operator().gateway_lost()
     assert scene.told == []
 
 
@@ -878,27 +878,27 @@ def refusals(*entries: tuple[str | None, str, str, int], code: Code = Code.BUSY)
 
 async def test_a_refused_command_is_told_once_for_each_time_it_is_refused() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     for number in (1, 1, 2, 2, 3):
-        helm.look(refusals(("hq.toy.1", "raw/toy", "busy", number)))
+        operator.look(refusals(("hq.toy.1", "raw/toy", "busy", number)))
     assert scene.told == ["raw/toy: busy"] * 3
-    assert helm.intent.held
+    assert operator.intent.held
 
 
 async def test_what_was_refused_to_others_is_not_told() -> None:
     scene = Scene()
-    helm = await scene.driving()
-    helm.look(refusals(("operator", "drive", "busy", 1), ("hq.toy.11", "drive", "busy", 1)))
+    operator = await scene.driving()
+    operator.look(refusals(("operator", "drive", "busy", 1), ("hq.toy.11", "drive", "busy", 1)))
     assert scene.told == []
 
 
 async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a_command() -> None:
     scene = Scene()
-    asking, idle = scene.helm(), scene.helm("hq.toy.2")
+    asking, idle = scene.operator(), scene.operator("hq.toy.2")
     asking.command(topics.CMD_LIDAR, Switch(True))
     refused = (None, "lidar", "the robot has no such command", 1)
-    for helm in (idle, asking):
-        helm.look(refusals(refused, (None, "text", "no", 1)))
+    for operator in (idle, asking):
+        operator.look(refusals(refused, (None, "text", "no", 1)))
     assert scene.told == ["lidar: the robot has no such command"]
     scene.now += 1.0
     asking.look(refusals((*refused[:3], 2)))
@@ -907,8 +907,8 @@ async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a
 
 async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
 
     ask = scene.bus.ask
 
@@ -917,21 +917,21 @@ async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monk
         return []
 
     monkeypatch.setattr(scene.bus, "ask", ask_in_vain)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.told == ["not driving: no gateway answers"]
-    assert scene.gateway.report().holder == helm.who
-    scene.look(helm)
+    assert scene.gateway.report().holder == operator.who
+    scene.look(operator)
     assert scene.gateway.report().holder is None
 
 
 async def test_a_program_that_gave_the_robot_back_and_wants_it_again_is_not_in_its_own_way() -> None:
     scene = Scene()
-    helm = await scene.driving(needs_mode=False)
-    helm.command(topics.CMD_MODE, Mode("none"))
-    helm.command(topics.CMD_MODE, Mode("manual"))
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = await scene.driving(needs_mode=False)
+    operator.command(topics.CMD_MODE, Mode("none"))
+    operator.command(topics.CMD_MODE, Mode("manual"))
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "release", "acquire"]
     assert scene.gateway.taken()[-1] == ("drive", GO)
@@ -939,7 +939,7 @@ async def test_a_program_that_gave_the_robot_back_and_wants_it_again_is_not_in_i
 
 async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> None:
     scene = Scene()
-    greedy, other = scene.helm(), scene.helm("hq.toy.2")
+    greedy, other = scene.operator(), scene.operator("hq.toy.2")
     for _ in range(50):
         greedy.command(topics.CMD_LIDAR, Switch(True))
     with pytest.raises(Refused, match="more than 50 commands a second"):
@@ -951,35 +951,35 @@ async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> Non
 
 async def test_a_robot_of_another_protocol_is_not_taken_to_move_by_itself() -> None:
     scene = Scene(protocol="other")
-    helm = scene.helm(needs_mode=True)
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator = scene.operator(needs_mode=True)
+    operator.command(topics.CMD_DRIVE, STAND)
     with pytest.raises(Refused, match="does not move by itself"):
-        helm.command(topics.CMD_MODE, Mode("autonomous"))
+        operator.command(topics.CMD_MODE, Mode("autonomous"))
     await scene.settle()
-    assert (scene.gateway.asked, helm.intent.mode) == ([], "manual"), "but it can be driven"
+    assert (scene.gateway.asked, operator.intent.mode) == ([], "manual"), "but it can be driven"
 
 
 async def test_what_was_refused_to_a_program_of_this_name_before_is_not_told() -> None:
     scene = Scene()
     scene.view.note(topics.CONTROL, refusals(("hq.toy.1", "drive", "busy", 4)))
-    helm = scene.helm()
-    helm.look(refusals(("hq.toy.1", "drive", "busy", 4)))
+    operator = scene.operator()
+    operator.look(refusals(("hq.toy.1", "drive", "busy", 4)))
     assert scene.told == []
-    helm.look(refusals(("hq.toy.1", "drive", "busy", 5)))
+    operator.look(refusals(("hq.toy.1", "drive", "busy", 5)))
     assert scene.told == ["drive: busy"]
 
 
 async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.gateway.authority.hold_back("busy: map")
-    helm.command(topics.CMD_DRIVE, GO)
-    scene.look(helm)
+    operator.command(topics.CMD_DRIVE, GO)
+    scene.look(operator)
     assert scene.told == ["drive: busy: map: send a neutral drive first"]
     with pytest.raises(Refused, match="motion was refused: release the stick first"):
-        helm.command(topics.CMD_DRIVE, GO)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     assert [message for _, message in scene.gateway.taken()] == [STAND, GO]
 
 
@@ -988,48 +988,48 @@ async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it() -
 
 async def test_what_a_controller_set_once_is_repeated_while_it_lives() -> None:
     scene = Scene()
-    helm = scene.helm(hold=True)
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
+    operator = scene.operator(hold=True)
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
     await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))]
     for _ in range(100):
         scene.now += ATTEND_S
-        helm.tick()
+        operator.tick()
         await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))] * 100
     assert scene.gateway.report().holder == "hq.toy.1"
     assert scene.gateway.refused == []
-    helm.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=0.0))
     await scene.settle()
     scene.gateway.taken()
     scene.now += ATTEND_S
-    helm.tick()
+    operator.tick()
     await scene.settle()
     assert scene.gateway.taken() == [], "neutral is not repeated"
 
 
 async def test_what_other_programs_set_is_not_repeated() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.now += ATTEND_S
-    helm.tick()
+    operator.tick()
     await scene.settle()
     assert scene.gateway.taken() == []
 
 
 async def test_every_motor_there_can_be_is_set_and_held() -> None:
     scene = Scene()
-    helm = scene.helm(hold=True)
+    operator = scene.operator(hold=True)
     motors = [topics.CMD_MOTOR(f"m{number}") for number in range(255)]
-    helm.command(motors[0], Motor(value=0.0))
+    operator.command(motors[0], Motor(value=0.0))
     for motor in motors:
-        helm.command(motor, Motor(value=1.0))
+        operator.command(motor, Motor(value=1.0))
     await scene.settle()
     assert len(scene.gateway.taken()) == 255
     scene.now += ATTEND_S
-    helm.tick()
-    helm.tick()
+    operator.tick()
+    operator.tick()
     await scene.settle()
     assert {path for path, _ in scene.gateway.taken()} == {f"motor/m{number}" for number in range(255)}
 
@@ -1037,26 +1037,26 @@ async def test_every_motor_there_can_be_is_set_and_held() -> None:
 async def test_one_motor_at_rest_is_no_neutral_while_another_is_still_set() -> None:
     """A controller that turns about one wheel says 0 for it all the time: a stop would not outlast that."""
     scene = Scene()
-    helm = scene.helm(hold=True)
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
-    helm.command(RIGHT, Motor(value=0.0))
+    operator = scene.operator(hold=True)
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
+    operator.command(RIGHT, Motor(value=0.0))
     await scene.settle()
     scene.gateway.authority.stop("stop")
-    scene.look(helm)
+    scene.look(operator)
     await scene.settle()
     scene.gateway.taken()
     for _ in range(10):
         scene.now += ATTEND_S
         with pytest.raises(Refused, match="release the stick first"):
-            helm.command(LEFT, Motor(value=5.0))
-        helm.command(RIGHT, Motor(value=0.0))
-        helm.tick()
+            operator.command(LEFT, Motor(value=5.0))
+        operator.command(RIGHT, Motor(value=0.0))
+        operator.tick()
         await scene.settle()
     assert scene.gateway.taken() == []
     assert scene.gateway.asked.count("acquire") == 1
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
     await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))]
 
@@ -1064,17 +1064,17 @@ async def test_one_motor_at_rest_is_no_neutral_while_another_is_still_set() -> N
 async def test_a_motor_that_was_set_once_before_the_robot_was_had_does_not_keep_the_others_back() -> None:
     """A controller puts its arm where it belongs when it starts, and never says 0 of that."""
     scene = Scene()
-    helm = scene.helm(hold=True)
+    operator = scene.operator(hold=True)
     with pytest.raises(Refused, match="connected"):
-        helm.command(topics.CMD_MOTOR("arm"), Motor(value=0.2))
-    helm.command(LEFT, Motor(value=0.0))
+        operator.command(topics.CMD_MOTOR("arm"), Motor(value=0.2))
+    operator.command(LEFT, Motor(value=0.0))
     with pytest.raises(Refused, match="connected"):
-        helm.command(LEFT, Motor(value=5.0))
+        operator.command(LEFT, Motor(value=5.0))
     scene.now += DEADMAN_S
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
     await scene.settle()
-    helm.tick()
+    operator.tick()
     await scene.settle()
     assert scene.gateway.taken() == [("motor/left", Motor(value=5.0))] * 2, "what was refused is not held"
 
@@ -1082,17 +1082,17 @@ async def test_a_motor_that_was_set_once_before_the_robot_was_had_does_not_keep_
 async def test_what_was_set_before_the_deadman_does_not_move_again_by_itself() -> None:
     """The loop was away for a while: what is held has lapsed, and one motor's neutral does not revive the other."""
     scene = Scene()
-    helm = scene.helm(hold=True)
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
-    helm.command(RIGHT, Motor(value=5.0))
+    operator = scene.operator(hold=True)
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
+    operator.command(RIGHT, Motor(value=5.0))
     await scene.settle()
     scene.gateway.taken()
     scene.now += DEADMAN_S
-    helm.tick()
-    helm.command(LEFT, Motor(value=0.0))
+    operator.tick()
+    operator.command(LEFT, Motor(value=0.0))
     await scene.settle()
-    helm.tick()
+    operator.tick()
     await scene.settle()
     assert all(not message.value for _, message in scene.gateway.taken() if isinstance(message, Motor))
 
@@ -1100,71 +1100,71 @@ async def test_what_was_set_before_the_deadman_does_not_move_again_by_itself() -
 async def test_a_controller_of_wheels_may_become_one_of_motors() -> None:
     """The robot was another one for a while: a drive that was never ended is not waited for."""
     scene = Scene()
-    helm = scene.helm(hold=True)
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator = scene.operator(hold=True)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     scene.gateway.authority.stop("stop")
-    scene.look(helm)
+    scene.look(operator)
     await scene.settle()
     scene.now += DEADMAN_S
-    helm.command(LEFT, Motor(value=0.0))
-    helm.command(LEFT, Motor(value=5.0))
+    operator.command(LEFT, Motor(value=0.0))
+    operator.command(LEFT, Motor(value=5.0))
     await scene.settle()
     scene.gateway.authority.stop("stop")
-    scene.look(helm)
+    scene.look(operator)
     await scene.settle()
     scene.now += DEADMAN_S
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert [path for path, _ in scene.gateway.taken()] == ["drive", "motor/left", "drive"]
 
 
 async def test_neutral_for_the_time_of_the_lease_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     for _ in range(26):
         scene.now += ATTEND_S
-        helm.command(topics.CMD_DRIVE, STAND)
-        helm.tick()
+        operator.command(topics.CMD_DRIVE, STAND)
+        operator.tick()
         await scene.settle()
-        assert helm.intent.held
+        assert operator.intent.held
     for _ in range(2):
         scene.now += ATTEND_S
-        helm.tick()
+        operator.tick()
     await scene.settle()
     assert scene.gateway.report().state == "free"
-    assert not helm.active
+    assert not operator.active
     assert scene.told == [], "nobody wanted it any more"
-    helm.command(topics.CMD_DRIVE, GO)
+    operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.report().holder == "hq.toy.1"
 
 
 async def test_silence_lets_the_motion_lapse_and_gives_the_robot_back() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     for _ in range(31):
         scene.now += ATTEND_S
-        helm.tick()
+        operator.tick()
         await scene.settle()
     assert scene.gateway.report().state in ("free", "stopped")
-    assert not helm.active
+    assert not operator.active
     with pytest.raises(Refused, match="deadman"):
-        helm.command(topics.CMD_DRIVE, GO)
+        operator.command(topics.CMD_DRIVE, GO)
 
 
 async def test_a_lease_shorter_than_usual_is_given_back_sooner() -> None:
     scene = Scene()
     scene.gateway.authority.lease_s = 1.0
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.now += 0.7
-    helm.tick()
-    assert helm.intent.held
+    operator.tick()
+    assert operator.intent.held
     scene.now += 0.06
-    helm.tick()
-    assert not helm.intent.held
+    operator.tick()
+    assert not operator.intent.held
     await scene.settle()
 
 
@@ -1173,22 +1173,22 @@ async def test_a_lease_shorter_than_usual_is_given_back_sooner() -> None:
 
 async def test_a_program_that_went_gives_the_robot_back_at_once() -> None:
     scene = Scene()
-    helm = await scene.driving()
-    helm.close()
-    helm.close()
+    operator = await scene.driving()
+    operator.close()
+    operator.close()
     await scene.settle()
     assert scene.gateway.asked == ["acquire", "release"]
     assert scene.gateway.report().state == "free"
     assert await scene.bus.alive(KEYS.alive("*")) == []
-    assert not helm.active
+    assert not operator.active
 
 
 async def test_a_program_that_went_while_it_asked_gives_back_what_was_granted() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.close()
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.close()
     await scene.settle()
     assert scene.gateway.taken() == []
     assert scene.gateway.asked == ["acquire", "release"]
@@ -1199,10 +1199,10 @@ async def test_a_program_that_went_while_it_asked_gives_back_what_was_granted() 
 async def test_a_program_that_went_while_it_asked_in_vain_leaves_nothing() -> None:
     scene = Scene()
     scene.gateway.authority.acquire(Acquire(who="operator"), scene.now)
-    helm = scene.helm()
-    helm.command(topics.CMD_DRIVE, STAND)
-    helm.command(topics.CMD_DRIVE, GO)
-    helm.close()
+    operator = scene.operator()
+    operator.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, GO)
+    operator.close()
     await scene.settle()
     assert scene.gateway.report().holder == "operator"
     assert await scene.bus.alive(KEYS.alive("*")) == []
@@ -1210,20 +1210,20 @@ async def test_a_program_that_went_while_it_asked_in_vain_leaves_nothing() -> No
 
 async def test_a_program_that_never_asked_leaves_without_a_word() -> None:
     scene = Scene()
-    helm = scene.helm()
-    helm.close()
+    operator = scene.operator()
+    operator.close()
     await scene.settle()
     assert scene.gateway.asked == []
 
 
 async def test_a_program_that_goes_while_the_robot_is_being_given_back_leaves_it_free() -> None:
     scene = Scene()
-    helm = await scene.driving()
+    operator = await scene.driving()
     scene.now += LEASE_S - 0.01
-    helm.command(topics.CMD_DRIVE, STAND)
+    operator.command(topics.CMD_DRIVE, STAND)
     scene.now += 0.01
-    helm.tick()
-    helm.close()
+    operator.tick()
+    operator.close()
     await scene.settle()
     assert scene.gateway.report().state == "free", "given back, not lost"
     assert await scene.bus.alive(KEYS.alive("*")) == []
@@ -1232,14 +1232,14 @@ async def test_a_program_that_goes_while_the_robot_is_being_given_back_leaves_it
 async def test_many_programs_come_and_go_and_leave_nothing() -> None:
     scene = Scene()
     for number in range(300):
-        helm = await scene.driving(who=f"hq.toy.{number}")
-        helm.close()
+        operator = await scene.driving(who=f"hq.toy.{number}")
+        operator.close()
         await scene.settle()
     assert scene.tasks == set()
     assert await scene.bus.alive(KEYS.alive("*")) == []
     scene.bridge.close()
     assert "Bridge to r1" in repr(scene.bridge)
-    assert repr(helm).startswith("<Operator hq.toy.299 <Intent")
+    assert repr(operator).startswith("<Operator hq.toy.299 <Intent")
 
 
 async def test_keys_that_are_commanded_one_after_the_other_do_not_add_up() -> None:

@@ -7,7 +7,7 @@
         async with robot.control() as drive:
             await drive(forward=0.3)
 
-Knows no robot's protocol and nothing of gateways' insides: only keys and fleet messages.
+Knows no protocol and no part of a gateway: only keys and fleet messages.
 :mod:`zbridge.client.blocking` is the same for programs without an event loop.
 """
 
@@ -25,11 +25,11 @@ from zbridge.metrics import Metrics
 __all__ = ["LOCAL_ROUTER", "Driver", "Feed", "Fleet", "Robot", "StateFeed", "bus_settings", "connect"]
 
 LOCAL_ROUTER = "tcp/127.0.0.1:7447"
-"""Where a router on this machine is looked for."""
+"""The address at which a router on this machine is expected."""
 
 
 def bus_settings(endpoints: Sequence[str] = (), tls: Tls | None = None) -> BusSettings:
-    """Choose how a program joins the bus: the given endpoints, else multicast and the router on this machine."""
+    """Return how a program joins the bus: by the given endpoints, else by multicast and the router on this machine."""
     if endpoints:
         return BusSettings(connect=tuple(endpoints), multicast=False, tls=tls)
     return BusSettings(mode="peer", connect=(LOCAL_ROUTER,), tls=tls)
@@ -43,11 +43,11 @@ async def connect(
     tls: Tls | None = None,
     settings: BusSettings | None = None,
 ) -> AsyncIterator[Fleet]:
-    """Be on the bus while the context lasts.
+    """Join the bus for as long as the context lasts.
 
-    endpoints: of Zenoh, ``tcp/192.168.0.2:7447``; without any, the local network and the router on this machine.
-    settings: all there is to set, instead of ``endpoints`` and ``tls``.
-    Raises BusError where no given endpoint can be reached.
+    endpoints: Zenoh endpoints, ``tcp/192.168.0.2:7447``; by default the local network and the router on this machine.
+    settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
+    Raises BusError if no given endpoint can be reached.
     """
     if isinstance(endpoints, str):
         endpoints = (endpoints,)

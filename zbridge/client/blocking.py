@@ -1,4 +1,4 @@
-"""The client for scripts and notebooks: the same robots without ``async``, by an event loop on a thread.
+"""The client for scripts and notebooks: the same classes without ``async``; an event loop runs on a thread.
 
 with zbridge.blocking.connect(endpoints=["tcp/127.0.0.1:7447"]) as fleet:
     robot = fleet["r1"]
@@ -53,7 +53,7 @@ class _Loop:
         self._thread.start()
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine there and wait for it; interrupted, it is cancelled."""
+        """Run a coroutine on the loop and wait for it; an interruption cancels it."""
         try:
             future = asyncio.run_coroutine_threadsafe(work, self._loop)
         except RuntimeError:
@@ -83,7 +83,7 @@ class _Loop:
 
 @contextlib.contextmanager
 def connect(endpoints: Sequence[str] | str = (), *, realm: str = "fleet", tls: Tls | None = None) -> Iterator[Fleet]:
-    """Be on the bus while the context lasts; see :func:`zbridge.client.connect`."""
+    """Join the bus for as long as the context lasts; see :func:`zbridge.client.connect`."""
     joining = zbridge.client.connect(endpoints, realm=realm, tls=tls)
     with contextlib.closing(_Loop()) as loop, _entered(loop, joining) as fleet:
         yield Fleet(loop, fleet)
@@ -100,24 +100,24 @@ class Fleet:
         return repr(self._fleet)
 
     def __getitem__(self, name: str) -> Robot:
-        """Give the robot of this name, on the bus or not."""
+        """Return the robot of this name, whether or not it is on the bus."""
         return Robot(self._loop, self._fleet[name])
 
     def robots(self) -> dict[str, Status | None]:
-        """List the robots that have a gateway or a status."""
+        """Return the robots that have a gateway or a status, by name."""
         return self._loop.run(self._fleet.robots())
 
     def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
-        """Give the session tables by robot and process; see :meth:`zbridge.client.fleet.Fleet.sessions`."""
+        """Return the session tables by robot and process; see :meth:`zbridge.client.fleet.Fleet.sessions`."""
         return self._loop.run(self._fleet.sessions())
 
     def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
-        """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""
+        """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed."""
         return self._loop.run(self._fleet.stop(names))
 
 
 class Feed(Generic[T]):
-    """One key, or several: ``for message in feed``."""
+    """The messages of one key, or of several: ``for message in feed``."""
 
     def __init__(self, loop: _Loop, source: feed.Feed[T]) -> None:
         self._loop = loop
@@ -128,12 +128,12 @@ class Feed(Generic[T]):
 
     @property
     def lost(self) -> int:
-        """Messages that made room because a program was slower than the robot."""
+        """Messages that were dropped because the program was slower than the robot."""
         return self._feed.lost
 
     @property
     def malformed(self) -> int:
-        """Payloads that were not what their key promises, and were left out."""
+        """Payloads that could not be decoded as their key's message, and were left out."""
         return self._feed.malformed
 
     def __iter__(self) -> Iterator[T]:
@@ -143,24 +143,24 @@ class Feed(Generic[T]):
             message: T = await anext(messages)
             return message
 
-        while True:  # dropped, the asynchronous generator is closed by its own loop: this one must not wait for it
+        while True:  # its own loop closes the asynchronous generator: this thread must not wait for it
             yield self._loop.run(following())
 
 
 class StateFeed(Feed[F]):
-    """A key that keeps its last value."""
+    """The messages of a key that keeps its last value."""
 
     def __init__(self, loop: _Loop, source: feed.StateFeed[F]) -> None:
         super().__init__(loop, source)
         self._state = source
 
     def last(self, timeout_s: float = 1.0) -> F | None:
-        """Give the last value; None where nobody has published one."""
+        """Return the last value; None if there is none."""
         return self._loop.run(self._state.last(timeout_s))
 
 
 class ControlFeed(StateFeed[Control]):
-    """The state ``control``; called, the right to drive."""
+    """The messages of ``control``; calling the feed acquires the right to drive."""
 
     def __init__(self, loop: _Loop, source: fleets.ControlFeed) -> None:
         super().__init__(loop, source)
@@ -174,7 +174,7 @@ class ControlFeed(StateFeed[Control]):
 
 
 class Robot:
-    """One robot: a feed for every key it publishes, questions, commands that need no lease, and the lease."""
+    """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
     def __init__(self, loop: _Loop, robot: fleets.Robot) -> None:
         self._loop = loop
@@ -196,7 +196,7 @@ class Robot:
         return repr(self._robot)
 
     def sensor(self, name: str) -> Feed[Reading]:
-        """Give the feed of one sensor."""
+        """Return the feed of one sensor."""
         return Feed(self._loop, self._robot.sensor(name))
 
     @property
@@ -205,19 +205,19 @@ class Robot:
         return Feed(self._loop, self._robot.sensors)
 
     def raw(self, protocol: str) -> Feed[Raw]:
-        """Give the legacy messages that no fleet message holds."""
+        """Return the feed of the legacy messages that no fleet message can hold."""
         return Feed(self._loop, self._robot.raw(protocol))
 
     def ask_pose(self) -> Pose:
-        """Ask the robot where it is, now."""
+        """Ask the robot for its pose now."""
         return self._loop.run(self._robot.ask_pose())
 
     def ask_map(self) -> Map:
-        """Ask the robot for its map, now."""
+        """Ask the robot for its map now."""
         return self._loop.run(self._robot.ask_map())
 
     def stop(self) -> None:
-        """Stop the robot and end whatever lease there is; return when its gateway has confirmed it."""
+        """Stop the robot and end any lease; return when its gateway has confirmed the stop."""
         self._loop.run(self._robot.stop())
 
     def set_light(self, on: bool) -> None:
@@ -237,7 +237,7 @@ class Robot:
         self._loop.run(self._robot.say(text))
 
     def feed_scan(self, scan: Scan) -> None:
-        """Give the robot simulated lidar data."""
+        """Send the robot simulated lidar data."""
         self._loop.run(self._robot.feed_scan(scan))
 
     def set_sensor(self, name: str, setting: SensorSetting) -> None:
@@ -246,7 +246,7 @@ class Robot:
 
 
 class Driver:
-    """The lease of one robot: ``drive(forward=0.3)``, again and again, for motion lasts ``deadman_s`` only."""
+    """The lease of one robot: ``drive(forward=0.3)``, again and again, for motion lasts only ``deadman_s``."""
 
     def __init__(self, loop: _Loop, holder: driver.Driver) -> None:
         self._loop = loop
@@ -267,7 +267,7 @@ class Driver:
         self._loop.run(self._driver(forward, left, turn, light=light))
 
     def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for so many seconds, then stand."""
+        """Drive for so many seconds, then send neutral."""
         self._loop.run(self._driver.during(seconds, forward, left, turn))
 
     def motor(self, name: str, value: float) -> None:
@@ -275,17 +275,17 @@ class Driver:
         self._loop.run(self._driver.motor(name, value))
 
     def mode(self, mode: str) -> None:
-        """Say who moves the robot: ``none``, ``manual`` or ``autonomous``."""
+        """Set who moves the robot: ``none``, ``manual`` or ``autonomous``."""
         self._loop.run(self._driver.mode(mode))
 
     def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
-        """Send a legacy message that no fleet message holds."""
+        """Send a legacy message that no fleet message can hold."""
         self._loop.run(self._driver.raw(protocol, message_id, body))
 
 
 @contextlib.contextmanager
 def _entered(loop: _Loop, context: contextlib.AbstractAsyncContextManager[T]) -> Iterator[T]:
-    """Be inside an asynchronous context whose loop runs on another thread."""
+    """Enter and leave an asynchronous context on the loop's thread."""
 
     async def enter() -> T:
         return await context.__aenter__()

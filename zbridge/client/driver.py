@@ -11,8 +11,8 @@ from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
 from zbridge.control.lease_client import RETRY_S, LeaseClient
+from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind
 from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, Held, LeaseLost, PayloadError, Refused
 from zbridge.errors import refusal as refused
@@ -30,7 +30,7 @@ _MOVING = ("drive", "mode", "motor/", "raw/")
 
 
 def default_who() -> str:
-    """Name this program as ``user@host``."""
+    """Return the name of this program, ``user@host``."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a user id without a name
@@ -70,16 +70,16 @@ class Driver:
     ) -> None:
         """Drive: fractions of full scale, -1 to 1, ``turn`` counter-clockwise; all zero is neutral.
 
-        Raises ValueError where a value is outside -1..1, LeaseLost, or Refused with the gateway's reason.
+        Raises ValueError if a value is outside -1..1, LeaseLost, or Refused with the gateway's reason.
         """
         for name, value in (("forward", forward), ("left", left), ("turn", turn)):
             if not -1.0 <= value <= 1.0:
                 raise ValueError(f"{name} = {value!r}: expected -1 to 1")
         await self._send(topics.CMD_DRIVE, Drive(forward=forward, left=left, turn=turn, light=light))
-        await asyncio.sleep(0)  # a program that drives in a loop must leave time to hear of its loss
+        await asyncio.sleep(0)  # a program that drives in a loop must leave time to notice a loss
 
     async def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for so many seconds, then stand."""
+        """Drive for so many seconds, then send neutral."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while (left_s := end - loop.time()) > 0:
@@ -88,17 +88,17 @@ class Driver:
         await self()
 
     async def motor(self, name: str, value: float) -> None:
-        """Move one motor: rad/s, or metres for a linear motor; to be repeated like a drive."""
+        """Move one motor: rad/s, or metres for a linear motor; must be repeated like a drive."""
         await self._send(topics.CMD_MOTOR(name), Motor(value))
 
     async def mode(self, mode: str) -> None:
-        """Say who moves the robot: ``none``, ``manual`` or ``autonomous`` (for as long as the lease is held)."""
+        """Set who moves the robot: ``none``, ``manual`` or ``autonomous`` (for as long as the lease is held)."""
         if mode not in ("none", "manual", "autonomous"):
             raise ValueError(f"mode = {mode!r}: expected 'none', 'manual' or 'autonomous'")
         await self._send(topics.CMD_MODE, Mode(mode))  # type: ignore[arg-type]
 
     async def raw(self, protocol: str, message_id: int, body: bytes = b"") -> None:
-        """Send a legacy message that no fleet message holds."""
+        """Send a legacy message that no fleet message can hold."""
         await self._send(topics.CMD_RAW(protocol), Raw(id=message_id, body=body))
 
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
@@ -148,7 +148,7 @@ class Driver:
             self._refusal = refused(refusal.code, text)
 
     async def release(self) -> None:
-        """Give the lease back and wait until the gateway was asked; a moving robot is stopped."""
+        """Release the lease and wait for the answer; a moving robot is stopped."""
         for task in self._tasks:
             task.cancel()
         self._granted.cancel()

@@ -1,4 +1,4 @@
-"""What a robot publishes on one key, as typed messages: iterate, or ask for the last one."""
+"""The typed messages that a robot publishes on one key: iterate over them, or ask for the last one."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ T = TypeVar("T")
 F = TypeVar("F", bound=FleetMessage)
 
 WAITING = 256
-"""Messages that may wait for an iterating program; the oldest makes room and is counted."""
+"""Messages that may wait for an iterating program; a new one replaces the oldest, which is counted as lost."""
 
 
 class Feed(Generic[T]):
-    """One key, or several: ``async for message in feed``. Every iteration has a queue of its own.
+    """The messages of one key, or of several: ``async for message in feed``. Each iteration has a queue of its own.
 
-    lost: messages that made room because a program was slower than the robot. malformed: payloads that are not
-    what their key promises; they are left out.
+    lost: messages that were dropped because the program was slower than the robot. malformed: payloads that could not
+    be decoded as their key's message; they are left out.
     """
 
     def __init__(self, bus: Bus, key_expr: str, read: Callable[[Sample], T], *, history: bool = False) -> None:
@@ -64,14 +64,14 @@ class Feed(Generic[T]):
 
 
 class StateFeed(Feed[F]):
-    """A key that keeps its last value: iterating gives that first."""
+    """The messages of a key that keeps its last value; an iteration begins with that value."""
 
     def __init__(self, bus: Bus, keys: KeySpace, topic: Topic) -> None:
         self._message: Any = topic.message
         super().__init__(bus, keys.key(topic.path), reader(topic), history=True)
 
     async def last(self, timeout_s: float = 1.0) -> F | None:
-        """Give the last value; None where nobody has published one."""
+        """Return the last value; None if there is none."""
         for answer in await self._bus.ask(self.key_expr, timeout_s=timeout_s):
             if answer.error is None:
                 message: F = payloads.decode(self._message, answer.payload)
@@ -80,6 +80,6 @@ class StateFeed(Feed[F]):
 
 
 def reader(topic: Topic) -> Callable[[Sample], Any]:
-    """Make the function that decodes what comes on a topic."""
+    """Return a function that decodes the samples of a topic."""
     message = topic.message
     return lambda sample: payloads.decode(message, sample.payload)

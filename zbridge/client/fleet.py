@@ -1,4 +1,4 @@
-"""The robots on the bus as a program sees them."""
+"""The robots on the bus, for programs that see and drive them."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ from zbridge.fleet.messages import (
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
 
 CONFIRM_S = 2.0
-"""Seconds within which a stop must be confirmed."""
+"""Longest wait for the confirmation of a stop, seconds."""
 ANSWER_S = 5.0
-"""Longest time a robot is given to answer a question."""
+"""Longest wait for a robot's answer, seconds."""
 _STOP_EVERY_S = 0.05
 _ASK_S = 0.3
 
@@ -56,13 +56,13 @@ class Fleet:
         return f"<Fleet {self.realm}>"
 
     def __getitem__(self, name: str) -> Robot:
-        """Give the robot of this name, on the bus or not; raise ValueError for what cannot be a name."""
+        """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
         return Robot(self._bus, KeySpace(self.realm, name))
 
     async def robots(self) -> dict[str, Status | None]:
-        """List the robots that have a gateway or a status, by name; None where there is no status yet."""
+        """Return the robots that have a gateway or a status, by name; None for a robot without a status."""
         tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
         robots: dict[str, Status | None] = {split[1]: None for key in tokens if (split := split_key(key))}
         for answer in await self._bus.ask(f"{self.realm}/*/{topics.STATUS.path}"):
@@ -73,7 +73,7 @@ class Fleet:
         return dict(sorted(robots.items()))
 
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
-        """Give the session tables by robot and process: who is connected to which robot, how, and what was left out."""
+        """Return the session tables by robot and process: peers, their states, and what was not translated."""
         tables: dict[tuple[str, str], tuple[SessionEntry, ...]] = {}
         for answer in await self._bus.ask(f"{self.realm}/*/@rpc/sessions/*"):
             split = split_key(answer.key)
@@ -84,7 +84,7 @@ class Fleet:
         return dict(sorted(tables.items()))
 
     async def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
-        """Stop these robots, or every one that has a gateway; give for each what is wrong, None where it stands."""
+        """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed."""
         if names is None:
             tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
             names = {split[1] for key in tokens if (split := split_key(key)) and is_name(split[1])}
@@ -100,7 +100,7 @@ class Fleet:
 
 
 class ControlFeed(StateFeed[Control]):
-    """The state ``control``; called, the right to drive."""
+    """The messages of ``control``; calling the feed acquires the right to drive."""
 
     def __init__(self, bus: Bus, keys: KeySpace) -> None:
         super().__init__(bus, keys, topics.CONTROL)
@@ -120,12 +120,12 @@ class ControlFeed(StateFeed[Control]):
     ) -> AsyncIterator[Driver]:
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
-        who: shown to others as the holder, ``user@host`` by default. name: where access rules know this program by the
-        first part of ``who`` only (``op1`` of ``op1.laptop``), that part.
-        priority: a higher one is given the robot of a lower one.
-        deadman_s: motion not commanded anew for so long ends; the robot's configuration caps it.
-        takeover: take the robot from whoever drives it. wait_s: how long to wait for the robot's gateway.
-        Raises Held naming the holder, BusError where no gateway answers, or what else the gateway refused it as.
+        who: the holder's name that others are shown, ``user@host`` by default. name: the first part of ``who``
+        (``op1`` of ``op1.laptop``) if access rules know this program by that part only.
+        priority: a program with a higher priority is given the robot of one with a lower priority.
+        deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
+        takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
+        Raises Held with the holder's name, BusError if no gateway answers, or Refused as the gateway did.
         """
         who = who or default_who()
         name = name or who
@@ -141,7 +141,7 @@ class ControlFeed(StateFeed[Control]):
 
 
 class Robot:
-    """One robot: a feed for every key it publishes, questions, commands that need no lease, and the lease."""
+    """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
     def __init__(self, bus: Bus, keys: KeySpace) -> None:
         self.name = keys.robot
@@ -163,7 +163,7 @@ class Robot:
         return f"<Robot {self._keys.realm}/{self.name}>"
 
     def sensor(self, name: str) -> Feed[Reading]:
-        """Give the feed of one sensor."""
+        """Return the feed of one sensor."""
         return self._feed(topics.SENSOR(name))
 
     @property
@@ -176,27 +176,27 @@ class Robot:
         return Feed(self._bus, self._keys.key("sensor/*"), read)
 
     def raw(self, protocol: str) -> Feed[Raw]:
-        """Give the legacy messages that no fleet message holds."""
+        """Return the feed of the legacy messages that no fleet message can hold."""
         return self._feed(topics.RAW(protocol))
 
     # Questions
 
     async def ask_pose(self) -> Pose:
-        """Ask the robot where it is, now; raise Refused with the gateway's reason, BusError where none answers."""
+        """Ask the robot for its pose now; raise Refused with the gateway's reason, BusError if no gateway answers."""
         pose: Pose = await self._ask(topics.RPC_POSE, Pose)
         return pose
 
     async def ask_map(self) -> Map:
-        """Ask the robot for its map, now; raise Refused with the gateway's reason, BusError where none answers."""
+        """Ask the robot for its map now; raise Refused with the gateway's reason, BusError if no gateway answers."""
         answer: Map = await self._ask(topics.RPC_MAP, Map)
         return answer
 
-    # Commands that everybody may give
+    # Commands that need no lease
 
     async def stop(self) -> None:
-        """Stop the robot and end whatever lease there is; return when its gateway has confirmed it.
+        """Stop the robot and end any lease; return when its gateway has confirmed the stop.
 
-        Raises BusError where none does within 2 s, Refused where the robot cannot be stopped or reached.
+        Raises BusError if no gateway does within 2 s, Refused if the robot cannot be stopped or reached.
         """
         await self._put(topics.CMD_STOP, Stop())  # before anything that may take time
         try:
@@ -232,7 +232,7 @@ class Robot:
         await self._put(topics.CMD_TEXT, Text(text))
 
     async def feed_scan(self, scan: Scan) -> None:
-        """Give the robot simulated lidar data."""
+        """Send the robot simulated lidar data."""
         await self._put(topics.CMD_SCAN, scan)
 
     async def set_sensor(self, name: str, setting: SensorSetting) -> None:
@@ -258,7 +258,7 @@ class Robot:
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
 
     async def _stop_until_shown(self) -> Control:
-        """Send the stop again and again until ``control`` shows it."""
+        """Repeat the stop until ``control`` shows it; raise BusError if that takes too long."""
         shown: asyncio.Future[Control] = asyncio.get_running_loop().create_future()
 
         def look(sample: Sample) -> None:
@@ -280,7 +280,7 @@ class Robot:
 
 
 def _refused_stops(control: Control) -> list[Refusal]:
-    """List the stops that the robot's gateway could not send."""
+    """Return the refusals of stops by the robot's gateway."""
     return [refusal for refusal in control.refusals if refusal.command == "stop" and refusal.by is None]
 
 

@@ -1,7 +1,8 @@
 """Who may drive one robot: leases and proofs, stops and deadlines, limits on motion, the audit log.
 
-Knows no link and no protocol. The authority decides and is a machine without clock, loop or bus; the gate sorts
-commands on the bus's threads; the enforcer carries out what the authority decides; the lease server answers queries.
+Knows no link and no protocol. The authority is the gateway's machine, the lease client the holder's; both are without
+clock, loop and bus. The gate sorts commands on the bus's threads; the enforcer carries out what the authority decides;
+the lease server answers queries; the lease holder asks them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from zbridge.control.authority import Authority
     from zbridge.control.context import RobotContext
     from zbridge.control.enforcer import Enforcer
+    from zbridge.control.lease_client import LeaseClient
+    from zbridge.control.lease_holder import LeaseHolder
     from zbridge.control.lease_server import LeaseServer
     from zbridge.control.motion_limits import MotionLimits
     from zbridge.control.proof import Signer, Verifier
@@ -26,6 +29,8 @@ __all__ = [
     "Authority",
     "ControlSettings",
     "Enforcer",
+    "LeaseClient",
+    "LeaseHolder",
     "LeaseServer",
     "MotionLimits",
     "RobotContext",
@@ -40,6 +45,8 @@ _MODULES = {
     "Authority": "authority",
     "ControlSettings": "settings",
     "Enforcer": "enforcer",
+    "LeaseClient": "lease_client",
+    "LeaseHolder": "lease_holder",
     "LeaseServer": "lease_server",
     "MotionLimits": "motion_limits",
     "RobotContext": "context",

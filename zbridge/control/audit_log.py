@@ -1,15 +1,15 @@
 """The audit log: who acquired, released, was refused, stopped the robot, and why. JSON lines, rotated, never rewritten.
 
-What repeats itself is folded, so that noise neither fills the disk nor pushes out what happened before it:
+Repeated events are folded, so that a flood neither fills the disk nor rotates older lines away:
 
-- The same again (event, who, command, reason) is a line, then one a second with its count.
-- An actor that varies what it does has :data:`BURST` lines for each kind of event, then its share of one a second; all
-  else it does is counted together, as ``others``. So is what strangers do while :data:`ACTORS` others are at it: an
-  actor may take any name. Each kind of event has budgets of its own, so that no flood of one hides another.
-- Counts have a budget too (:data:`COUNTS`); where it is used up, they go on and are written later. None is lost.
+- The first of equal events (kind, who, command, reason) is a line; the others are one line a second with their count.
+- An actor whose events differ has :data:`BURST` lines for each kind of event, then a share of one line a second. The
+  rest of its events is counted together, as ``others``. Beyond :data:`ACTORS` actors at a time, new ones share one
+  budget, because an actor may take any name. Each kind of event has its own budgets: no flood hides another kind.
+- Lines with counts have a budget too (:data:`COUNTS`); when it is used up, counting goes on and is written later.
 
-Lines are written by a thread of their own: a disk that stands still delays no stop. What cannot be written waits, and
-people are told so.
+A thread of its own writes the lines: a disk that hangs delays no stop. Lines that cannot be written wait, and the
+gateway's status says so.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from zbridge.text import as_json
 log = logging.getLogger("zbridge.control")
 
 CLOSE_S = 1.0
-"""Longest time the disk is given at the end, twice."""
+"""Longest wait for the disk at the end, seconds; it is waited for twice."""
 RETRY_S = 1.0
 """Seconds between two attempts to write what could not be written."""
 WAITING = 4096
-"""Lines that may wait for the disk; what is more is dropped and counted."""
+"""Lines that may wait for the disk; more are dropped and counted."""
 KINDS = 256
-"""Different events counted at a time; the rest is counted as others."""
+"""Different events that are counted separately at a time; more are counted as others."""
 ACTORS = 64
 """Actors that have a budget of their own at a time, for each kind of event."""
 BURST = 20.0
 """Lines of one kind of event that an actor has at once."""
 COUNTS = 200.0
-"""Lines with counts that may be written one a second; then there are :data:`COUNTS_HZ`."""
+"""Lines with counts that may be written at once; then :data:`COUNTS_HZ` a second."""
 COUNTS_HZ = 0.5
 LINES_HZ = 1.0
 """Lines a second of one kind of event that its actors share when their bursts are used up."""
 MOST = 20
-"""How many times ``audit_files`` there are at most, however young."""
+"""The most files there are, as a multiple of ``audit_files``, however young they are."""
 OTHERS = "others"
 _DAY_S = 86_400.0
 _MAY_PASS = (errno.ENXIO, errno.ENOSPC, errno.EDQUOT, errno.EIO)
@@ -69,7 +69,7 @@ class _Folded(msgspec.Struct):
 
 
 class Audit:
-    """Writes events by ``write`` and to the gateway's log. Call :meth:`flush` about once a second."""
+    """Writes events by ``write`` and to the gateway's log; :meth:`flush` must be called about once a second."""
 
     def __init__(self, robot: str, write: Callable[[str], None], clock_ns: Callable[[], int] = time.time_ns) -> None:
         self._robot = robot
@@ -84,7 +84,7 @@ class Audit:
         return f"<Audit {self._robot}>"
 
     def write(self, event: Event) -> None:
-        """Write one event: now, or counted with a later :meth:`flush` where it is one of many."""
+        """Write one event, or count it for the next :meth:`flush` if it repeats itself or comes too often."""
         kind = (event.what, event.who, event.command, event.reason, event.stops)
         folded = self._folded.get(kind)
         if folded is not None:
@@ -98,7 +98,7 @@ class Audit:
             self._folded.setdefault((event.what, who, None, OTHERS, event.stops), _Folded(others)).count += 1
 
     def flush(self) -> None:
-        """Write the counts of repeated events since the last call, and refill the budgets."""
+        """Write what was counted since the last call, and refill the budgets."""
         self._counts = min(COUNTS, self._counts + COUNTS_HZ)
         for what, budgets in self._budgets.items():
             share = LINES_HZ / (len(budgets) + 1)
@@ -113,7 +113,7 @@ class Audit:
                 self._counts -= 1
                 self._line(folded.event, folded.count)
                 written[kind] = _Folded(folded.event)
-        self._folded = waiting | written  # those that had to wait come first the next time
+        self._folded = waiting | written  # those that had to wait are first the next time
 
     def close(self) -> None:
         """Write all that was counted."""
@@ -121,7 +121,7 @@ class Audit:
         self.flush()
 
     def _affords(self, event: Event) -> bool:
-        """Tell whether the actor may have another line; if so, take it off the budget."""
+        """Return whether the actor may have another line, and take it off its budget."""
         budgets = self._budgets[event.what]
         left = budgets.get(event.who, BURST)
         if event.who not in budgets and len(budgets) >= ACTORS:
@@ -149,9 +149,9 @@ class Audit:
 
 
 class AuditFile:
-    """A file to which a thread appends lines; see :class:`_Appended` for its rotation.
+    """Appends lines to a file by a thread; see :class:`_Appended` for its rotation.
 
-    tell: called on that thread with the reason when lines cannot be written, and with None when they can again.
+    ``tell`` is called on that thread with the reason when lines cannot be written, and with None when they can again.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class AuditFile:
         self._writer.start()
 
     def write(self, line: str) -> None:
-        """Queue a line; drop and count it where the queue is full."""
+        """Append a line soon; drop and count it if too many wait."""
         try:
             self._lines.put_nowait(line.encode() + b"\n")
         except queue.Full:
@@ -216,7 +216,7 @@ class AuditFile:
         self._file.close()
 
     def _insist(self, do: Callable[[], None]) -> bool:
-        """Try until it is done, once only while the gateway ends. Return whether it was done."""
+        """Try until it succeeds, at the end of the gateway only once; return whether it did."""
         while True:
             try:
                 do()
@@ -244,12 +244,12 @@ class AuditFile:
 
 
 class _Appended:
-    """The file in use, and older ones besides it, ``.1`` the youngest.
+    """The file in use, and older files beside it; ``.1`` is the youngest of them.
 
-    At ``file_bytes`` it becomes an older one. Of those the oldest is dropped when there are more than ``files`` and it
-    is older than ``days``, or when there are :data:`MOST` times as many.
+    A file that reaches ``file_bytes`` becomes an older file. The oldest is deleted when there are more than ``files``
+    and it is older than ``days``, or when there are :data:`MOST` times as many.
 
-    ``take`` gives it a line, ``write`` writes it, or the rest of it, and raises OSError where that is not possible now.
+    After :meth:`take`, call :meth:`write` until it raises no OSError.
     """
 
     def __init__(self, path: Path, *, file_bytes: int, files: int, days: float) -> None:
@@ -262,7 +262,7 @@ class _Appended:
         self._line = self._rest = b""
 
     def open(self) -> None:
-        """Open the file, if it is not open; never waits, not even for the reader of a pipe."""
+        """Open the file if it is not open; do not wait, not even for the reader of a pipe."""
         if self._descriptor is None:
             descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK, 0o666)
             os.set_blocking(descriptor, True)
@@ -270,11 +270,11 @@ class _Appended:
             self._rotates = stat.S_ISREG(os.fstat(descriptor).st_mode)
 
     def take(self, line: bytes) -> None:
-        """Set the line that :meth:`write` writes."""
+        """Set the line to write next."""
         self._line = self._rest = line
 
     def write(self) -> None:
-        """Write the line, or the rest of it; raise OSError where that is not possible now."""
+        """Write the line, or the rest of it; raise OSError if that is not possible now."""
         try:
             self.open()
             if self._rest is self._line:

@@ -134,7 +134,9 @@ class Authority:
             self._autonomous = False
             return
         (parts.add if moving else parts.discard)(part)
-        self._handle(Input.MOTION if parts else Input.NEUTRAL, now)
+        action, after = self.TABLE[self._state][_MOTION if parts else _NEUTRAL]
+        action(self, now)
+        self._state = after or self._state
 
     def mode_chosen(self, *, autonomous: bool) -> None:
         """Record that the robot was told the holder's choice of its mode."""
@@ -209,8 +211,6 @@ class Authority:
             expires_in_s=self._expires_in_s(now),
             refusals=self._refusals.shown(),
         )
-
-    # The machine
 
     def _handle(self, said: Input, *arguments: object, **options: object) -> Lease | None:
         """Carry out the table: the action, then the next state. Ignore an input that the state has no entry for."""
@@ -336,4 +336,5 @@ class Authority:
     """What to do with an input, and the state after it; None: the state stays."""
 
 
+_MOTION, _NEUTRAL = Input.MOTION, Input.NEUTRAL  # looking up a member of an enum costs more than a command may
 _SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}

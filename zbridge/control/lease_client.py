@@ -3,31 +3,32 @@
 Theory of operation. The machine is :attr:`LeaseClient.TABLE`, ``{state: {input: (action, next state)}}``;
 ``docs/control.md`` shows the same table, and a test compares both. A pair that the table lacks changes nothing.
 
-FREE: no lease. ASKING: the question for one is on its way; DROPPED: so it is, but the lease is not wanted any more;
-RECALLED: it was dropped and is wanted again. PAUSED: the gateway could not answer, the question is repeated soon. HELD:
-commands may be sent. CHECKING: a renewal is on its way; DOUBTED: so it is, and news that came since need another one.
-RETURNING: the lease is being given back; WANTED: so it is, and is wanted again. Commands may be sent in HELD, CHECKING
-and DOUBTED.
+States. FREE: no lease and no question. ASKING: an ``acquire`` awaits its answer. PAUSED: the gateway could not answer;
+the question is repeated soon. DROPPED: an ``acquire`` awaits its answer, but the program no longer wants the lease.
+RECALLED: as DROPPED, but the program wants the lease again. HELD: the lease is held. CHECKING: the lease is held and a
+``renew`` awaits its answer. DOUBTED: as CHECKING, and news since then demand another ``renew``. RETURNING: a
+``release`` awaits its answer. WANTED: as RETURNING, and the program wants the lease again. Commands may be sent in
+HELD, CHECKING and DOUBTED.
 
-Whoever drives it calls :meth:`want`, :meth:`drop`, :meth:`look` for news from ``control``, :meth:`gateway_lost`, and
-:meth:`expire` at :meth:`deadline`; after each of them asks :meth:`question` and takes :meth:`events`; and hands what
-was replied to :meth:`answered`, with ``now``. :class:`zbridge.control.lease_holder.LeaseHolder` does so on a bus.
+Who calls what. The caller (:class:`zbridge.control.lease_holder.LeaseHolder` on a bus) calls :meth:`want` and
+:meth:`drop` for the program, :meth:`look` for news from ``control``, :meth:`gateway_lost`, and :meth:`expire` at
+:meth:`deadline`. After each call it must ask :meth:`question` and handle :meth:`events`, and must pass the replies to
+:meth:`answered`.
 
-Guarantees. At most one question is waited for. A reply to an earlier question changes nothing. A lease that is granted
-after it was dropped is given back. Every lease that ends without :meth:`drop` ends with one LOST event.
+Guarantees. At most one question is awaited. A reply to an earlier question changes nothing. A lease that is granted
+after :meth:`drop` is released. A lease that ends without :meth:`drop` causes exactly one LOST event.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from enum import StrEnum
 from typing import ClassVar, TypeAlias
 
 import msgspec
 
 from zbridge.bus import Answer
-from zbridge.control.lease_replies import LeaseEvent, LeaseEventKind, Reply, code_of, passes, read
+from zbridge.control.lease_events import Input, LeaseEvent, LeaseEventKind, Reply, State, code_of, passes, read
 from zbridge.control.proof import Signer
 from zbridge.control.refusal_news import RefusalNews
 from zbridge.errors import BusError, Code, PayloadError
@@ -44,40 +45,8 @@ LEASE_S = 3.0
 """The length of a lease that does not tell its own, seconds."""
 
 
-class State(StrEnum):
-    """What a program has, and what it waits for."""
-
-    FREE = "free"
-    ASKING = "asking"
-    DROPPED = "dropped"
-    RECALLED = "recalled"
-    PAUSED = "paused"
-    HELD = "held"
-    CHECKING = "checking"
-    DOUBTED = "doubted"
-    RETURNING = "returning"
-    WANTED = "wanted"
-
-
-class Input(StrEnum):
-    """What the program wants, what was replied, and what is heard."""
-
-    WANT = "want"
-    DROP = "drop"
-    GRANTED = "granted"
-    DENIED = "denied"
-    LATER = "ask later"
-    CONFIRMED = "confirmed"
-    UNANSWERED = "unanswered"
-    ENDED = "ended"
-    RETURNED = "returned"
-    DOUBT = "doubt"
-    DUE = "due"
-    GATEWAY_LOST = "gateway lost"
-
-
 class Question(msgspec.Struct, frozen=True):
-    """A query about the lease, to be asked at once. returns: only after all commands before it are with the bus."""
+    """A query to send. returns: whether it releases the lease; then all earlier commands must be flushed first."""
 
     key: str
     payload: bytes
@@ -90,11 +59,11 @@ Row: TypeAlias = dict[Input, tuple[Callable[..., None], State]]
 
 
 class LeaseClient:
-    """The lease of one robot for one program. name: the one it is asked for in, with which ``request.who`` begins.
+    """The lease of one robot for one program.
 
-    wait_s: for how many seconds a gateway that does not answer is asked again; then also, a lease is lost only by its
-    gateway's word or at its expiry. None: whatever is no grant is a denial, whatever is no confirmation a loss.
-    concerns: whether a refusal is news to this program.
+    name: the name in the key of the question; ``request.who`` begins with it. concerns: whether a refusal is this
+    program's. wait_s: seconds for which a gateway that does not answer is asked again; a held lease then ends only if
+    the gateway says so, or at its expiry. None: a missing answer denies the lease, or ends it.
     """
 
     def __init__(
@@ -153,7 +122,7 @@ class LeaseClient:
         self._handle(Input.WANT, now)
 
     def drop(self, now: float) -> None:
-        """Give the lease back, or give up asking for it."""
+        """Release the lease, or stop asking for it."""
         self._handle(Input.DROP, now)
 
     # What is heard

@@ -9,7 +9,7 @@ from typing import Any
 
 from zbridge.bus import Bus, Handle
 from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_replies import LeaseEvent
+from zbridge.control.lease_events import LeaseEvent
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
 
@@ -60,7 +60,7 @@ class LeaseHolder:
         self._settle()
 
     def drop(self) -> None:
-        """Give the lease back, or give up asking for it. No event follows."""
+        """Release the lease, or stop asking for it. No event follows."""
         self.client.drop(self._clock())
         self._settle()
 

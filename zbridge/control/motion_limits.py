@@ -1,4 +1,4 @@
-"""Limits on motion that the robot's owner sets: how often drives may come, and how fast they may change. Sans-IO."""
+"""Limits on motion that the configuration sets: drives a second, and how fast a drive may change. Sans-IO."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from zbridge.errors import TooFast
 from zbridge.fleet.messages import Drive
 
 STEP_S = 0.25
-"""Longest time since the last command that a change is computed for, seconds."""
+"""The longest time between two drives that counts for their change, seconds."""
 _BURST = 2.0
-"""Commands that may come at once, above the rate."""
+"""Drives that may come at once."""
 
 
 class MotionLimits:
-    """Limits the rate and the change of drives. Neutral is never refused, and slowing down is never limited.
+    """rate_hz: commands a second; slew_per_s: change of each part of a drive a second, in full scales.
 
-    rate_hz: commands a second. slew_per_s: change of each part of a drive, full scales a second. Infinite: no limit.
+    Infinite: no limit. Neutral is never refused, and slowing down is not limited.
     """
 
     def __init__(self, rate_hz: float = math.inf, slew_per_s: float = math.inf) -> None:
@@ -30,7 +30,7 @@ class MotionLimits:
         self._counted_at = -math.inf
 
     def limit(self, drive: Drive, now: float) -> Drive:
-        """Return the drive that may be sent now; raise TooFast where commands come too fast."""
+        """Return the drive that may be sent now; raise TooFast if drives come too fast."""
         if not drive.moving:
             return drive
         if self.rate_hz < math.inf:
@@ -47,11 +47,11 @@ class MotionLimits:
         )
 
     def sent(self, drive: Drive, now: float) -> None:
-        """Note what the robot was told."""
+        """Record the drive that the robot was sent."""
         self._last, self._last_at = drive, now
 
     def stands(self) -> None:
-        """Note that the robot is at rest, whatever it was told last."""
+        """Record that the robot is at rest, whatever it was sent last."""
         self._last = Drive()
 
     def _count(self, now: float) -> None:
@@ -63,7 +63,7 @@ class MotionLimits:
 
 
 def _towards(last: float, wanted: float, step: float) -> float:
-    """Return ``last`` moved towards ``wanted`` by ``step`` at most; towards zero at once."""
+    """Return the value on the way from ``last`` to ``wanted``, ``step`` away at most; towards zero without limit."""
     start = last if last * wanted > 0 else 0.0
     if abs(wanted) <= abs(start):
         return wanted

@@ -1,12 +1,14 @@
-"""Proofs: what shows that a command, or a question about the lease, comes from the holder as it is. Sans-IO.
+"""Proofs: they show that a command, or a question about the lease, comes unaltered from the holder. Sans-IO.
 
-The token of a lease is told once, in the answer that grants it. What the holder sends afterwards carries the lease's
-public id, a number that rises, and a proof: the first 16 bytes of HMAC-SHA256(token, key + 0x00 + number as 8 bytes
-big-endian + payload). Whoever overhears it can neither forge nor alter it, nor use it for another key, and the
-gateway takes each number once. Commands are numbered apart from questions, whose payload is empty in the proof.
+The token of a lease is sent once, in the answer that grants it. Each command and question of the holder carries the
+lease's public id, a number that rises, and a proof: the first 16 bytes of HMAC-SHA256(token, key + 0x00 + number as 8
+bytes big-endian + payload). Who overhears it can neither forge nor alter it, nor use it for another key, and the
+gateway accepts each number once. Commands and questions are numbered separately; the proof of a question covers an
+empty payload.
 
-:class:`Signer` is the holder's end. :class:`Verifier` is the gateway's. It keeps no numbers. The bus's thread proves a
-command and leaves a note of it; the event loop's takes the note, so that each proof is reckoned once.
+:class:`Signer` is the holder's end. :class:`Verifier` and :class:`Holders` are the gateway's: the first checks proofs,
+the second also numbers. The bus's thread verifies a command and leaves a note in the verifier; the event loop's thread
+takes the note, so that each proof is computed once.
 Source: the design's "Who may drive".
 """
 
@@ -26,18 +28,18 @@ LEASE_BYTES = 8
 TOKEN_BYTES = 32
 PROOF_BYTES = 16
 NOTES = 1024
-"""Proven commands that may wait for the event loop; where there are more, their proofs are reckoned again."""
+"""Verified commands that may wait for the event loop; the proofs of more are computed twice."""
 ENDED = 16
 """Ended leases that are remembered: their holders are told why, and their ids are not given again."""
 LEAST_BYTES, MOST_BYTES = 46, 128
-"""Bytes of an authorization: as short as MessagePack can write it, and with room for those who write it longer."""
+"""Bytes of an authorization: the shortest MessagePack form, and room for longer forms."""
 
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Authorization).decode
 
 
 class Signer:
-    """Numbers and proves what the holder of one lease sends. Raises PayloadError where the lease was not granted."""
+    """Numbers and proves what the holder of one lease sends. Raises PayloadError if the lease was not granted."""
 
     def __init__(self, lease: Lease) -> None:
         if lease.lease is None or lease.token is None:
@@ -51,12 +53,12 @@ class Signer:
         return f"<Signer of {self.lease.hex()}>"
 
     def command(self, key: str, payload: bytes) -> bytes:
-        """Give the attachment of the next command. key: the one it is put on, without wildcards."""
+        """Return the attachment of the next command. key: the key it is put on, without wildcards."""
         self._commands += 1
         return self._sign(key, self._commands, payload)
 
     def question(self, key: str) -> bytes:
-        """Give the payload of the next question: ``renew`` or ``release``."""
+        """Return the payload of the next question, ``renew`` or ``release``."""
         self._questions += 1
         return self._sign(key, self._questions, b"")
 
@@ -65,7 +67,7 @@ class Signer:
 
 
 class Verifier:
-    """Tells what the holder of one lease sent from what anybody else did."""
+    """Verifies what the holder of one lease sends; keeps no numbers."""
 
     def __init__(self, lease: bytes, token: bytes) -> None:
         self.lease = lease
@@ -76,21 +78,21 @@ class Verifier:
         return f"<Verifier of {self.lease.hex()}>"
 
     def plausible(self, shown: bytes | None) -> bool:
-        """Tell by the cheapest look there is whether this can be an authorization of this lease."""
+        """Return whether this can be an authorization of this lease, without decoding it."""
         return shown is not None and LEAST_BYTES <= len(shown) <= MOST_BYTES and self.lease in shown
 
     def proves(self, shown: Authorization, key: str, payload: bytes = b"") -> bool:
-        """Tell whether the proof is the holder's, for this key and this payload; its number is looked at by others."""
+        """Return whether the proof is the holder's, for this key and payload. The caller must check the number."""
         return hmac.compare_digest(_proof(self._prepared, key, shown.seq, payload), shown.proof)
 
     def note(self, attachment: bytes, shown: Authorization, key: str, payload: bytes) -> None:
-        """Keep that this command was proven, until :meth:`noted` is asked for it; any one thread may call it."""
+        """Record that this command was verified, until :meth:`noted` is asked for it. One thread may call this."""
         if len(self._notes) >= NOTES:
             self._notes.clear()
         self._notes[attachment] = (shown, key, payload)
 
     def noted(self, attachment: bytes, key: str, payload: bytes) -> Authorization | None:
-        """Give the authorization of a command that was proven as it is here; None once it was asked for."""
+        """Return the authorization of a command that was verified with this key and payload, once; else None."""
         note = self._notes.pop(attachment, None)
         return note[0] if note is not None and note[1:] == (key, payload) else None
 
@@ -199,7 +201,7 @@ def _use_up(kind: str, seq: int, holder: Holder) -> Holder:
 
 
 def _prepare(token: bytes) -> hmac.HMAC:
-    """Do once what depends on the token alone: copying it is cheaper than making it."""
+    """Do what depends on the token alone: copying it is cheaper than making it anew."""
     return hmac.new(token, digestmod=hashlib.sha256)
 
 

@@ -1,4 +1,4 @@
-"""The settings of control authority (``[control]``)."""
+"""The ``[control]`` table of a configuration."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ LEAST_IDLE_STOP_S = 0.1
 
 
 class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[control]``: the most a holder may ask for in seconds, limits on motion, and the audit log.
+    """The most that a holder may ask for (seconds), limits on motion, and the audit log.
 
     rate_hz: drives a second that are carried out. slew_per_s: change of each part of a drive, full scales a second.
-    idle_stop_s: seconds between two stops while nobody drives; 0: only when motion ends.
-    audit: the file of the audit log. It is rotated at ``audit_bytes``; ``audit_files`` older files are kept, and any
-    that are younger than ``audit_days``.
+    idle_stop_s: seconds between two stops while nobody drives; 0: a stop is sent only when motion ends.
+    audit: the file of the audit log, rotated at ``audit_bytes``; ``audit_files`` older files are kept, and more of them
+    while they are younger than ``audit_days``.
     """
 
     lease_s: Seconds = 3.0
@@ -31,6 +31,6 @@ class ControlSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     audit_days: Annotated[float, msgspec.Meta(ge=0)] = 30.0
 
     def __post_init__(self) -> None:
-        """Raise ValueError for stops more frequent than robots can take."""
+        """Raise ValueError if stops would come more often than robots can take."""
         if 0 < self.idle_stop_s < LEAST_IDLE_STOP_S:
             raise ValueError(f"idle_stop_s: expected 0, or at least {LEAST_IDLE_STOP_S:g}")

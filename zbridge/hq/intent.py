@@ -98,17 +98,17 @@ class Intent:
     @property
     def held(self) -> bool:
         """Whether the lease is held."""
-        return self._state in (State.HOLDING, State.HOLDING_OWES)
+        return self._state in _HOLDING
 
     @property
     def asking(self) -> bool:
         """Whether the lease was asked for and the answer is awaited."""
-        return self._state in (State.ASKING, State.ASKING_OWES)
+        return self._state in _ASKING
 
     @property
     def may_steer(self) -> bool:
         """Whether wheels may be set: the lease is held and no neutral is owed."""
-        return self._state is State.HOLDING
+        return self._state in _HOLDING and self.held_back is None
 
     # What the program says
 
@@ -126,7 +126,7 @@ class Intent:
             self.refused(_MODE_NONE)
             self._modeless_at = now
             raise LeaseLost(_MODE_NONE, Code.NO_LEASE)
-        action = self._handle(Input.MOTION)
+        action = self._handle(_MOTION)
         self._used_at = now
         if lasts:
             self._moved_at, self._moving = now, True
@@ -143,7 +143,7 @@ class Intent:
         if self.mode == "autonomous" and self.held_back is None and not self._moving:
             return Action.NOTHING
         self.held_back, self._moving = None, False
-        return self._handle(Input.NEUTRAL)
+        return self._handle(_NEUTRAL)
 
     def choose(self, mode: str, now: float) -> Action:
         """Take a control mode; ``autonomous`` counts as motion, ``none`` releases the robot."""
@@ -198,8 +198,11 @@ class Intent:
 
     def _handle(self, said: Input) -> Action:
         """Carry out the table; raise NeutralFirst if its action is to refuse. A missing pair changes nothing."""
-        action, self._state = self.TABLE[self._state].get(said, (Action.NOTHING, self._state))
-        if action is Action.REFUSE:
+        entry = self.TABLE[self._state].get(said)
+        if entry is None:
+            return _NOTHING
+        action, self._state = entry
+        if action is _REFUSE:
             raise NeutralFirst(f"{self.held_back}: release the stick first")
         return action
 
@@ -268,4 +271,9 @@ class Intent:
     }
 
 
+_HOLDING = frozenset({State.HOLDING, State.HOLDING_OWES})
+_ASKING = frozenset({State.ASKING, State.ASKING_OWES})
+# Looking up a member of an enum costs more than the rest of a command:
+_MOTION, _NEUTRAL = Input.MOTION, Input.NEUTRAL
+_NOTHING, _REFUSE = Action.NOTHING, Action.REFUSE
 _CHOSEN = {"none": Input.NONE, "manual": Input.MANUAL, "autonomous": Input.AUTONOMOUS}

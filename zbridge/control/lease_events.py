@@ -1,4 +1,4 @@
-"""What questions about a lease come to: replies as they are read, and the events that come of them. Sans-IO."""
+"""The lease client's states and inputs, the replies to its questions, and the events that come of them. Sans-IO."""
 
 from __future__ import annotations
 
@@ -19,6 +19,38 @@ Reply: TypeAlias = Lease | ZbridgeError | None
 NO_ANSWER = "no gateway answers"
 _PASSING: tuple[str, ...] = (*NotReady.codes, *TooFast.codes)
 """Codes that do not decide whose the lease is."""
+
+
+class State(StrEnum):
+    """What a program has, and what it waits for."""
+
+    FREE = "free"
+    ASKING = "asking"
+    DROPPED = "dropped"
+    RECALLED = "recalled"
+    PAUSED = "paused"
+    HELD = "held"
+    CHECKING = "checking"
+    DOUBTED = "doubted"
+    RETURNING = "returning"
+    WANTED = "wanted"
+
+
+class Input(StrEnum):
+    """What the program wants, what was replied, and what is heard."""
+
+    WANT = "want"
+    DROP = "drop"
+    GRANTED = "granted"
+    DENIED = "denied"
+    LATER = "ask later"
+    CONFIRMED = "confirmed"
+    UNANSWERED = "unanswered"
+    ENDED = "ended"
+    RETURNED = "returned"
+    DOUBT = "doubt"
+    DUE = "due"
+    GATEWAY_LOST = "gateway lost"
 
 
 class LeaseEventKind(StrEnum):

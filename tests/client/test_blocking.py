@@ -354,14 +354,6 @@ def test_the_lease_is_held_while_the_context_lasts(fleet: blocking.Fleet, world:
     assert [shown.seq for shown in world.gateway.attachments] == list(range(1, len(world.gateway.attachments) + 1))
 
 
-def test_an_idle_program_keeps_its_lease(fleet: blocking.Fleet, world: World) -> None:
-    with fleet["r1"].control(ME, lease_s=0.15) as drive:
-        time.sleep(0.5)
-        drive(forward=0.5)
-        assert drive.loss is None
-        assert world.gateway.control.holder == ME
-
-
 def test_held_bad_wishes_and_no_gateway_come_through(fleet: blocking.Fleet) -> None:
     robot = fleet["r1"]
     with robot.control(ME):

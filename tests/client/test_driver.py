@@ -19,7 +19,7 @@ import pytest
 from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
 from tests.proofs import lease, proof
 from zbridge.bus import Answer, Handle, IncomingQuery, Publisher, Sample
-from zbridge.bus.fake import FakeBus, FakeQuery
+from zbridge.bus.fake import FakeBus
 from zbridge.client import Driver, Fleet, Robot
 from zbridge.client.driver import RETRY_S, default_who
 from zbridge.errors import (
@@ -190,26 +190,6 @@ async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[s
     assert world.loop.time() - asked_at == pytest.approx(wait_s, abs=2 * RETRY_S)
     assert tokens(world.bus) == []
     assert subscriptions(world.bus, "fleet/r1/control") == 0
-
-
-async def test_a_gateway_that_cannot_say_is_asked_again_and_what_it_says_is_told() -> None:
-    world = World()
-    world.gateway.leases.refuse_all("gateway stopped")
-    asked_at = world.loop.time()
-    with pytest.raises(NotReady, match=r"^r1: gateway stopped$") as refused:
-        await world.robot.control(ME).__aenter__()
-    assert refused.value.code is Code.CLOSING
-    assert world.loop.time() - asked_at == pytest.approx(5.0, abs=2 * RETRY_S)
-    world.loop.call_later(1.0, setattr, world.gateway.leases, "_closing", None)
-    async with world.robot.control(ME):
-        assert world.gateway.control.holder == ME
-
-
-async def test_a_program_that_does_not_wait_asks_once() -> None:
-    world = World()
-    async with world.robot.control(ME, wait_s=0.0):
-        assert world.gateway.control.holder == ME
-    assert len(world.gateway.questions("acquire")) == 1
 
 
 async def test_held_names_the_holder_at_once() -> None:
@@ -430,37 +410,6 @@ async def test_commands_of_a_new_lease_are_taken_although_they_count_anew() -> N
 # Keeping the lease
 
 
-async def test_an_idle_program_keeps_its_lease() -> None:
-    async with driving() as (world, drive):
-        least_s = math.inf
-        for _ in range(600):
-            await asyncio.sleep(0.1)
-            left_s = world.gateway.control.expires_in_s
-            assert left_s is not None, "the lease has ended"
-            least_s = min(least_s, left_s)
-        assert least_s >= LEASE_S / 2, "renewed with time to spare for a lost answer"
-        assert drive.loss is None
-        assert 50 <= len(world.gateway.questions("renew")) <= 70
-
-
-async def test_a_short_lease_is_renewed_more_often() -> None:
-    async with driving(lease_s=0.3) as (world, drive):
-        await asyncio.sleep(10.0)
-        assert drive.loss is None
-        assert world.gateway.control.state == "held"
-
-
-async def test_one_answer_that_does_not_come_costs_nothing() -> None:
-    async with driving() as (world, drive):
-        world.gateway.leases.refuse_all("not now")
-        await asyncio.sleep(LEASE_S / 2)
-        assert world.gateway.questions("renew")
-        world.gateway.leases._closing = None
-        await asyncio.sleep(2 * LEASE_S)
-        assert drive.loss is None
-        assert world.gateway.control.state == "held"
-
-
 async def test_a_malformed_answer_does_not_end_the_renewals() -> None:
     async with driving() as (world, drive):
         nonsense = world.garble(topics.RPC_RENEW)
@@ -525,12 +474,6 @@ async def test_a_higher_priority_is_given_the_robot_and_named() -> None:
         assert "held by bob@there" in await lost(world, drive, 0.1)
 
 
-async def test_a_takeover_by_a_program_of_the_same_name_is_noticed_as_soon() -> None:
-    async with driving() as (world, drive), world.others.control(ME, takeover=True) as other:
-        assert "taken over by ann@here" in await lost(world, drive, 0.1)
-        assert other.loss is None
-
-
 async def test_a_takeover_by_a_program_of_the_same_name_is_a_loss_and_no_refusal() -> None:
     async with driving() as (world, drive), world.others.control(ME, takeover=True):
         with pytest.raises(LeaseLost):
@@ -546,13 +489,6 @@ async def test_the_refusals_of_a_program_of_the_same_name_that_lost_its_lease_ar
         assert world.gateway.driven == [Drive(forward=0.25)]
 
 
-async def test_a_lease_that_ran_out_is_noticed() -> None:
-    async with driving() as (world, drive):
-        world.gateway.authority.expire(world.loop.time() + 10 * LEASE_S)
-        world.gateway.enforcer.settle()
-        assert await lost(world, drive, 0.1) == "r1: the lease has ended (lease expired)"
-
-
 async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_out() -> None:
     async with driving() as (world, drive):
         await asyncio.sleep(10.0)
@@ -565,16 +501,6 @@ async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_ou
             await drive(forward=0.5)
 
 
-async def test_a_gateway_that_starts_anew_knows_nothing_of_the_lease() -> None:
-    async with driving() as (world, drive):
-        await world.gateway.vanish()
-        again = Gateway(world.bus)
-        again.serve()
-        await asyncio.wait_for(drive.lost.wait(), LEASE_S)
-        assert "no lease: acquire first" in str(drive.loss)
-        assert again.driven == []
-
-
 async def test_what_others_do_to_control_is_no_loss() -> None:
     async with driving() as (world, drive):
         world.gateway.put(topics.CONTROL, b"\xc1")
@@ -583,26 +509,6 @@ async def test_what_others_do_to_control_is_no_loss() -> None:
         await asyncio.sleep(0.1)
         assert drive.loss is None, "the gateway was asked, and it knows better"
         assert 1 <= len(world.gateway.questions("renew")) <= 3
-        await drive(forward=0.5)
-        assert len(world.gateway.driven) == 1
-
-
-async def test_whoever_repeats_our_question_before_it_arrives_takes_no_lease() -> None:
-    async with driving() as (world, drive):
-        heard: list[bytes] = []
-
-        def repeat(question: IncomingQuery) -> None:
-            if question.payload not in heard:
-                heard.append(question.payload)
-                world.gateway.answer_first(FakeQuery(question.key, question.payload))
-
-        world.bus.answer("fleet/r1/@rpc/control/renew", repeat)
-        queryables = world.bus._shared.queryables
-        queryables.insert(0, queryables.pop())
-        await asyncio.sleep(3 * LEASE_S)
-        assert len(heard) >= 3
-        assert {refusal.code for refusal in world.gateway.control.refusals} == {"out_of_order"}
-        assert drive.loss is None
         await drive(forward=0.5)
         assert len(world.gateway.driven) == 1
 
@@ -683,18 +589,6 @@ async def test_a_refusal_is_raised_by_the_next_command(command: Command) -> None
             await command(drive)
         assert not isinstance(raised.value, LeaseLost)
         assert drive.loss is None
-
-
-async def test_a_refusal_is_raised_once_and_again_when_it_happens_again() -> None:
-    async with driving() as (world, drive):
-        for _ in range(3):
-            await world.refused(drive)
-            with pytest.raises(Refused, match=REFUSED):
-                await drive()
-            await asyncio.sleep(1.0)
-            world.gateway.enforcer.beat()
-            await drive()
-            await drive()
 
 
 async def test_a_refusal_that_others_pushed_out_of_sight_is_raised_when_it_happens_again() -> None:

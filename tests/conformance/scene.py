@@ -145,6 +145,10 @@ class Scene:
         events = self.judge.events
         await until(lambda: any(words in event for event in events), lambda: f"{words!r} is not among {events}")
 
+    async def told(self, events: str) -> None:
+        """So many events, and no more."""
+        assert len(self.judge.events) == int(events), self.judge.events
+
     async def ok(self, _: str) -> None:
         assert self.judge.violations == []
         assert self.judge.alive
@@ -188,6 +192,11 @@ class Scene:
         self._former.append(self.peer)
         self.peer = Peer(self.peer.port)
         await self.peer.connect()
+
+    async def back(self, _: str) -> None:
+        """Go on with the connection before."""
+        self._former.append(self.peer)
+        self.peer = self._former[0]
 
     async def close(self, _: str) -> None:
         self.peer.close()

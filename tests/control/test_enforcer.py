@@ -73,9 +73,7 @@ async def limited() -> Any:
     made.enforcer.close()
 
 
-async def test_keeping_time_before_the_deadline_asks_nothing_of_the_authority(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_keeping_time_before_the_deadline_asks_nothing_of_the_authority(rig, monkeypatch) -> None:
     rig.drive()
     monkeypatch.setattr(rig.authority, "expire", pytest.fail)
     rig.now += DEADMAN_S - 0.01

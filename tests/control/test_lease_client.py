@@ -113,9 +113,7 @@ def test_a_lease_that_was_granted_proves_commands_with_rising_numbers() -> None:
         (BusError("the bus is closed"), BusError, "the bus is closed"),
     ],
 )
-def test_a_client_that_does_not_wait_is_denied_by_whatever_is_no_grant(
-    replied: Any, kind: type[Exception], reason: str
-) -> None:
+def test_a_client_that_does_not_wait_is_denied_by_whatever_is_no_grant(replied, kind, reason) -> None:
     lease = client()
     lease.want(NOW)
     lease.answered(asked(lease, "acquire/ann"), replied, NOW)

@@ -112,9 +112,7 @@ async def test_a_bus_that_cannot_be_asked_denies_the_lease(monkeypatch: pytest.M
     assert [str(event.error) for event in scene.events] == ["the bus is closed"]
 
 
-async def test_a_lease_is_given_back_although_what_was_commanded_before_cannot_be_flushed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_lease_is_given_back_although_what_was_commanded_before_cannot_be_flushed(monkeypatch) -> None:
     scene = Scene()
 
     async def fails() -> None:

@@ -29,7 +29,7 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.tcpudp.conformance.parser import Feature
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e.conftest import Bench
-from tests.e2e.hq_robot import ROBOTS, fragile_robot
+from tests.e2e.fragile import fragile_robot
 from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener, playing, ports, soon
 
 LEASE_S = 1.2
@@ -42,6 +42,14 @@ IDLE_S = 0.3
 """Seconds between two neutrals of an external controller that idles."""
 RANGES = tuple(120.0 + degree / 2 for degree in range(360))
 """Simulated lidar data: centimetres, one a degree."""
+ROBOTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "tcpudp-1.1": ("tcpudp-1.1", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
+    "tcpudp-1.2": ("tcpudp-1.2", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
+    "tcpudp-1.3": ("tcpudp-1.3-udp", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
+    "alf": ("alf", {}),
+    "wc2ec": ("wc2ec-deployed", {}),
+}
+"""The fragile robots, and what they are told."""
 ALF_FULL = {"text": 255, "binary": 100}
 _BEARINGS = ", ".join(f"ds{number} = {45.0 * number}" for number in range(8))
 _TABLES = ", ".join(f"ds{number} = [[0.0, 0.0], [1000.0, 2.0]]" for number in range(8))
@@ -373,7 +381,7 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
     """Judge one robot: let each of ``drivers`` drive a moment, then ``driver`` for a time."""
     judgement = Judgement(robot, [*drivers])
     began = time.monotonic()
-    with fragile_robot(robot) as process:
+    with fragile_robot(ROBOTS[robot][0], **ROBOTS[robot][1]) as process:
         async with stage(robot, process) as on:
             await on.all_see()
             for name in judgement.drove:

@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import random
 import struct
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from tests.e2e.conftest import Bench, until
+from tests.e2e.fragile import ended, fragile_robot
 
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 PACE_S = 0.03
@@ -71,7 +70,7 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
     """Run one gateway against one fragile robot."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
-        robot = stack.enter_context(fragile_robot(version, udp=udp, seed=seed))
+        robot = stack.enter_context(fragile_robot(f"tcpudp-{version}{'-udp' * udp}", seed=seed))
         assert robot.stdout is not None
         bench.gateway("r1", int(robot.stdout.readline()))
         until(lambda: bench.fleet.state("r1") == "established", what="established")
@@ -84,25 +83,9 @@ def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement
         run.end()
         run.judgement.seconds = time.monotonic() - began
         run.judgement.late_s = bench.withheld_s - withheld_s
-        report = json.loads(robot.communicate("end\n", timeout=20)[0])
+        report = ended(robot)
     run.compare(report)
     return run.judgement
-
-
-@contextlib.contextmanager
-def fragile_robot(version: str, *, udp: bool = False, seed: int = 1, **options: Any) -> Any:
-    """Start a fragile robot as a process; its first line is its port."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.e2e.fragile_robot", version, str(int(udp)), str(seed), json.dumps(options)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 class _Run:
@@ -139,7 +122,7 @@ class _Run:
         judgement.alive = report["alive"]
         for text in report["violations"]:
             (judgement.excused if "(this process" in text else judgement.violations).append(text)
-        came = report["received"] + report["piled"]
+        came = [row[1:] for row in report["received"] + report["piled"]]
         arrived = Counter((packet_id, body) for _, packet_id, body in came)
         for packet_id, body in self._expected:
             if arrived[packet_id, body]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
 import time
 from typing import Any
 
 import pytest
 
 from tests.e2e.conftest import Bench, until
-from tests.e2e.judge import VERSIONS, fragile_robot, judge
+from tests.e2e.fragile import ended, fragile_robot
+from tests.e2e.judge import VERSIONS, judge
 
 
 @pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
@@ -30,17 +29,11 @@ def serve(bench: Bench, robot: Any) -> None:
     bench.fleet.hold("r1")
 
 
-def ended(robot: subprocess.Popen[str]) -> dict[str, Any]:
-    """End a fragile robot; give what it has to say."""
-    report: dict[str, Any] = json.loads(robot.communicate("end\n", timeout=20)[0])
-    return report
-
-
 @pytest.mark.parametrize(("version", "udp"), [("1.1", False), ("1.3", True)])
 def test_a_poor_second_connection_is_named_and_not_driven(bench: Bench, version: str, udp: bool) -> None:
     """It loses half of all packets in both directions and sends no telemetry; its client id is 3."""
     fleet = bench.fleet
-    with fragile_robot(version, udp=udp, client_id=2, again=True) as robot:
+    with fragile_robot(f"tcpudp-{version}{'-udp' * udp}", client_id=2, again=True) as robot:
         serve(bench, robot)
         fleet.put("r1/@cmd/drive", forward=0.5)
         until(lambda: len(fleet.seen.get("fleet/r1/pose", [])) > 1, 20, what="telemetry")
@@ -64,14 +57,14 @@ def test_a_poor_second_connection_is_named_and_not_driven(bench: Bench, version:
         report = ended(robot)
     assert not report["moving"], "of the stops enough arrived"
     assert report["alive"]
-    assert [body for _, packet_id, body in report["received"] if packet_id == 11 and body.endswith("6666663f")] == []
+    assert [body for _, _, packet_id, body in report["received"] if packet_id == 11 and body.endswith("6666663f")] == []
 
 
 @pytest.mark.parametrize("version", ["1.1", "1.2"])
 def test_a_lidar_mode_that_a_robot_misread_arrives_all_the_same(bench: Bench, version: str) -> None:
     """The robot misreads a third of them, in an order of its own, but none of these twice running."""
     fleet = bench.fleet
-    with fragile_robot(version, seed=20, misread=0.34, times={"unasked_s": 0}) as robot:
+    with fragile_robot(f"tcpudp-{version}", seed=20, misread=0.34, times={"unasked_s": 0}) as robot:
         serve(bench, robot)
         for number in range(8):
             on = number % 2 == 0
@@ -79,7 +72,7 @@ def test_a_lidar_mode_that_a_robot_misread_arrives_all_the_same(bench: Bench, ve
             until(lambda on=on: fleet.last("r1/lidar").get("on") is on, what=f"lidar {on}")
             time.sleep(0.4)
         report = ended(robot)
-    assert len([1 for _, packet_id, _ in report["misread"] if packet_id == 50]) == 6
+    assert len([1 for _, _, packet_id, _ in report["misread"] if packet_id == 50]) == 6
     assert report["violations"] == []
 
 
@@ -88,7 +81,7 @@ def test_a_lidar_mode_that_a_robot_misread_arrives_all_the_same(bench: Bench, ve
 def test_a_robot_that_moves_when_it_is_stopped_is_at_rest(bench: Bench, version: str, mode: str) -> None:
     """In mode 3 its own program drives, whatever 13 says."""
     fleet = bench.fleet
-    with fragile_robot(version) as robot:
+    with fragile_robot(f"tcpudp-{version}") as robot:
         serve(bench, robot)
         fleet.put("r1/@cmd/mode", mode=mode)
         if mode == "manual":
@@ -98,6 +91,6 @@ def test_a_robot_that_moves_when_it_is_stopped_is_at_rest(bench: Bench, version:
         time.sleep(0.5)
         report = ended(robot)
     assert not report["moving"]
-    modes = [body for _, packet_id, body in report["received"] if packet_id == 10]
+    modes = [body for _, _, packet_id, body in report["received"] if packet_id == 10]
     assert ("01000000" in modes) is (mode == "autonomous")
     assert report["violations"] == []

@@ -24,9 +24,9 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.captures import Record, payloads
 from tests.e2e.conftest import Bench
+from tests.e2e.fragile import fragile_robot
 from tests.e2e.hq_churn import CLIENTS, Churn, churn, crowd
 from tests.e2e.hq_judge import RANGES, judge, stage
-from tests.e2e.hq_robot import fragile_robot
 from tests.e2e.hq_scene import HOST, NEUTRAL, ByHand, device, gateway, listener, playing, ports, sessions, soon
 from tests.e2e.robots import SETTINGS, ScriptedRobot, position
 
@@ -58,7 +58,7 @@ async def test_programs_of_every_protocol_see_one_robot_and_drive_it_in_turn_and
 
 
 async def test_a_robot_that_asks_for_lidar_data_gets_that_of_a_program_and_the_bus_sees_it() -> None:
-    with fragile_robot("tcpudp-1.2") as process:
+    with fragile_robot("tcpudp-1.2", misnamed=0.0, times={"unasked_s": 0.05}) as process:
         async with stage("tcpudp-1.2", process) as on:
             await on.all_see()
             asked = {program.name: program.judge for program in on.programs if isinstance(program.judge, TcpHq)}

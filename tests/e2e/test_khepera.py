@@ -34,9 +34,7 @@ def run(environment: dict[str, str], *arguments: str) -> str:
     return ran.stdout
 
 
-def test_the_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(
-    environment: dict[str, str], tmp_path: Path
-) -> None:
+def test_the_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(environment, tmp_path) -> None:
     shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
     shutil.copy(EXAMPLE / "pyproject.toml", tmp_path)
     out = run(environment, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), str(tmp_path))

@@ -10,22 +10,18 @@ it anew after each stop. Of drives the newest wins, so a few that were overtaken
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
-import json
 import random
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gateways.wc2ec.conformance.fragile_robot import FragileController
 from tests.e2e.conftest import Bench, until
+from tests.e2e.fragile import ended, fragile_robot
 
 DIALECTS = ("deployed", "draft")
 PACE_S = 0.01
@@ -100,7 +96,7 @@ def judge(dialect: str, *, commands: int, seed: int = 1) -> Judgement:
     """Run one gateway against one fragile controller."""
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
-        robot = stack.enter_context(_robot(dialect, seed))
+        robot = stack.enter_context(fragile_robot(f"wc2ec-{dialect}", seed=seed, values=VALUES))
         assert robot.stdout is not None
         file = bench.folder / "r1.toml"
         file.write_text(
@@ -118,42 +114,9 @@ def judge(dialect: str, *, commands: int, seed: int = 1) -> Judgement:
             time.sleep(PACE_S)
         run.end()
         run.judgement.seconds = time.monotonic() - began
-        report = json.loads(robot.communicate("end\n", timeout=20)[0])
+        report = ended(robot)
     run.compare(report)
     return run.judgement
-
-
-@contextlib.contextmanager
-def _robot(dialect: str, seed: int) -> Iterator[subprocess.Popen[str]]:
-    """Run the fragile controller as a process of its own, so that nothing but the machine makes it late."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.e2e.wc2ec_judge", "--dialect", dialect, "--seed", str(seed), "--robot"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-async def _serve(dialect: str, seed: int) -> None:
-    """Be the robot: print the port; a line on stdin ends it, and it prints what came of it as one JSON object."""
-    controller = FragileController(dialect, seed=seed, values=VALUES)  # type: ignore[arg-type]
-    serving = asyncio.create_task(controller.serve("127.0.0.1", 0, lambda port: print(port, flush=True)))
-    await asyncio.to_thread(sys.stdin.readline)
-    ended = serving.done()
-    serving.cancel()
-    await asyncio.wait([serving])
-    report = {
-        "violations": controller.violations,
-        "events": controller.events,
-        "alive": controller.alive and not controller.stuck and not ended,
-        "received": [(command, number, value) for _, command, _, number, value in controller.received],
-    }
-    print(json.dumps(report))
 
 
 class _Run:
@@ -187,9 +150,9 @@ class _Run:
     def compare(self, report: dict[str, Any]) -> None:
         """Hold what arrived against what had to."""
         judgement = self.judgement
-        judgement.alive = report["alive"]
+        judgement.alive = report["alive"] and not report["left"]
         judgement.violations += report["violations"]
-        received = [(command, number, rounded(value)) for command, number, value in report["received"]]
+        received = [(command, number, rounded(value)) for _, command, _, number, value in report["received"]]
         judgement.arrived = len(received)
         arrived = Counter(received)
         for wanted, missing in ((self._expected, judgement.missing), (self._drives, judgement.overtaken)):
@@ -360,11 +323,7 @@ def main() -> None:
     parser.add_argument("--commands", type=int, default=2000)
     parser.add_argument("--dialect", choices=DIALECTS)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--robot", action="store_true", help=argparse.SUPPRESS)
     wanted = parser.parse_args()
-    if wanted.robot:
-        asyncio.run(_serve(wanted.dialect, wanted.seed))
-        return
     failed = False
     for dialect in [wanted.dialect] if wanted.dialect else DIALECTS:
         judgement = judge(dialect, commands=wanted.commands, seed=wanted.seed)

@@ -10,12 +10,11 @@ import msgspec
 import pytest
 
 from tests.proofs import numbered
-from zbridge.bus import Answer
-from zbridge.bus.fake import FakeBus, FakeQuery
+from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Handle, IncomingQuery, Sample
 from zbridge.control.authority import Authority
 from zbridge.control.proof import read
-from zbridge.errors import BusError, Code, NotReady, Refused
+from zbridge.errors import BusError, Code, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -23,7 +22,6 @@ from zbridge.fleet.messages import (
     Control,
     Drive,
     FleetMessage,
-    Lease,
     Mode,
     Motor,
     Raw,
@@ -46,7 +44,6 @@ DEADMAN_S = 1.25
 GO, STAND = Drive(forward=0.5), Drive()
 LEFT, RIGHT = topics.CMD_MOTOR("left"), topics.CMD_MOTOR("right")
 RAW = topics.CMD_RAW("toy")
-_HOLDERS = (topics.CMD_DRIVE.path, topics.CMD_MODE.path)
 
 
 class Gateway:
@@ -301,42 +298,6 @@ async def test_without_a_gateway_the_answer_is_no() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reply", "reason"),
-    [
-        (lambda question: question.refuse(NotReady("not now")), "not now"),
-        (lambda question: question.answer(b"\xc1"), "Lease: "),
-        (lambda question: question.answer(payloads.pack({"ok": True})), "Lease: granted without an id"),
-        (lambda question: None, "no gateway answers"),
-    ],
-)
-async def test_an_answer_that_is_none_is_a_no(reply: Any, reason: str) -> None:
-    scene = Scene()
-    scene.gateway.vanish()
-    scene.gateway.bus.answer(KEYS.key("@rpc/control/acquire/hq.toy"), reply)
-    operator = scene.operator()
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    (told,) = scene.told
-    assert told.startswith(f"not driving: {reason}")
-    assert not operator.active
-
-
-async def test_a_bus_that_cannot_be_asked_is_a_no(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = Scene()
-
-    async def fails(*args: Any, **kwargs: Any) -> list[Any]:
-        raise BusError("the bus is closed")
-
-    monkeypatch.setattr(scene.bus, "ask", fails)
-    operator = scene.operator()
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    assert scene.told == ["not driving: the bus is closed"]
-
-
-@pytest.mark.parametrize(
     ("status", "alive", "reason"),
     [
         (Status(state="offline", reason="no route", protocol="toy"), True, "robot offline: no route"),
@@ -387,17 +348,6 @@ async def test_commands_that_are_open_to_all_need_no_lease_and_no_neutral() -> N
     operator.command(topics.CMD_SENSOR("front"), SensorSetting(enable=True))
     assert [path for path, _ in scene.gateway.taken()] == ["stop", "lidar", "sensor/front"]
     assert scene.gateway.asked == []
-
-
-async def test_numbers_rise_with_every_command_of_a_lease() -> None:
-    scene = Scene()
-    operator = await scene.driving()
-    for step in range(50):
-        operator.command(topics.CMD_DRIVE, Drive(forward=0.01 * step))
-        operator.command(RAW, Raw(id=40))
-        await scene.settle()
-    assert scene.gateway.refused == []
-    assert len(scene.gateway.taken()) == 100
 
 
 async def test_a_drive_does_not_overtake_what_a_thread_carries() -> None:
@@ -658,24 +608,6 @@ async def test_mode_none_while_the_answer_is_awaited_gives_back_what_was_granted
     assert not operator.active
 
 
-async def test_a_program_that_changes_its_mind_while_the_answer_is_awaited_holds_one_lease() -> None:
-    scene = Scene()
-    operator = scene.operator(needs_mode=True)
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_MODE, Mode(mode="manual"))
-    operator.command(topics.CMD_DRIVE, GO)
-    operator.command(topics.CMD_MODE, Mode(mode="none"))
-    operator.command(topics.CMD_MODE, Mode(mode="manual"))
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    assert scene.gateway.report().holder == "hq.toy.1"
-    operator.command(topics.CMD_DRIVE, GO)
-    assert scene.gateway.refused == []
-    operator.close()
-    await scene.settle()
-    assert scene.gateway.report().state == "free"
-
-
 async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     scene = Scene()
     operator = scene.operator(needs_mode=True)
@@ -698,19 +630,6 @@ async def test_mode_autonomous_acquires_is_told_and_keeps_the_lease() -> None:
     assert scene.gateway.report().state == "free", "total silence"
 
 
-async def test_mode_autonomous_is_refused_before_neutral_and_without_a_robot() -> None:
-    scene = Scene()
-    operator = scene.operator(needs_mode=True)
-    with pytest.raises(Refused, match="connected: release the stick first"):
-        operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
-    operator.command(topics.CMD_DRIVE, STAND)
-    scene.view.alive = False
-    with pytest.raises(Refused, match="no gateway serves the robot"):
-        operator.command(topics.CMD_MODE, Mode(mode="autonomous"))
-    await scene.settle()
-    assert scene.gateway.asked == []
-
-
 # Losing the robot
 
 
@@ -729,28 +648,6 @@ async def test_a_stop_ends_the_drive_and_neutral_must_come() -> None:
     operator.command(topics.CMD_DRIVE, GO)
     await scene.settle()
     assert scene.gateway.report().holder == "hq.toy.1"
-
-
-async def test_a_question_that_somebody_repeated_and_was_first_with_loses_no_lease() -> None:
-    scene = Scene()
-    operator = await scene.driving()
-    answering = scene.gateway.serving[2]
-    answering.close()
-    again: list[IncomingQuery] = []
-
-    def repeat(question: IncomingQuery) -> None:
-        """Play somebody on the bus who hears the question, and repeats it before it has arrived."""
-        again.append(question)
-        scene.gateway._decide(FakeQuery(question.key, question.payload))
-        scene.gateway._decide(question)
-
-    scene.gateway.bus.answer(KEYS.key(topics.RPC_RENEW.path), repeat)
-    operator.look(Control(state="free"))
-    await scene.settle()
-    assert len(again) == 1
-    assert scene.gateway.report().refusals[-1].code == "out_of_order"
-    assert operator.intent.held
-    assert scene.told == []
 
 
 @pytest.mark.parametrize("code", [Code.NEUTRAL_FIRST, Code.LEASE_ENDED, Code.NOT_READY])
@@ -775,65 +672,6 @@ async def test_a_takeover_is_noticed_and_told_once() -> None:
         scene.look(operator)
         await scene.settle()
     assert scene.told == ["not driving: the lease has ended (taken over by operator)"]
-    assert not operator.active
-
-
-async def test_news_older_than_the_lease_does_not_end_it() -> None:
-    scene = Scene()
-    operator = scene.operator()
-    old = scene.gateway.report()
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    operator.look(old)
-    await scene.settle()
-    assert operator.intent.held
-    assert scene.told == []
-
-
-async def test_a_doubt_about_an_older_lease_does_not_end_the_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = Scene()
-    operator = scene.operator(needs_mode=True)
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_MODE, Mode(mode="manual"))
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    ask, renewals = scene.bus.ask, list[Any]()
-    held_anew = asyncio.Event()
-
-    async def late(key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        answers = await ask(key_expr, payload, timeout_s=timeout_s)
-        if key_expr == KEYS.key(topics.RPC_RENEW.path):
-            renewals.extend(answers)
-            await held_anew.wait()
-        return answers
-
-    monkeypatch.setattr(scene.bus, "ask", late)
-    operator.look(Control(state="free"))
-    operator.command(topics.CMD_MODE, Mode(mode="none"))
-    scene.gateway.authority.stop("stop")
-    operator.command(topics.CMD_MODE, Mode(mode="manual"))
-    operator.command(topics.CMD_DRIVE, GO)
-    for _ in range(20):
-        await asyncio.sleep(0)
-    assert operator.intent.held
-    held_anew.set()
-    await scene.settle()
-    assert [payloads.decode(Lease, answer.payload).ok for answer in renewals] == [False]
-    assert operator.intent.held
-    assert scene.told == []
-
-
-async def test_a_lease_that_expired_is_noticed_by_the_refusal_of_the_next_command() -> None:
-    scene = Scene()
-    operator = await scene.driving()
-    operator.command(topics.CMD_DRIVE, STAND)
-    scene.now += 1.0
-    scene.gateway.authority.expire(scene.now + LEASE_S)
-    operator.command(topics.CMD_DRIVE, GO)
-    scene.look(operator)
-    await scene.settle()
-    assert scene.told == ["not driving: the lease has ended (lease expired)"]
     assert not operator.active
 
 
@@ -885,13 +723,6 @@ async def test_a_refused_command_is_told_once_for_each_time_it_is_refused() -> N
     assert operator.intent.held
 
 
-async def test_what_was_refused_to_others_is_not_told() -> None:
-    scene = Scene()
-    operator = await scene.driving()
-    operator.look(refusals(("operator", "drive", "busy", 1), ("hq.toy.11", "drive", "busy", 1)))
-    assert scene.told == []
-
-
 async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a_command() -> None:
     scene = Scene()
     asking, idle = scene.operator(), scene.operator("hq.toy.2")
@@ -903,38 +734,6 @@ async def test_a_refusal_that_bears_no_name_is_told_to_who_has_just_given_such_a
     scene.now += 1.0
     asking.look(refusals((*refused[:3], 2)))
     assert len(scene.told) == 1
-
-
-async def test_a_lease_whose_answer_was_lost_is_ended_when_control_shows_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = Scene()
-    operator = scene.operator()
-    operator.command(topics.CMD_DRIVE, STAND)
-
-    ask = scene.bus.ask
-
-    async def ask_in_vain(key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
-        await ask(key_expr, payload, timeout_s=timeout_s)
-        return []
-
-    monkeypatch.setattr(scene.bus, "ask", ask_in_vain)
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    assert scene.told == ["not driving: no gateway answers"]
-    assert scene.gateway.report().holder == operator.who
-    scene.look(operator)
-    assert scene.gateway.report().holder is None
-
-
-async def test_a_program_that_gave_the_robot_back_and_wants_it_again_is_not_in_its_own_way() -> None:
-    scene = Scene()
-    operator = await scene.driving(needs_mode=False)
-    operator.command(topics.CMD_MODE, Mode("none"))
-    operator.command(topics.CMD_MODE, Mode("manual"))
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_DRIVE, GO)
-    await scene.settle()
-    assert scene.gateway.asked == ["acquire", "release", "acquire"]
-    assert scene.gateway.taken()[-1] == ("drive", GO)
 
 
 async def test_commands_that_need_no_lease_are_bounded_for_each_program() -> None:

@@ -1,5 +1,7 @@
 """What a listener refused, told to the robot's gateway: folded, a few times a second, and never without end."""
 
+from __future__ import annotations
+
 import asyncio
 import itertools
 from typing import Any

@@ -235,9 +235,7 @@ def stop_beside(self: Any, now: float, until: float) -> None:
         (stop_beside, "moves the robot after its stop"),
     ],
 )
-def test_a_stop_that_is_not_first_or_does_not_last_is_found(
-    heard: Recording, stop: Callable[..., None], problem: str
-) -> None:
+def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, stop, problem) -> None:
     claims = failed(check_stop(with_robot(stop=stop), heard))
     assert next(iter(claims)) == "the stop goes before all that waits, and no motion after it"
     assert problem in claims["the stop goes before all that waits, and no motion after it"]
@@ -334,9 +332,7 @@ def test_a_simulation_that_cannot_start_is_found() -> None:
 # The command
 
 
-def test_the_whole_check_passes_for_a_sound_protocol(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> None:
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     monkeypatch.setattr("logging.disable", lambda level: None)
     assert kit.main(["toy"]) == 0
@@ -345,9 +341,7 @@ def test_the_whole_check_passes_for_a_sound_protocol(
     assert "ok    the simulated robot drives" in out
 
 
-def test_what_does_not_hold_is_printed_and_is_the_exit_status(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsys) -> None:
     findings = [Finding("one"), Finding("two", "it does not"), Finding.of("three", ["a", "b", "c", "d"], "tried")]
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     monkeypatch.setattr(kit, "check", lambda protocol: findings)

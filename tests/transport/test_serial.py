@@ -207,9 +207,7 @@ def test_close_writes_what_waits_first(run: Run, device: Device) -> None:
     run(scene())
 
 
-def test_close_waits_for_a_line_that_takes_nothing_only_so_long(
-    run: Run, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_close_waits_for_a_line_that_takes_nothing_only_so_long(run, device, monkeypatch) -> None:
     monkeypatch.setattr(serial, "CLOSE_S", 0.05)
 
     async def scene() -> None:

@@ -1,5 +1,7 @@
 """A Webots robot that registers new names on every connection: what its gateway keeps of the old ones."""
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import struct

@@ -645,9 +645,7 @@ async def test_every_list_is_bounded_and_each_violation_is_told() -> None:
     assert repr(hq) == "<FragileHq 1.1 ENDED violations=2 alive=True>"
 
 
-async def test_the_command_logs_violations_and_prints_the_death(
-    caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+async def test_the_command_logs_violations_and_prints_the_death(caplog, capsys) -> None:
     sockets = Sockets()
     with caplog.at_level(logging.ERROR):
         task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", sockets.port, version="1.1", udp=False))

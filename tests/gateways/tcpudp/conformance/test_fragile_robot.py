@@ -118,9 +118,6 @@ class Hq(Scene):
     async def took(self, kinds: str) -> None:
         assert [row[2] for row in self.judge.received] == [int(kind) for kind in kinds.split()]
 
-    async def events(self, count: str) -> None:
-        assert len(self.judge.events) == int(count), self.judge.events
-
     async def silent(self, _: str) -> None:
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(0.1):
@@ -195,7 +192,7 @@ PARTS: dict[str, Any] = {"version": "1.4", "parts": 4}
         "a 7 that denies the answer is an event, and all goes by TCP": (
             UDP,
             ["probing", "by_udp PROBE", "> NOT_CONNECTED", "wait 0.1", "> FORWARD", "ok"]
-            + ["? 7(false) though 6(true) was sent by UDP", "events 1"],
+            + ["? 7(false) though 6(true) was sent by UDP", "told 1"],
         ),
         "a connection that breaks is an event": (
             {"times": Times(unasked_s=0.005)},

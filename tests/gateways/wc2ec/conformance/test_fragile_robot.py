@@ -1,5 +1,6 @@
 """The fragile controller against an external one written by hand: every byte here is read off the protocol page."""
 
+import ast
 import asyncio
 import contextlib
 import logging
@@ -9,14 +10,14 @@ import socket
 import struct
 import time
 from collections.abc import AsyncIterator
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 from gateways.wc2ec.conformance import parser
 from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Motor, Reader, Robot, Times
-from tests.conformance.scene import LONG_S, Peer, Scene, serving, until
+from tests.conformance.scene import LONG_S, Peer, Scene, scripts, serving, until
 
 QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""
@@ -73,15 +74,6 @@ async def connected(controller: FragileController) -> AsyncIterator[External]:
 
 def quick(dialect: Dialect = "deployed", **options: Any) -> FragileController:
     return FragileController(dialect, **{"times": QUICK, **options})
-
-
-async def violated(controller: FragileController, words: str) -> None:
-    """Wait until a violation with these words was noted."""
-    await until(lambda: any(words in one for one in controller.violations), (words, controller.violations))
-
-
-async def happened(controller: FragileController, words: str) -> None:
-    await until(lambda: any(words in event for event in controller.events), (words, controller.events))
 
 
 async def heard(controller: FragileController, count: int) -> None:
@@ -148,35 +140,6 @@ async def test_a_draft_controller_sends_data_of_enabled_sensors_only() -> None:
         assert controller.robot.enabled == {0}
     assert [fields for _, *fields in controller.received] == [[128, 0, 2, None], [129, 0, 2, None], [128, 0, 0, None]]
     assert controller.violations == controller.events == []
-
-
-async def test_a_draft_controller_says_nothing_unasked() -> None:
-    controller = quick("draft")
-    async with connected(controller) as external:
-        await external.send(CHANGE)
-        await heard(controller, 1)
-        with pytest.raises(BlockingIOError):
-            external.tcp.recv(1)
-
-
-async def test_sensors_of_the_draft_can_be_changed_and_set() -> None:
-    controller = quick("draft")
-    async with connected(controller) as external:
-        await external.send(CHANGE + SET)
-        await heard(controller, 2)
-    assert controller.received[0][1:] == (130, 0, 1, (2.0, 1.5))
-    assert controller.received[1][1:] == (131, 0, 3, (1.5, 1.5, 1.5))
-    assert controller.robot.configuration == {0: [0] * 3, 1: [0, 0, 1.5], 2: [0] * 3, 3: [1.5] * 3}
-    assert controller.violations == []
-
-
-async def test_a_sensor_type_may_have_another_number_of_values() -> None:
-    controller = quick("draft", values=1)
-    async with connected(controller) as external:
-        await external.send(SET[:11] + DISABLE)
-        await heard(controller, 2)
-    assert controller.received[0][1:] == (131, 0, 3, (1.5,))
-    assert controller.violations == []
 
 
 @pytest.mark.parametrize(("dialect", "data"), [("deployed", FORWARD), ("draft", CHANGE)])
@@ -298,103 +261,76 @@ def test_a_linear_motor_goes_back_as_well() -> None:
     assert math.isclose(motor.position, -0.1)
 
 
-# What it notes and survives
+# What it notes, survives and dies of
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (FORWARD[:3] + NAN, "nan to motor 'left wheel motor': 82 35 08 00 00 00 00 00 00 f8 7f"),
-        (FORWARD[:3] + INFINITY, "-inf to motor 'left wheel motor': 82 35 08"),
-        (LIFT[:3] + NAN, "nan to motor 'lift': 82 2e 0a"),
-    ],
-)
-async def test_a_motor_is_not_set_to_what_is_no_number(data: bytes, words: str) -> None:
-    controller = quick()
-    async with connected(controller) as external:
-        await external.send(FORWARD + data + LIFT)
-        await heard(controller, 3)
-        assert len(controller.violations) == 1
-        assert controller.violations[0].startswith(words)
-        assert controller.motors["left wheel motor"].velocity == 1.5
-        assert controller.motors["lift"].target == 0.25
-        assert controller.alive
+class Talk(Scene):
+    """A conversation with the controller, and what is to be seen of it afterwards."""
+
+    names: ClassVar[dict[str, str]] = {
+        "FORWARD": FORWARD.hex(),
+        "LIFT": LIFT.hex(),
+        "ENABLE": ENABLE.hex(),
+        "DISABLE": DISABLE.hex(),
+        "CHANGE": CHANGE.hex(),
+        "SET": SET.hex(),
+        "NAN": NAN.hex(),
+        "INFINITY": INFINITY.hex(),
+        "ONE": ONE.hex(),
+        "ZERO": bytes(8).hex(),
+    }
+
+    async def meet(self, _: str) -> None:
+        """Connect, and wait for the registrations of the dialect that has any."""
+        await self.connect("")
+        await until(lambda: self.judge.registered, self.judge)
+
+    async def noted(self, words: str) -> None:
+        """Exactly this violation, or one that begins so where it ends in three dots."""
+        (violation,) = self.judge.violations
+        assert violation.startswith(words[:-3]) if words.endswith("...") else violation == words
+
+    async def got(self, row: str) -> None:
+        """The newest command, as a tuple."""
+        assert self.judge.received[-1][1:] == ast.literal_eval(row)
+
+    async def first(self, row: str) -> None:
+        assert self.judge.received[0][1:] == ast.literal_eval(row)
+
+    async def events(self, events: str) -> None:
+        assert self.judge.events == [event for event in events.split(" / ") if event]
+
+    async def enabled(self, numbers: str) -> None:
+        assert self.judge.robot.enabled == {int(number) for number in numbers.split()}
+
+    async def configured(self, configuration: str) -> None:
+        assert self.judge.robot.configuration == ast.literal_eval(configuration)
+
+    async def motor(self, name_and_commands: str) -> None:
+        """A motor has this velocity."""
+        name, _, velocity = name_and_commands.rpartition(" ")
+        assert self.judge.motors[name].velocity == float(velocity)
+
+    async def alive(self, _: str) -> None:
+        assert self.judge.alive
+
+    async def stuck(self, _: str) -> None:
+        assert self.judge.stuck
+
+    async def data(self, count: str) -> None:
+        """It goes on measuring."""
+        for _ in range(int(count)):
+            assert (await self.peer.measurement())[0] == 1
+
+    async def registrations(self, _: str) -> None:
+        assert len(await self.peer.registrations()) == 11
+
+    async def twice(self, _: str) -> None:
+        assert self.judge.violations == [f"a command before the last registration: {FORWARD.hex(' ')}"] * 2
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        ("80 00 04", "command 128 to light sensor 4, which is not there: 80 00 04"),
-        ("81 00 ff", "command 129 to light sensor 255, which is not there: 81 00 ff"),
-        ("82 00 04 00" + bytes(8).hex(), "command 130 to light sensor 4, which is not there"),
-        ("83 00 09" + bytes(24).hex(), "command 131 to light sensor 9, which is not there"),
-        ("82 00 01 03" + bytes(8).hex(), "value 3 of 3: 82 00 01 03 00 00"),
-        ("82 00 01 00" + NAN.hex(), "a configuration value that is no number, (nan,)"),
-        (
-            "83 00 01" + ONE.hex() + INFINITY.hex() + ONE.hex(),
-            "a configuration value that is no number, (1.0, -inf, 1.0)",
-        ),
-    ],
-)
-async def test_a_bad_command_of_the_draft_is_noted_and_ignored(data: str, words: str) -> None:
-    controller = quick("draft")
-    async with connected(controller) as external:
-        await external.send(DISABLE + bytes.fromhex(data) + ENABLE)
-        await heard(controller, 3)
-        assert len(controller.violations) == 1
-        assert controller.violations[0].startswith(words)
-        assert controller.robot.enabled == {2}
-        assert controller.robot.configuration == dict.fromkeys(range(4), [0.0] * 3)
-
-
-async def test_what_is_needless_in_the_draft_is_an_event() -> None:
-    controller = quick("draft")
-    async with connected(controller) as external:
-        await external.send(DISABLE + ENABLE + ENABLE)
-        await heard(controller, 3)
-    assert controller.events == ["light sensor 2 disabled that was not enabled", "light sensor 2 enabled again"]
-    assert controller.violations == []
-
-
-async def test_a_command_before_the_last_registration_is_noted() -> None:
-    controller = quick(times=Times(step_s=0.005, register_s=0.3))
-    async with facing(controller) as (external, _):
-        await external.connect()
-        await external.send(FORWARD + FORWARD)
-        await heard(controller, 2)
-        assert len(await external.registrations()) == 11
-        await external.measurement()
-        await external.send(FORWARD)
-        await heard(controller, 3)
-    assert controller.violations == [f"a command before the last registration: {FORWARD.hex(' ')}"] * 2
-    assert controller.motors["left wheel motor"].velocity == 1.5
-
-
-async def test_a_part_that_nothing_follows_is_noted_once() -> None:
-    controller = quick(times=Times(step_s=0.005, register_s=0.0, part_s=0.05))
-    async with connected(controller) as external:
-        await external.send(FORWARD + FORWARD[:4])
-        await violated(controller, "part of a command, and no more for 0.0")
-        await asyncio.sleep(0.1)
-        assert len(controller.violations) == 1
-        assert controller.violations[0].endswith(" s: 82 35 08 00")
-        await external.send(FORWARD[4:])
-        await heard(controller, 2)
-
-
-@pytest.mark.parametrize(("dialect", "part"), [("deployed", FORWARD[:10]), ("draft", SET[:26])])
-async def test_an_end_within_a_command_is_noted(dialect: Dialect, part: bytes) -> None:
-    controller = quick(dialect)
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await until(lambda: controller.registered, controller)
-        await external.send(part)
-        external.tcp.shutdown(socket.SHUT_WR)
-        await over(task)
-    assert controller.violations == [f"the connection ended within a command: {part.hex(' ')}"]
-    assert controller.alive
-
-
+DRAFT: dict[str, Any] = {"dialect": "draft"}
+UNSET = "{0: [0, 0, 0], 1: [0, 0, 0], 2: [0, 0, 0], 3: [0, 0, 0]}"
 LOST = [
     ("deployed", "80 35 08", "unknown command 128: 80 35 08"),
     ("deployed", "81", "unknown command 129: 81"),
@@ -410,79 +346,155 @@ LOST = [
 ]
 
 
-@pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_alone_is_noted_and_the_read_thrown_away(dialect, data, words) -> None:
-    controller = quick(dialect)
-    async with connected(controller) as external:
-        await external.send(bytes.fromhex(data))
-        await violated(controller, words)
-        await external.send(GOOD[dialect])
-        await heard(controller, 2)
-        assert controller.violations == [words]
-        command, node_type, number = [*bytes.fromhex(data), -1, -1][:3]
-        assert controller.received[0][1:] == (command, node_type, number, None)
-        assert controller.received[1][1] == GOOD[dialect][0]
-        assert controller.alive
-
-
-# What it dies of, or is stuck by
-
-
-@pytest.mark.parametrize(("dialect", "data", "words"), LOST)
-async def test_an_unknown_command_after_a_valid_one_in_the_same_read_kills(dialect, data, words) -> None:
-    controller = quick(dialect)
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await until(lambda: controller.registered, controller)
-        await external.send(GOOD[dialect] + bytes.fromhex(data))
-        await over(task)
-        assert not controller.alive
-        assert controller.death == words.replace(": ", ", after a valid one in the same read: it loops for ever: ")
-        assert controller.violations == [controller.death]
-        assert controller.events == [f"died: {controller.death}"]
-        await external.read_to_the_end()
-
-
-async def test_the_end_of_a_split_command_counts_as_a_valid_one() -> None:
-    controller = quick()
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await until(lambda: controller.registered, controller)
-        await external.send(FORWARD + FORWARD[:5])
-        await heard(controller, 1)
-        await external.send(FORWARD[5:] + b"\x84")
-        await over(task)
-    assert controller.death.startswith("unknown command 132, after a valid one in the same read")
-
-
-@pytest.mark.parametrize(
-    ("header", "words"),
-    [
-        ("82 35 0b", "130 to number 11, which is not registered: every later command is stuck: 82 35 0b 00"),
-        ("82 35 ff", "130 to number 255, which is not registered"),
-        ("82 25 00", "130 to 'ds0', which is no motor"),
-        ("82 35 07", "130 to 'ds7', which is no motor"),
-        ("82 2e 08", "130 to type 46 number 8: 'left wheel motor' is of type 53"),
-        ("82 35 0a", "130 to type 53 number 10: 'lift' is of type 46"),
-    ],
+@scripts(
+    {
+        "a draft controller says nothing unasked": (DRAFT, ["meet", "> CHANGE", "heard 1", "nothing"]),
+        "sensors of the draft can be changed and set": (
+            DRAFT,
+            ["meet", "> CHANGE SET", "heard 2", "first (130, 0, 1, (2.0, 1.5))", "got (131, 0, 3, (1.5, 1.5, 1.5))"]
+            + ["configured {0: [0, 0, 0], 1: [0, 0, 1.5], 2: [0, 0, 0], 3: [1.5, 1.5, 1.5]}", "ok"],
+        ),
+        "a sensor type may have another number of values": (
+            {**DRAFT, "values": 1},
+            ["meet", f"> {SET[:11].hex()} DISABLE", "heard 2", "first (131, 0, 3, (1.5,))", "ok"],
+        ),
+        "what is needless in the draft is an event": (
+            DRAFT,
+            ["meet", "> DISABLE ENABLE ENABLE", "heard 3", "ok"]
+            + ["events light sensor 2 disabled that was not enabled / light sensor 2 enabled again"],
+        ),
+        **{
+            f"a motor is not set to what is no number, {data}": (
+                {},
+                [
+                    "meet",
+                    f"> FORWARD {data} LIFT",
+                    "heard 3",
+                    f"noted {words}...",
+                    "motor left wheel motor 1.5",
+                    "alive",
+                ],
+            )
+            for data, words in (
+                ("823508 NAN", "nan to motor 'left wheel motor': 82 35 08 00 00 00 00 00 00 f8 7f"),
+                ("823508 INFINITY", "-inf to motor 'left wheel motor': 82 35 08"),
+                ("822e0a NAN", "nan to motor 'lift': 82 2e 0a"),
+            )
+        },
+        **{
+            f"a bad command of the draft is noted and ignored, {data}": (
+                DRAFT,
+                [
+                    "meet",
+                    f"> DISABLE {data} ENABLE",
+                    "heard 3",
+                    f"noted {words}...",
+                    "enabled 2",
+                    f"configured {UNSET}",
+                ],
+            )
+            for data, words in (
+                ("80 00 04", "command 128 to light sensor 4, which is not there: 80 00 04"),
+                ("81 00 ff", "command 129 to light sensor 255, which is not there: 81 00 ff"),
+                ("82 00 04 00 ZERO", "command 130 to light sensor 4, which is not there"),
+                ("83 00 09 ZERO ZERO ZERO", "command 131 to light sensor 9, which is not there"),
+                ("82 00 01 03 ZERO", "value 3 of 3: 82 00 01 03 00 00"),
+                ("82 00 01 00 NAN", "a configuration value that is no number, (nan,)"),
+                ("83 00 01 ONE INFINITY ONE", "a configuration value that is no number, (1.0, -inf, 1.0)"),
+            )
+        },
+        "a command before the last registration is noted": (
+            {"times": Times(step_s=0.005, register_s=0.3)},
+            ["connect", "> FORWARD FORWARD", "heard 2", "registrations", "data 1", "> FORWARD", "heard 3", "twice"]
+            + ["motor left wheel motor 1.5"],
+        ),
+        "a part that nothing follows is noted once": (
+            {"times": Times(step_s=0.005, register_s=0.0, part_s=0.05)},
+            ["meet", "> FORWARD 82350800", "! part of a command, and no more for 0.0", "wait 0.1", "!!  s: 82 35 08 00"]
+            + [f"> {FORWARD[4:].hex()}", "heard 2"],
+        ),
+        **{
+            f"an end within a command is noted, {dialect}": (
+                {"dialect": dialect},
+                ["meet", f"> {part.hex()}", "shut", "over", "alive"]
+                + [f"noted the connection ended within a command: {part.hex(' ')}"],
+            )
+            for dialect, part in (("deployed", FORWARD[:10]), ("draft", SET[:26]))
+        },
+        **{
+            f"an unknown command alone is noted and the read thrown away, {dialect} {data}": (
+                {"dialect": dialect},
+                ["meet", f"> {data}", f"! {words}", f"> {GOOD[dialect].hex()}", "heard 2", f"noted {words}", "alive"]
+                + [f"first {(*[*bytes.fromhex(data), -1, -1][:3], None)}"],
+            )
+            for dialect, data, words in LOST
+        },
+        **{
+            f"an unknown command after a valid one in the same read kills, {dialect} {data}": (
+                {"dialect": dialect},
+                ["meet", f"> {GOOD[dialect].hex()} {data}"]
+                + [f"died {words.replace(': ', ', after a valid one in the same read: it loops for ever: ')}", "eof"],
+            )
+            for dialect, data, words in LOST
+        },
+        "the end of a split command counts as a valid one": (
+            {},
+            ["meet", f"> FORWARD {FORWARD[:5].hex()}", "heard 1", f"> {FORWARD[5:].hex()} 84"]
+            + ["died unknown command 132, after a valid one in the same read"],
+        ),
+        **{
+            f"after a 130 to no motor every later command is stuck, {header}": (
+                {},
+                ["connect", "registrations", f"> LIFT {header} ONE FORWARD", f"! {words}"]
+                + [f"> FORWARD 84 {FORWARD[:4].hex()}", "data 80", f"!! {words}", "stuck", "heard 2"]
+                + ["motor left wheel motor 0", "close", "over", "alive"],
+            )
+            for header, words in (
+                ("82 35 0b", "130 to number 11, which is not registered: every later command is stuck: 82 35 0b 00"),
+                ("82 35 ff", "130 to number 255, which is not registered"),
+                ("82 25 00", "130 to 'ds0', which is no motor"),
+                ("82 35 07", "130 to 'ds7', which is no motor"),
+                ("82 2e 08", "130 to type 46 number 8: 'left wheel motor' is of type 53"),
+                ("82 35 0a", "130 to type 53 number 10: 'lift' is of type 46"),
+            )
+        },
+        "it is gone when the external controller is": (
+            {},
+            ["meet", "> FORWARD", "heard 1", "shut", "over", "eof", "refused", "ok"]
+            + ["events the external controller left the robot moving: closed"],
+        ),
+        "a reset is an end": (
+            DRAFT,
+            [
+                "connect",
+                "> CHANGE",
+                "heard 1",
+                "reset",
+                "over",
+                "told 1",
+                "? the external controller left the robot at rest: ",
+            ],
+        ),
+        "a second connection is an event and never answered": (
+            {},
+            [
+                "meet",
+                "again",
+                "> FORWARD",
+                "? second connection, from 127.0.0.1:",
+                "nothing",
+                "back",
+                "> LIFT",
+                "heard 1",
+            ]
+            + ["got (130, 46, 10, 0.25)", "ok"],
+        ),
+        "many connections are bounded": ({}, ["meet", "crowd 20"]),
+    }
 )
-async def test_after_a_130_to_no_motor_every_later_command_is_stuck(header: str, words: str) -> None:
-    controller = quick()
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await external.registrations()
-        await external.send(LIFT + bytes.fromhex(header) + ONE + FORWARD)
-        await violated(controller, words)
-        await external.send(FORWARD + b"\x84" + FORWARD[:4])
-        for _ in range(8 * 10):
-            assert (await external.measurement())[0] == 1
-        external.close()
-        await over(task)
-    assert len(controller.violations) == 1
-    assert len(controller.received) == 2
-    assert controller.stuck
-    assert controller.alive
-    assert controller.motors["left wheel motor"].commands == 0
+async def test_what_an_external_controller_may_do_and_what_not(options: dict[str, Any], steps: list[str]) -> None:
+    async with serving(quick(**options), External, Talk) as talk:
+        await talk.play(steps)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -498,36 +510,6 @@ def test_random_bytes_never_make_the_judge_raise(dialect: Dialect) -> None:
 # The connection
 
 
-async def test_it_is_gone_when_the_external_controller_is() -> None:
-    controller = quick()
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await until(lambda: controller.registered, controller)
-        await external.send(FORWARD)
-        await heard(controller, 1)
-        external.tcp.shutdown(socket.SHUT_WR)
-        await over(task)
-        await external.read_to_the_end()
-        again = External(external.port)
-        with pytest.raises(ConnectionRefusedError), contextlib.closing(again):
-            await again.connect()
-    assert controller.events == ["the external controller left the robot moving: closed"]
-    assert controller.violations == []
-    assert repr(controller) == "<FragileController deployed over violations=0 alive=True>"
-
-
-async def test_a_reset_is_an_end() -> None:
-    controller = quick("draft")
-    async with facing(controller) as (external, task):
-        await external.connect()
-        await external.send(CHANGE)
-        await heard(controller, 1)
-        external.reset()
-        await over(task)
-    assert len(controller.events) == 1
-    assert controller.events[0].startswith("the external controller left the robot at rest: ")
-
-
 async def test_a_reset_while_it_sends_is_an_end() -> None:
     controller = quick()
     async with facing(controller) as (external, task):
@@ -537,33 +519,6 @@ async def test_a_reset_while_it_sends_is_an_end() -> None:
         await over(task)
     assert len(controller.events) == 1
     assert controller.violations == []
-
-
-async def test_a_second_connection_is_an_event_and_never_answered() -> None:
-    controller = quick()
-    async with connected(controller) as external:
-        again = External(external.port)
-        with contextlib.closing(again):
-            await again.connect()
-            await again.send(FORWARD)
-            await happened(controller, "second connection, from 127.0.0.1:")
-            with pytest.raises(BlockingIOError):
-                again.tcp.recv(1)
-        await external.send(LIFT)
-        await heard(controller, 1)
-        assert len(controller.received) == len(controller.events) == 1
-        assert controller.violations == []
-
-
-async def test_many_connections_are_bounded() -> None:
-    controller = quick()
-    async with connected(controller) as external:
-        others = [External(external.port) for _ in range(20)]
-        for other in others:
-            await other.connect()
-        await until(lambda: len(controller.events) == 20, controller.events)
-        for other in others:
-            other.close()
 
 
 async def test_an_external_controller_that_reads_nothing_ends_it() -> None:

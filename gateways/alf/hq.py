@@ -25,7 +25,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import VehicleSession
+from gateways.alf.session import VehicleRole
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
@@ -58,7 +58,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
-class HqClient(VehicleSession):
+class HqClient(VehicleRole):
     """The session of one client.
 
     scanner: the scanner init that it was sent last, encoded. laser: whether it is shown measurements and scanner init.

@@ -108,7 +108,7 @@ class AlfSession(Session[AlfMessage]):
         super().close(reason, now)
 
 
-class HqSession(AlfSession):
+class HqRole(AlfSession):
     """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
 
     role = Role.HQ
@@ -138,7 +138,7 @@ class HqSession(AlfSession):
         self.outbox.set(_DRIVE, (self.encode(command),), now, period_s=REPEAT_S, urgent=urgent)
 
 
-class VehicleSession(AlfSession):
+class VehicleRole(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT

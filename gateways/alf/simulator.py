@@ -1,4 +1,4 @@
-"""A simulated ALF vehicle: steers like a car, measures the small world with its laser, stops when nobody drives it.
+"""An ALF vehicle to play with: steers like a car, measures the room with its laser, stops when nobody drives it.
 
 It speaks either dialect, on one port or two. Deterministic with a seed: the same commands at the same times give
 the same world. Source: the message table and "Dialect `text`" of the protocol page.
@@ -6,27 +6,22 @@ the same world. Source: the message table and "Dialect `text`" of the protocol p
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
 import math
 import random
-from collections.abc import Callable
 
 import numpy as np
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import VehicleSession
-from gateways.alf.translate import DRIVE, LASER
-from zbridge.protocol import EncodeError, Refused, Simulation, State
+from gateways.alf.session import VehicleRole
+from gateways.alf.translate import DRIVE, LASER, VEHICLE
+from zbridge.protocol import Simulation
+from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
-from zbridge.transport.conversation import Accepted, Conversation
-from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import listen
+from zbridge.transport.conversation import Conversation
 
 log = logging.getLogger("gateways.alf.simulator")
 
-STEP_S = 0.02
 SPEED_M_S = 1.0
 """Speed over ground at 100 percent."""
 WHEELBASE_M = 0.35
@@ -47,11 +42,11 @@ _MOST_SPEED, _MOST_TEXT_SPEED = 100, 255
 
 
 class Car:
-    """The simulated vehicle: obeys commands, moves, measures. Knows no connection."""
+    """The vehicle itself: what commands make it do, and what it measures. Knows no connection."""
 
     def __init__(self, seed: int, dialect: Dialect) -> None:
         rng = random.Random(seed)
-        self.body = Body(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3), radius=0.25)
+        self.body = Body.somewhere(rng, radius=0.25)
         self.light = False
         self.speed_m_s = 0.0
         self._dialect = dialect
@@ -102,7 +97,7 @@ class Car:
         return Measurement(self._sequence, self._clock_ms, np.maximum(points, 0), FIRST_VALID, LAST_VALID)
 
     def info(self) -> DriveInfo:
-        """Describe the motion, in the units of the dialect."""
+        """Give how it moves, in the units of its dialect."""
         g, degrees = STANDARD_GRAVITY, math.degrees(self._turn_rad_s)
         lateral = -self.speed_m_s * self._turn_rad_s / g
         values = (self._acceleration / g, lateral, 1.0, 0.0, 0.0, degrees)
@@ -111,83 +106,41 @@ class Car:
         return DriveInfo(round(abs(self.speed_m_s) / SPEED_M_S * _MOST_SPEED), *values, TEMPERATURE)
 
 
-class Simulator:
-    """Serves one car on its ports: the first drives, the last measures."""
+class VehicleSimulator(Simulator[AlfMessage]):
+    """Serves one car: on one link, or drive commands on the first and measurements on the second ("Roles")."""
 
-    def __init__(self, seed: int, dialect: Dialect) -> None:
+    def __init__(self, seed: int, dialect: Dialect, links: int) -> None:
+        super().__init__(log, links=(DRIVE, LASER) if links > 1 else (VEHICLE,))
         self.car = Car(seed, dialect)
         self._dialect = dialect
-        self._peers: dict[str, set[Conversation]] = {DRIVE: set(), LASER: set()}
-        self._loop = asyncio.get_running_loop()
+        self._drive, self._laser = (DRIVE, LASER) if links > 1 else (VEHICLE, VEHICLE)
 
     def __repr__(self) -> str:
-        return f"<Simulator {self.car}>"
+        return f"<VehicleSimulator {self.car}>"
 
-    async def run(self, simulation: Simulation) -> None:
-        """Listen and simulate until cancelled; then send END."""
-        parts = [{DRIVE}, {LASER}] if len(simulation.addresses) > 1 else [{DRIVE, LASER}]
-        async with contextlib.AsyncExitStack() as stack:
-            addresses = [
-                await stack.enter_async_context(listen(address, self._accepting(part)))
-                for address, part in zip(simulation.addresses, parts, strict=True)
-            ]
-            simulation.ready(tuple(addresses))
-            try:
-                await self._live()
-            finally:
-                for conversation in set().union(*self._peers.values()):
-                    conversation.close("simulator ended")
+    def session(self, peer: str, link: str) -> VehicleRole:
+        session = VehicleRole(self._dialect)
+        session.name = f"hq {peer}"
+        return session
 
-    def _accepting(self, parts: set[str]) -> Callable[[], Receiver]:
-        return lambda: Accepted(lambda link: self._admit(link, parts))
+    def greet(self, client: Conversation, link: str) -> None:
+        """Describe the scanner, before anything is measured."""
+        if link == self._laser:
+            self.send(client, SCANNER)
 
-    def _admit(self, link: Link, parts: set[str]) -> Conversation:
-        session = VehicleSession(self._dialect)
-        session.name = f"hq {link.peer}"
-        conversation = Conversation(session, self._loop, deliver=self._deliver)
-        log.info("%s: connected for %s", link.peer, " and ".join(sorted(parts)))
-        self._loop.call_soon(self._greet, conversation, parts)
-        return conversation
+    def take(self, client: Conversation, message: AlfMessage) -> None:
+        if isinstance(message, DriveCommand):
+            self.car.take(message)
 
-    def _greet(self, conversation: Conversation, parts: set[str]) -> None:
-        """Describe the scanner; from then on send measurements."""
-        if LASER in parts:
-            _send(conversation, SCANNER)
-        for part in () if conversation.ended.done() else parts:
-            self._peers[part].add(conversation)
-            conversation.ended.add_done_callback(lambda _, peers=self._peers[part]: peers.discard(conversation))  # type: ignore[misc]
-
-    def _deliver(self, messages: list[AlfMessage]) -> None:
-        for message in messages:
-            if isinstance(message, DriveCommand):
-                self.car.take(message)
-
-    def _tell(self, part: str, message: AlfMessage) -> None:
-        for conversation in tuple(self._peers[part]):
-            _send(conversation, message)
-
-    async def _live(self) -> None:
-        due, steps = self._loop.time(), 0
-        while True:
-            due = max(due + STEP_S, self._loop.time() - 1.0)
-            await asyncio.sleep(due - self._loop.time())
-            steps += 1
-            self.car.step(STEP_S)
-            if steps % _SCAN_EVERY == 0:
-                self._tell(LASER, self.car.measure())
-            if steps % _INFO_EVERY == 0:
-                self._tell(DRIVE, self.car.info())
-
-
-def _send(conversation: Conversation, message: AlfMessage) -> None:
-    if conversation.session.state is State.ESTABLISHED:
-        try:
-            conversation.session.send(message)
-        except (Refused, EncodeError) as error:
-            log.debug("%s: not sent, %s", conversation.session.name, error)
-        conversation.pump()
+    def step(self, steps: int) -> None:
+        self.car.step(STEP_S)
+        if steps % _SCAN_EVERY == 0:
+            self.tell(self.car.measure(), link=self._laser)
+        if steps % _INFO_EVERY == 0:
+            self.tell(self.car.info(), link=self._drive)
 
 
 async def simulate(simulation: Simulation) -> None:
     """Run a simulated vehicle until cancelled."""
-    await Simulator(simulation.seed, Dialect(simulation.dialect or "text")).run(simulation)
+    dialect = Dialect(simulation.dialect or "text")
+    await VehicleSimulator(simulation.seed, dialect, len(simulation.addresses)).run(simulation)

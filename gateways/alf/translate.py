@@ -24,7 +24,7 @@ from gateways.alf.messages import (
     Measurement,
     ScannerInit,
 )
-from gateways.alf.session import HqSession, points_of
+from gateways.alf.session import HqRole, points_of
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
@@ -85,7 +85,7 @@ class AlfRobot(Robot):
         self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = Dialect(options.dialect)
-        self._session: HqSession | None = None
+        self._session: HqRole | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
@@ -99,15 +99,15 @@ class AlfRobot(Robot):
         self._command = self._neutral()
 
     @property
-    def driving(self) -> HqSession | None:
+    def driving(self) -> HqRole | None:
         return self._session
 
-    def session(self, link: str, peer: str) -> HqSession:
+    def session(self, link: str, peer: str) -> HqRole:
         drives = link == self.link_names[0]
         if drives:
             self._backward = False
             self._command = self._neutral()
-        session = HqSession(
+        session = HqRole(
             self._dialect,
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,

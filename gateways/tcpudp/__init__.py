@@ -1,8 +1,8 @@
 """The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
 
-``messages`` declares the packets, ``session`` holds the conversation in both roles, ``translate`` turns
-packets into fleet messages and commands into packets, ``simulator`` is a robot to play with, ``fragile`` one that
-is as fragile as the deployed ones and shares no code with the others.
+``messages`` declares the packets, ``settings`` the settings blocks, ``versions`` the versions; ``session`` holds
+the conversation in both roles; ``translate`` is the device side, ``hq`` and ``maps`` the HQ side. ``simulator`` is a
+simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
 """
 
 from __future__ import annotations

@@ -276,7 +276,7 @@ def frame_end(data: bytes, start: int) -> int:
 
 
 def encode_packet(message: Packet, sender_id: int) -> bytes:
-    """Write a packet with its header; raise EncodeError for values it cannot carry."""
+    """Write a packet with its header; raise EncodeError for values that do not fit."""
     if isinstance(message, OpaquePacket):
         packet_id, body = message.id, message.body
     else:
@@ -288,7 +288,7 @@ def encode_packet(message: Packet, sender_id: int) -> bytes:
 
 
 def read_header(frame: bytes) -> tuple[int, int]:
-    """Read the ``id`` byte and the packet id of one whole packet; raise ProtocolError where its length lies."""
+    """Read the ``id`` byte and the packet id of one whole packet; raise ProtocolError if its length is wrong."""
     if len(frame) < HEADER.size:
         raise ProtocolError(f"packet of {len(frame)} bytes, expected at least {HEADER.size}")
     length, sender_id, packet_id = HEADER.unpack_from(frame)
@@ -298,7 +298,7 @@ def read_header(frame: bytes) -> tuple[int, int]:
 
 
 def decode_packet(frame: bytes) -> Packet:
-    """Read one whole packet; raise ProtocolError for a header or a body that is not what it says."""
+    """Read one whole packet; raise ProtocolError for a wrong length or a malformed body."""
     return decoder(read_header(frame)[1])(frame, HEADER.size)
 
 

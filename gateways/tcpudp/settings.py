@@ -1,7 +1,7 @@
 """The settings blocks of each version: what a peer announces, declared flag by flag. Sans-IO.
 
-Source: "Settings and version negotiation" of the protocol page. The block follows the newest version its
-sender lists, and older readers ignore the tail.
+Source: "Settings and version negotiation" of the protocol page. The block is that of the newest version
+its sender lists; older readers ignore the tail.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ ROBOT_BLOCKS: dict[str, type[Settings]] = {"1.1": Settings, "1.2": Settings12, "
 
 
 def read_settings(versions: str, block: bytes, blocks: dict[str, type[Settings]]) -> Settings:
-    """Read a settings block by the versions its sender lists; raise ProtocolError where it is too short.
+    """Read a settings block by the versions its sender lists; raise ProtocolError if it is too short.
 
-    Of a version newer than all that are known, the newest known block is read and the tail ignored.
+    If the newest listed version is unknown, read the newest known block and ignore the tail.
     """
     version = newest(parse_versions(versions), known=blocks)
     if version is None:

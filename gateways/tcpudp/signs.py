@@ -1,7 +1,7 @@
-"""Signs of a connection to a robot that is not its first, and may carry half of what is said on it. Sans-IO.
+"""Signs that a connection is not the robot's one usable connection, and may lose half of all packets. Sans-IO.
 
-Source: "One usable connection per start" of the protocol page. The session tells what it heard, as a count of packets:
-texts are left out, as they reach every client of a robot.
+Source: "One usable connection per start" of the protocol page. The session passes ``heard``, the number of packets that
+it received, without texts: every client of a robot gets texts, also on a poor connection.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 from zbridge.protocol import Traffic
 
 FIRST_CLIENT = 2
-"""The id that a robot gives the first client after its start."""
+"""The id that a robot gives its first client."""
 LOOK_S = 5.0
-"""Seconds in which a connection is expected to show that it works."""
+"""Seconds after which a silent connection is a sign."""
 LOOK_AGAIN_S = 1.0
 MALFORMED, MALFORMED_SHARE = 3, 0.05
-"""Malformed packets that are a sign: so many, and such a share of all that came."""
+"""Malformed packets are a sign from this number and from this share of all packets on."""
 LATER_CLIENT = "another program is connected, or the one usable connection is used up"
 GARBLED = "malformed packets"
 UNANSWERED = f"no telemetry and no answer to the probe within {LOOK_S:g} s"
@@ -22,7 +22,7 @@ MUTE = f"no telemetry within {LOOK_S:g} s, unlike on the connection before"
 
 
 class Signs:
-    """The signs on one connection. before: those on the connection before."""
+    """The signs on one connection. ``before``: the signs on the connection before."""
 
     def __init__(self, before: Signs | None = None) -> None:
         self.talks: bool = before is not None and before.talks
@@ -36,14 +36,15 @@ class Signs:
         return f"<Signs talks={self.talks} {self._silent}>"
 
     def asked(self, heard: int, questions: int = 1) -> None:
-        """Take note of questions that were just sent: their answers are no telemetry."""
+        """Count queries that were just sent: their answers are no telemetry."""
         self._listen(heard)
         self._asked += questions
 
     def look(self, heard: int, *, unanswered: bool) -> None:
-        """Judge after :data:`LOOK_S` whether the robot is silent, and again later; unanswered: so was the probe.
+        """Judge whether the robot is silent. Call first at :data:`LOOK_S`; ``unanswered``: a probe got no answer.
 
-        A robot may be waiting to be asked: without telemetry before, or a probe, silence is no sign.
+        Some robots send nothing until they are asked: silence is a sign only if the robot sent telemetry on the
+        connection before, or did not answer the probe.
         """
         self._listen(heard)
         if not self._looked:
@@ -54,7 +55,7 @@ class Signs:
             self._silent = UNANSWERED if unanswered and not heard else None
 
     def gather(self, client_id: int, traffic: Traffic) -> tuple[str, ...]:
-        """List the signs there are now, for people."""
+        """List the present signs, for people."""
         later = f"client id {client_id}: {LATER_CLIENT}" if client_id > FIRST_CLIENT else None
         few = traffic.malformed < max(MALFORMED, MALFORMED_SHARE * traffic.frames_in)
         return tuple(filter(None, (later, None if few else GARBLED, self._silent)))

@@ -1,4 +1,4 @@
-"""A robot of the TCP/UDP package protocol to play with: moves, sees walls, builds a map, answers every packet.
+"""A robot of the TCP/UDP package protocol to play with: moves, measures walls, builds a map, answers every packet.
 
 It speaks any version, with or without UDP. Deterministic with a seed: the same packets at the same times give the
 same world. Source: the packet table and "Translation" of the protocol page.
@@ -6,8 +6,6 @@ same world. Source: the packet table and "Translation" of the protocol page.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import logging
 import math
 import random
@@ -35,18 +33,16 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.session import RobotSession, limits
+from gateways.tcpudp.session import RobotRole, limits
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.versions import VERSIONS
-from zbridge.protocol import ClientIds, EncodeError, Refused, Simulation, State
+from zbridge.protocol import ClientIds, Session, Simulation
+from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
-from zbridge.transport.conversation import Accepted, Conversation
-from zbridge.transport.link import Link
-from zbridge.transport.tcp import listen
+from zbridge.transport.conversation import Conversation
 
 log = logging.getLogger("gateways.tcpudp.simulator")
 
-STEP_S = 0.02
 SPEED_M_S = 0.5
 """Speed over ground at packet speed 1."""
 TURN_RAD_S = 1.0
@@ -78,11 +74,11 @@ def settings_of(version: str, *, udp: bool) -> Settings:
 
 
 class Vehicle:
-    """The simulated robot itself: what packets make it do, and what it sees. Knows no connection."""
+    """The robot itself: what packets make it do, and what it measures. Knows no connection."""
 
     def __init__(self, seed: int) -> None:
         rng = random.Random(seed)
-        self.body = Body(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3) + math.pi / 2)
+        self.body = Body.somewhere(rng, heading=math.pi / 2)
         self.grid = Grid(SIDE, CELL * UNIT_M)
         self.mode = 1
         self.lidar = True
@@ -95,7 +91,7 @@ class Vehicle:
 
     @property
     def moving(self) -> bool:
-        """Whether it has been told to move and still obeys."""
+        """True while it moves as it was told."""
         return any(self._motion)
 
     def step(self, dt: float) -> None:
@@ -113,12 +109,12 @@ class Vehicle:
         self.grid.see(self.body.x, self.body.y, angles, ranges + noise * (ranges < LIDAR_RANGE_M), LIDAR_RANGE_M)
 
     def position(self) -> ServerPosition:
-        """Say where it is: x, y in its unit, heading in degrees with 0 along y."""
+        """Give its place: x, y in its unit, heading in degrees with 0 along y."""
         heading_deg = math.degrees(self.body.heading - math.pi / 2)
         return ServerPosition(self.body.x / UNIT_M, self.body.y / UNIT_M, heading_deg)
 
     def map(self) -> ServerSLAMMap:
-        """Show the map, x-major."""
+        """Give the map, x-major."""
         return ServerSLAMMap(self.grid.cells.tobytes())
 
     def take(self, message: Packet) -> tuple[Packet, ...]:
@@ -164,105 +160,74 @@ class Vehicle:
             self.grid.see(self.body.x, self.body.y, angles, ranges[known], LIDAR_RANGE_M)
 
 
-class Simulator:
+class RobotSimulator(Simulator[Packet]):
     """Serves one vehicle to the HQ programs that connect."""
 
     def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
+        super().__init__(log, datagrams=udp)
         self.vehicle = Vehicle(seed)
+        self.vehicle.look()
         self._versions = VERSIONS[version].listed.split(",")
         self._settings = settings_of(version, udp=udp)
         self._parts = version == "1.4"
-        self._peers: dict[int, Conversation] = {}
         self._ids = ClientIds(CLIENTS, QUIET_S)
-        self._loop = asyncio.get_running_loop()
 
     def __repr__(self) -> str:
-        return f"<Simulator {self.vehicle} {len(self._peers)} HQ>"
+        return f"<RobotSimulator {self.vehicle}>"
 
-    async def run(self, simulation: Simulation) -> None:
-        """Listen and live until cancelled."""
-        (wanted,) = simulation.addresses
-        async with listen(wanted, lambda: Accepted(self.admit), datagrams=self._settings.udp) as address:
-            simulation.ready((address,))
-            await self._live()
-
-    def admit(self, link: Link) -> Conversation | None:
-        """Begin a conversation with a new HQ; None when all client ids are taken."""
+    def session(self, peer: str, link: str) -> RobotRole | None:
         client_id = self._ids.take(self._loop.time())
         if client_id is None:
             return None
-        session = RobotSession(limits(0.0), self._settings, client_id, self._versions)
+        session = RobotRole(limits(0.0), self._settings, client_id, self._versions)
         session.name = f"hq {client_id}"
-        conversation = Conversation(session, self._loop, deliver=lambda messages: self._deliver(conversation, messages))
-        conversation.ended.add_done_callback(lambda _: self._dismiss(client_id))
-        self._peers[client_id] = conversation
-        log.info("%s: connected as client %d", link.peer, client_id)
-        return conversation
+        return session
 
-    def _dismiss(self, client_id: int) -> None:
-        self._peers.pop(client_id, None)
-        self._ids.release(client_id, self._loop.time())
+    def dismiss(self, client: Conversation) -> None:
+        """Take the client's id back."""
+        assert isinstance(client.session, RobotRole)
+        self._ids.release(client.session.client_id, self._loop.time())
 
-    def _deliver(self, conversation: Conversation, messages: list[Packet]) -> None:
-        for message in messages:
-            if self._parts and isinstance(message, ClientGetSLAMMap):
-                continue  # an empty handler
+    def check(self, session: Session[Packet], message: Packet) -> None:
+        """Refuse what the HQ does not know; deployed robots send parts of the map without that check."""
+        assert isinstance(session, RobotRole)
+        if not isinstance(message, ServerSLAMMapPart):
+            session.may_send(message)
+
+    def take(self, client: Conversation, message: Packet) -> None:
+        """Let the vehicle obey and answer; the handler of 52 is empty in robots that send parts."""
+        if not (self._parts and isinstance(message, ClientGetSLAMMap)):
             for answer in self.vehicle.take(message):
-                _send(conversation, answer)
+                self.send(client, answer)
 
-    def _send_part(self, number: int) -> None:
-        """Send a part of the map as deployed robots do: to who announced LidarSim, without asking who knows it."""
+    def step(self, steps: int) -> None:
+        self.vehicle.step(STEP_S)
+        if steps % _POSE_EVERY == 0:
+            self.tell(self.vehicle.position())
+        if steps % _MAP_EVERY == 0:
+            if self.vehicle.lidar:
+                self.vehicle.look()
+            if self._parts:
+                self._tell_part(steps // _MAP_EVERY)
+            else:
+                self.tell(self.vehicle.map())
+        if steps % _ASK_EVERY == _ASK_EVERY // 2:
+            self.tell(ServerGetSimulatedLidarData())
+        if steps == _ASK_EVERY:
+            self.tell(ServerCamMode(2))
+            self.tell(ServerLidarStatus(1))
+
+    def _tell_part(self, number: int) -> None:
+        """Send a part of the map to every HQ that announced LidarSim, as deployed robots do."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)
         start = number % PARTS * size
         part = ServerSLAMMapPart(start, min(start + size, len(cells)), cells[start : start + size])
-        for conversation in tuple(self._peers.values()):
-            session = conversation.session
-            if session.state is State.ESTABLISHED and Feature.LIDAR_SIM.value in session.features:
-                with contextlib.suppress(Refused):
-                    session.send(part)
-                conversation.pump()
-
-    def _tell_all(self, message: Packet) -> None:
-        for conversation in tuple(self._peers.values()):
-            if conversation.session.state is State.ESTABLISHED:
-                _send(conversation, message)
-                conversation.pump()
-
-    async def _live(self) -> None:
-        self.vehicle.look()
-        due, steps = self._loop.time(), 0
-        while True:
-            due = max(due + STEP_S, self._loop.time() - 1.0)
-            await asyncio.sleep(due - self._loop.time())
-            steps += 1
-            self.vehicle.step(STEP_S)
-            if steps % _POSE_EVERY == 0:
-                self._tell_all(self.vehicle.position())
-            if steps % _MAP_EVERY == 0:
-                if self.vehicle.lidar:
-                    self.vehicle.look()
-                if self._parts:
-                    self._send_part(steps // _MAP_EVERY)
-                else:
-                    self._tell_all(self.vehicle.map())
-            if steps % _ASK_EVERY == _ASK_EVERY // 2:
-                self._tell_all(ServerGetSimulatedLidarData())
-            if steps == _ASK_EVERY:
-                self._tell_all(ServerCamMode(2))
-                self._tell_all(ServerLidarStatus(1))
-
-
-def _send(conversation: Conversation, message: Packet) -> None:
-    try:
-        session = conversation.session
-        assert isinstance(session, RobotSession)
-        session.may_send(message)
-        session.send(message)
-    except (Refused, EncodeError) as error:
-        log.debug("%s: not sent, %s", conversation.session.name, error)
+        for client in self.clients():
+            if Feature.LIDAR_SIM.value in client.session.features:
+                self.send(client, part)
 
 
 async def simulate(simulation: Simulation) -> None:
-    """Be a simulated robot until cancelled."""
-    await Simulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)
+    """Run a simulated robot until cancelled."""
+    await RobotSimulator(simulation.seed, simulation.version or "1.3", udp=simulation.udp).run(simulation)

@@ -13,15 +13,15 @@ from gateways.tcpudp.settings import HQ_BLOCKS, Feature
 from zbridge.protocol import newest, parse_versions
 
 LISTED = ("1.1", "1.2", "1.3")
-"""What peers of version 1.3 list, and the only list deployed 1.3 and "1.4" robots take without crashing."""
+"""What peers of version 1.3 list; with other lists deployed robots of 1.3 and "1.4" may crash."""
 _LISTED = ",".join(LISTED)
 
 
 class Version(msgspec.Struct, frozen=True):
     """One row. ``listed``: what a robot of this version sends.
 
-    answer: the list such a robot understands from an HQ; None: its own, to the letter.
-    known_to_hq: the packet ids an HQ of this version knows; one it does not know cripples it.
+    ``answer``: the list that such a robot understands from an HQ; None: its own, verbatim. ``known_to_hq``: the packet
+    ids that an HQ of this version knows; an unknown one cripples it.
     """
 
     listed: str

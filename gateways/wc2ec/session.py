@@ -53,7 +53,7 @@ class Wc2EcSession(Session[Wc2EcMessage]):
         return True
 
 
-class ExternalSession(Wc2EcSession):
+class ExternalRole(Wc2EcSession):
     """We play the external controller towards a Webots controller."""
 
     role = Role.HQ
@@ -91,7 +91,7 @@ class ExternalSession(Wc2EcSession):
             self.establish("", ())
 
 
-class ControllerSession(Wc2EcSession):
+class ControllerRole(Wc2EcSession):
     """We play the Webots controller towards an external one."""
 
     role = Role.ROBOT

@@ -6,7 +6,6 @@ page.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import random
@@ -24,16 +23,14 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ControllerSession
-from zbridge.protocol import EncodeError, Refused, Simulation, State
+from gateways.wc2ec.session import ControllerRole
+from zbridge.protocol import Simulation
+from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
-from zbridge.transport.conversation import Accepted, Conversation
-from zbridge.transport.link import Link
-from zbridge.transport.tcp import listen
+from zbridge.transport.conversation import Conversation
 
 log = logging.getLogger("gateways.wc2ec.simulator")
 
-STEP_S = 0.02
 WHEEL_RADIUS_M, TRACK_M = 0.05, 0.3
 FASTEST_RAD_S = 20.0
 LIFT_M_S = 0.1
@@ -58,11 +55,11 @@ DEVICES = (
 
 
 class Machine:
-    """The simulated robot: obeys commands, moves, senses. Knows no connection."""
+    """The robot itself: what commands make it do, and what it measures. Knows no connection."""
 
     def __init__(self, seed: int) -> None:
         rng = random.Random(seed)
-        self.body = Body(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3))
+        self.body = Body.somewhere(rng)
         self.velocities = {_LEFT: 0.0, _RIGHT: 0.0}
         self.lift_m = 0.0
         self.settings = {number: [1.0, 0.0, 0.0] for number in range(_LIGHTS)}
@@ -112,66 +109,35 @@ class Machine:
         return readings
 
 
-class Simulator:
+class ControllerSimulator(Simulator[Wc2EcMessage]):
     """Serves one machine to the external controllers that connect."""
 
     def __init__(self, seed: int, dialect: Dialect) -> None:
+        super().__init__(log)
         self.machine = Machine(seed)
         self._dialect = dialect
-        self._peers: set[Conversation] = set()
-        self._loop = asyncio.get_running_loop()
 
     def __repr__(self) -> str:
-        return f"<Simulator {self.machine}>"
+        return f"<ControllerSimulator {self.machine}>"
 
-    async def run(self, simulation: Simulation) -> None:
-        """Listen and simulate until cancelled."""
-        (wanted,) = simulation.addresses
-        async with listen(wanted, lambda: Accepted(self._admit)) as address:
-            simulation.ready((address,))
-            await self._live()
+    def session(self, peer: str, link: str) -> ControllerRole:
+        session = ControllerRole(self._dialect, values=VALUES)
+        session.name = f"controller {peer}"
+        return session
 
-    def _admit(self, link: Link) -> Conversation:
-        session = ControllerSession(self._dialect, values=VALUES)
-        session.name = f"controller {link.peer}"
-        conversation = Conversation(session, self._loop, deliver=self._deliver)
-        conversation.ended.add_done_callback(lambda _: self._peers.discard(conversation))
-        log.info("%s: connected", link.peer)
-        self._loop.call_soon(self._greet, conversation)
-        return conversation
-
-    def _greet(self, conversation: Conversation) -> None:
-        """Register the devices; from then on send their data."""
+    def greet(self, client: Conversation, link: str) -> None:
+        """Register the devices, before any data."""
         if self._dialect is Dialect.DEPLOYED:
-            _send(conversation, list(DEVICES))
-        if not conversation.ended.done():
-            self._peers.add(conversation)
+            self.send(client, *DEVICES)
 
-    def _deliver(self, messages: list[Wc2EcMessage]) -> None:
-        for message in messages:
-            self.machine.take(message)
+    def take(self, client: Conversation, message: Wc2EcMessage) -> None:
+        self.machine.take(message)
 
-    async def _live(self) -> None:
-        due = self._loop.time()
-        while True:
-            due = max(due + STEP_S, self._loop.time() - 1.0)
-            await asyncio.sleep(due - self._loop.time())
-            self.machine.step(STEP_S)
-            sensed = self.machine.distances() if self._dialect is Dialect.DEPLOYED else self.machine.lights()
-            for conversation in tuple(self._peers):
-                _send(conversation, sensed)
-
-
-def _send(conversation: Conversation, messages: list[SensorData] | list[RegisterSensor]) -> None:
-    if conversation.session.state is State.ESTABLISHED:
-        try:
-            for message in messages:
-                conversation.session.send(message)
-        except (Refused, EncodeError) as error:
-            log.debug("%s: not sent, %s", conversation.session.name, error)
-        conversation.pump()
+    def step(self, steps: int) -> None:
+        self.machine.step(STEP_S)
+        self.tell(*(self.machine.distances() if self._dialect is Dialect.DEPLOYED else self.machine.lights()))
 
 
 async def simulate(simulation: Simulation) -> None:
     """Run a simulated robot until cancelled."""
-    await Simulator(simulation.seed, Dialect(simulation.dialect or "deployed")).run(simulation)
+    await ControllerSimulator(simulation.seed, Dialect(simulation.dialect or "deployed")).run(simulation)

@@ -35,7 +35,7 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ExternalSession
+from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
@@ -67,7 +67,7 @@ class Wc2EcRobot(Robot):
         self.options = options
         self.dialect = options.dialect  # type: ignore[misc]
         self._dialect = Dialect(options.dialect)
-        self._session: ExternalSession | None = None
+        self._session: ExternalRole | None = None
         self._table = Table()
         self._listened: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
@@ -78,7 +78,7 @@ class Wc2EcRobot(Robot):
         self._motor_names = {ROTATIONAL: options.motors.rotational, LINEAR: options.motors.linear}
 
     @property
-    def driving(self) -> ExternalSession | None:
+    def driving(self) -> ExternalRole | None:
         return self._session
 
     @property
@@ -88,8 +88,8 @@ class Wc2EcRobot(Robot):
             return ()
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
-    def session(self, link: str, peer: str) -> ExternalSession:
-        self._session = ExternalSession(self._dialect)
+    def session(self, link: str, peer: str) -> ExternalRole:
+        self._session = ExternalRole(self._dialect)
         self._table = Table()
         self._ring = self._new_ring()
         for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
@@ -267,7 +267,7 @@ class Wc2EcRobot(Robot):
     def _send(self, message: Wc2EcMessage) -> None:
         self._connected().send(message)
 
-    def _connected(self) -> ExternalSession:
+    def _connected(self) -> ExternalRole:
         if self._session is None:
             raise NotReady("offline")
         return self._session

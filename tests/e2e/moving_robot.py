@@ -17,10 +17,13 @@ import time
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, NamedTuple
 
+from gateways.alf.conformance import machine as alf_machine
 from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
+from gateways.tcpudp.conformance import machine as tcpudp_machine
 from gateways.tcpudp.conformance import parser as tcpudp_wire
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.wc2ec.conformance import machine as wc2ec_machine
 from gateways.wc2ec.conformance import parser as wc2ec_wire
 from gateways.wc2ec.conformance.fragile_robot import FragileController
 from zbridge.simulation.judge import Judge
@@ -43,7 +46,7 @@ Tell = Callable[[float], None]
 Serve = Callable[[str, int, Callable[[int], None]], Coroutine[Any, Any, None]]
 
 
-class _Package(tcpudp_wire.Machine):
+class _Package(tcpudp_machine.Machine):
     """The machine of a TCP/UDP robot; tells the speed of 11, the turn of 12, and 0 for 13."""
 
     def __init__(self, tell: Tell, seed: int) -> None:
@@ -59,7 +62,7 @@ class _Package(tcpudp_wire.Machine):
             self._tell(struct.unpack("<f", body)[0] if body else 0.0)
 
 
-class _Vehicle(alf_wire.Machine):
+class _Vehicle(alf_machine.Machine):
     """The machine of an ALF vehicle; tells the speed of 3, and 0 when its motor stops by itself."""
 
     def __init__(self, tell: Tell, seed: int) -> None:
@@ -75,7 +78,7 @@ class _Vehicle(alf_wire.Machine):
         self._tell(0.0)
 
 
-class _Wheels(wc2ec_wire.Robot):
+class _Wheels(wc2ec_machine.Robot):
     """The robot of a simulation; tells the speed of its fastest wheel."""
 
     def __init__(self, tell: Tell, seed: int) -> None:

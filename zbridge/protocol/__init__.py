@@ -11,7 +11,7 @@ session         :class:`Session`: one conversation, in a :class:`Role`, within :
 session_table   :class:`ClientIds`: the ids that a robot gives its clients.
 outbox          :class:`Outbox`: what a session still has to write; ``LIMIT`` frames may wait.
 negotiation     :func:`agree`, :func:`newest`, :func:`parse_versions`: which version both sides speak.
-udp_probe       :class:`Probe`, :class:`Verdict`: whether datagrams get through.
+handshake       :class:`Handshake`: executes the table of a handshake, with the time limit of each step.
 device_clock    :class:`DeviceClock`: when a device measured, by its own millisecond counter.
 rate_limit      :class:`RateLimit`: how often something may happen.
 exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
@@ -43,6 +43,7 @@ from zbridge.protocol.bearings import BearingScan, Sectors
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock
 from zbridge.protocol.exchange import Exchange, ExchangeSession
+from zbridge.protocol.handshake import Handshake
 from zbridge.protocol.kinematics import Differential, Factors, Positive
 from zbridge.protocol.negotiation import agree, newest, parse_versions
 from zbridge.protocol.odometry import Odometry
@@ -63,7 +64,6 @@ from zbridge.protocol.plugin import (
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
 from zbridge.protocol.session_table import ClientIds
-from zbridge.protocol.udp_probe import Probe, Verdict
 
 __all__ = [
     "ATTEND_S",
@@ -82,6 +82,7 @@ __all__ = [
     "Exchange",
     "ExchangeSession",
     "Factors",
+    "Handshake",
     "HqSide",
     "HqSimulation",
     "Limits",
@@ -92,7 +93,6 @@ __all__ = [
     "Outbox",
     "Outcome",
     "Positive",
-    "Probe",
     "Protocol",
     "ProtocolError",
     "RateLimit",
@@ -109,7 +109,6 @@ __all__ = [
     "Traffic",
     "Translate",
     "Unsupported",
-    "Verdict",
     "agree",
     "newest",
     "parse_versions",

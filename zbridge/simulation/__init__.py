@@ -1,4 +1,5 @@
-"""What simulated robots share: the room they drive in, and the accounts of fragile ones.
+"""Simulated peers: the room they live in, what all simulators share, and what all judges share.
 
-Knows no bus.
+``world`` is the room; ``ticker`` the rhythm; ``simulator`` serves a robot to play with. ``judge`` keeps the accounts of
+a fragile peer; ``fragile``, ``sockets`` and ``stream_reader`` connect it. Knows no bus, no gateway and no protocol.
 """

@@ -1,4 +1,4 @@
-"""The small world in which simulated robots live: a walled room with boxes, seen by rays. Sans-IO.
+"""The room in which simulated robots live: walls and boxes, measured by rays. Sans-IO.
 
 Lengths in metres, angles in radians, axes after REP 103. Knows no protocol.
 """
@@ -6,6 +6,7 @@ Lengths in metres, angles in radians, axes after REP 103. Knows no protocol.
 from __future__ import annotations
 
 import math
+import random
 
 import msgspec
 import numpy as np
@@ -26,7 +27,7 @@ class Box(msgspec.Struct, frozen=True):
     y_max: float
 
     def near(self, x: float, y: float, radius: float) -> bool:
-        """Tell whether a disc overlaps the box."""
+        """True if a disc overlaps the box."""
         dx = x - min(max(x, self.x_min), self.x_max)
         dy = y - min(max(y, self.y_min), self.y_max)
         return dx * dx + dy * dy < radius * radius
@@ -45,7 +46,7 @@ _EDGES: Floats = np.array([(box.x_min, box.y_min, box.x_max, box.y_max) for box 
 
 
 class Body:
-    """A round robot: where it is and how it moves."""
+    """A round robot: its place, and how it moves. ``radius`` in metres."""
 
     def __init__(self, x: float = 0.0, y: float = 0.0, heading: float = 0.0, radius: float = 0.2) -> None:
         self.x = x
@@ -53,6 +54,11 @@ class Body:
         self.heading = heading
         self.radius = radius
         self.blocked = False
+
+    @classmethod
+    def somewhere(cls, rng: random.Random, *, heading: float = 0.0, radius: float = 0.2) -> Body:
+        """Place a robot near the middle of the room, within 0.3 rad of ``heading``, as the seed says."""
+        return cls(rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), rng.uniform(-0.3, 0.3) + heading, radius)
 
     def __repr__(self) -> str:
         return f"<Body x={self.x:.2f} y={self.y:.2f} heading={self.heading:.2f}>"
@@ -82,7 +88,7 @@ def cast(x: float, y: float, angles: Floats, range_max: float) -> Floats:
 
 
 class Grid:
-    """An occupancy map in the making: cells[column, row], 0 unknown, 1 free, 2 occupied."""
+    """An occupancy map that sweeps fill: cells[column, row], 0 unknown, 1 free, 2 occupied."""
 
     def __init__(self, side: int, cell: float) -> None:
         self.side = side
@@ -90,7 +96,7 @@ class Grid:
         self.cells: npt.NDArray[np.uint8] = np.zeros((side, side), np.uint8)
 
     def see(self, x: float, y: float, angles: Floats, ranges: Floats, range_max: float) -> None:
-        """Enter one sweep: free along every ray (angles in the world frame), occupied where it ended short."""
+        """Enter one sweep: free along every ray (angles in the world frame), occupied at its end if in range."""
         steps = np.arange(0.0, 1.0, self.cell / (2 * range_max))
         reach = np.minimum(ranges, range_max) - self.cell
         along = steps[None, :] * np.maximum(reach, 0.0)[:, None]

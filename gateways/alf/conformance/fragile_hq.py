@@ -1,8 +1,8 @@
 """A simulated ALF operator program as fragile as the deployed ones: the judge of a gateway that plays the vehicle.
 
-It notes each thing the protocol page ``alf.md`` forbids towards HQ programs, and dies of what they break on. By
-intention it shares no code with the gateway: not its messages, sessions or translation. Section names in the
-docstrings are those of that page.
+It records each violation of what the protocol page ``alf.md`` demands towards HQ programs, and dies of what they break
+on. It shares no code with the gateway: not its messages, sessions or translation. Section names in the docstrings are
+those of that page.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import math
 import re
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -24,7 +23,10 @@ import msgspec
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.parser import DRIVE, END, INFO, INIT, NO_ID, SCAN, Dialect, show
-from zbridge.simulation.judge import Judge
+from zbridge.simulation.fragile import log_violations, print_death
+from zbridge.simulation.judge import Ended, Judge
+from zbridge.simulation.sockets import connected
+from zbridge.simulation.ticker import Ticker
 
 Serves = Literal["auto", "drive", "laser", "both"]
 """What the gateway's listener is configured to serve ("The gateway as vehicle")."""
@@ -172,22 +174,16 @@ def _breaks(number: str, is_float: bool) -> str:
 
 class _Phase(enum.Enum):
     CONNECTING = enum.auto()
-    STANDING = enum.auto()
+    CONNECTED = enum.auto()
     ENDING = enum.auto()
-    """We said END, the vehicle has not."""
+    """The HQ sent END, the vehicle has not."""
     CLOSING = enum.auto()
-    """Both said END."""
+    """Both sent END."""
     OVER = enum.auto()
 
 
-class _Crash(Exception):
-    """The HQ's process has died."""
-
-
 class FragileHq(Judge):
-    """One connection of an operator program, that notes every violation and dies of what breaks it."""
-
-    _DEATH = _Crash
+    """One connection of an operator program: records every violation and dies of what breaks it."""
 
     def __init__(
         self,
@@ -210,8 +206,8 @@ class FragileHq(Judge):
         takes any id but 1 and 2 as END; None: neither, it bears both; ``repeat_s``: from one drive command to the next,
         None for a viewer that sends none; ``stops_reading_after``: so many measurements it reads no more, for good;
         ``answer_s``: longest time to the vehicle's END after ours, and to its close after both; ``flight_s``: how long
-        after the first command measurements may still come; ``keep``: bound of every list; ``note``: called with each
-        violation.
+        after the first command measurements may still come; ``keep``: most entries of every list; ``note``: called with
+        each violation.
         """
         if dialect not in _FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
@@ -234,7 +230,7 @@ class FragileHq(Judge):
         self._drove_at = math.inf
         """When the first command was sent."""
         self._blind = False
-        """It has taken something as END, and shows nothing more."""
+        """True once it took a message as END: it shows nothing more."""
         self._reader = Reader(dialect, points)
         self._phase, self._stopped, self._midway = _Phase.CONNECTING, False, False
         self._conn: socket.socket | None = None
@@ -260,7 +256,7 @@ class FragileHq(Judge):
         self._command = (speed, direction, steering, int(light))
 
     def idle(self) -> None:
-        """Repeat the command it begins with: stand, straight, forward, light off."""
+        """Repeat the command of the start: speed 0, straight, forward, light off."""
         self.drive(0)
 
     async def run(self, host: str, port: int) -> None:
@@ -268,11 +264,8 @@ class FragileHq(Judge):
 
         Raise OSError if nobody listens.
         """
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as conn:
-            conn.setblocking(False)
-            conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await asyncio.get_running_loop().sock_connect(conn, (host, port))
-            self._conn, self._phase = conn, _Phase.STANDING
+        async with connected(host, port) as conn:
+            self._conn, self._phase = conn, _Phase.CONNECTED
             self.connected.set()
             try:
                 async with asyncio.TaskGroup() as tasks:
@@ -280,15 +273,15 @@ class FragileHq(Judge):
                     await self._live(conn)
                     sender.cancel()
             finally:
-                if self._phase is _Phase.STANDING and self.alive:
+                if self._phase is _Phase.CONNECTED and self.alive:
                     self._say_end(conn)
                 self._phase, self._conn = _Phase.OVER, None
                 self._over.set()
 
     async def end(self) -> None:
-        """Send END, and return when the connection is over: END back, then the close (255: both sides then close)."""
+        """Send END, and wait for the end of the connection: END back, then the close (255: both sides then close)."""
         async with self._sending:
-            if self._phase is _Phase.STANDING and self._conn is not None:
+            if self._phase is _Phase.CONNECTED and self._conn is not None:
                 self._say_end(self._conn)
                 self._phase = _Phase.ENDING
                 self._hurry(0.0 if self._stopped else self._answer_s)
@@ -306,13 +299,13 @@ class FragileHq(Judge):
                         if not self._stopped:
                             self._hear(conn, told)
                 self._part()
-        except _Crash as crash:
-            self._event(str(crash))
+        except Ended as ended:
+            self._event(str(ended))
         except TimeoutError:
             self._late()
 
     async def _read(self, conn: socket.socket) -> bytes:
-        """Read, or not any more: "some HQ programs stop reading for good after ten measurements"."""
+        """Read, unless it stopped reading for good ("the driving one stops reading ... after ten measurements")."""
         if self._stopped:
             await self._broken.wait()
             return b""
@@ -323,7 +316,7 @@ class FragileHq(Judge):
             return b""
 
     def _hurry(self, seconds: float) -> None:
-        """Give the vehicle so long to do what it has to do now."""
+        """Give the vehicle ``seconds`` to do what is due."""
         if self._limit is not None:
             self._limit.reschedule(asyncio.get_running_loop().time() + seconds)
 
@@ -397,9 +390,9 @@ class FragileHq(Judge):
                 self._event(f"it reads no more, after {self.scans} measurements")
 
     def _answer(self, conn: socket.socket) -> None:
-        """Take END: answer it if it is not the answer, close this side, and listen for what must not come (255)."""
+        """Take END: answer it unless it is an answer, close this side, and listen for what must not come (255)."""
         self._event("END")
-        if self._phase is _Phase.STANDING:
+        if self._phase is _Phase.CONNECTED:
             self._say_end(conn)
         self._phase = _Phase.CLOSING
         self._hurry(self._answer_s)
@@ -410,22 +403,23 @@ class FragileHq(Judge):
 
     async def _repeat(self, conn: socket.socket) -> None:
         """Send the command every 20 ms even when unchanged ("Dialect `text`" 3)."""
-        due = time.monotonic()
-        while self._repeat_s is not None and self._phase is _Phase.STANDING and not self._broken.is_set():
+        if self._repeat_s is None:
+            return
+        ticker = Ticker(self._repeat_s, first_s=0.0)
+        while self._phase is _Phase.CONNECTED and not self._broken.is_set():
+            await ticker.tick()
             await self._send(conn, wire.write(self.dialect, DRIVE, self._command))
-            due = max(due + self._repeat_s, time.monotonic())
-            await asyncio.sleep(due - time.monotonic())
 
     async def _send(self, conn: socket.socket, data: bytes) -> None:
         async with self._sending:
-            if self._phase is not _Phase.STANDING:
+            if self._phase is not _Phase.CONNECTED:
                 return
             self._drove_at = min(self._drove_at, time.monotonic())
             try:
                 self._midway = True
                 await asyncio.get_running_loop().sock_sendall(conn, data)
                 self._midway = False
-            except OSError as error:  # the kernel tells once: the next read takes what is left, and sees an end
+            except OSError as error:  # reported once: the next read takes what is left, and sees an end
                 self._error = repr(error)
                 self._broken.set()
 
@@ -450,11 +444,9 @@ async def simulate_fragile_hq(
     hq = FragileHq(
         dialect=dialect,
         points=points,
-        serves="both",  # nobody has said what the listener serves
+        serves="both",  # what the listener is configured to serve is not known here
         deployed="driving",
-        note=lambda text: _log.error("violation: %s", text),
+        note=log_violations(_log),
     )
     await hq.run(host, port)
-    if not hq.alive:
-        sys.stdout.write(f"died: {hq.death}\n")
-        sys.stdout.flush()
+    print_death(hq)

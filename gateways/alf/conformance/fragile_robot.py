@@ -1,6 +1,6 @@
 """A simulated ALF vehicle as fragile as the deployed ones: the judge of a gateway that plays HQ.
 
-It notes each thing the protocol page ``alf.md`` forbids towards vehicles, and dies of what kills them. By intention it
+It records each violation of what the protocol page ``alf.md`` demands towards vehicles, and dies of what kills them. It
 shares no code with the gateway: not its messages, sessions or translation. Section names in the docstrings are those
 of that page.
 """
@@ -13,41 +13,37 @@ import enum
 import logging
 import random
 import socket
-import struct
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from gateways.alf.conformance import parser as wire
-from gateways.alf.conformance.parser import Dialect, Heard, Machine, Repeats, Scale, Times, show
-from zbridge.simulation.judge import Judge
+from gateways.alf.conformance.machine import Machine
+from gateways.alf.conformance.parser import Dialect, Heard, Repeats, Scale, Times, show
+from zbridge.simulation.fragile import FragileServer, Work, log_violations, print_death
+from zbridge.simulation.sockets import drain, reset_on_close
+from zbridge.simulation.ticker import Ticker
 
-_READ_BYTES = 65536
-_READS = 16
-_FROZEN_KEPT = 16
+_MOST_MOVE_S = 0.1
+"""Longest time for which the vehicle moves in one cycle, however late it is."""
 _log = logging.getLogger(__name__)
 
 
 class _Phase(enum.Enum):
     LISTENING = enum.auto()
-    STANDING = enum.auto()
+    CONNECTED = enum.auto()
     ENDING = enum.auto()
+    """The vehicle sent END, the HQ has not."""
     CLOSING = enum.auto()
+    """Both sent END."""
     OVER = enum.auto()
-
-
-class _Crash(Exception):
-    """The vehicle's process has died."""
 
 
 _DEPLOYED = Times()
 _COUNTS = Scale()
 
 
-class FragileVehicle(Judge):
-    """One server of a vehicle, that serves one connection, notes every violation and dies of the deadly ones."""
-
-    _DEATH = _Crash
+class FragileVehicle(FragileServer):
+    """One server of a vehicle: serves one connection, records every violation and dies of the deadly ones."""
 
     def __init__(
         self,
@@ -66,9 +62,9 @@ class FragileVehicle(Judge):
     ) -> None:
         """Set up the server.
 
-        ``laser``: it sends 2 and 1; ``drive``: it sends 4 and takes 3; ``speed_full``: the speed of ``text`` that is
-        full; ``scale``: of message 4 in ``binary``; ``machine``: that of the vehicle's other server, else its own;
-        ``keep``: bound of every list; ``note``: called with each violation.
+        ``laser``: sends 2 and 1; ``drive``: sends 4 and takes 3; ``speed_full``: full speed in ``text``; ``scale``: of
+        message 4 in ``binary``; ``machine``: shared with the vehicle's other server, default its own; ``keep``: most
+        entries of every list; ``note``: called with each violation.
         """
         if not (laser or drive) or dialect not in ("text", "binary"):
             raise ValueError(f"no such server: dialect {dialect!r}, laser {laser}, drive {drive}")
@@ -82,10 +78,8 @@ class FragileVehicle(Judge):
         self._scale, self._times = scale, times
         self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, full)
         self._phase = _Phase.LISTENING
-        self._over = asyncio.Event()
         self._conn: socket.socket | None = None
         self._broken: OSError | None = None
-        self._tasks: asyncio.TaskGroup | None = None
         self._sending, self._midway = asyncio.Lock(), False
         self._sequence = 0
         self._booted_s = time.monotonic() - random.Random(f"{seed} clock").uniform(10, 3600)
@@ -98,63 +92,42 @@ class FragileVehicle(Judge):
         state = f"{self._phase.name} violations={len(self.violations)} alive={self.alive}"
         return f"<FragileVehicle {self.dialect} {roles} {state}>"
 
-    async def serve(self, host: str, port: int, ready: Callable[[int], None]) -> None:
-        """Serve on ``port`` (0: any, told to ``ready``) until dead, or until cancelled: it leaves with END then."""
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with contextlib.ExitStack() as sockets:
-            server = sockets.enter_context(socket.create_server((host, port), family=family))
-            server.setblocking(False)
-            ready(server.getsockname()[1])
-            try:
-                async with asyncio.TaskGroup() as self._tasks:
-                    self._tasks.create_task(self._accept(server, sockets))
-                    self._tasks.create_task(self._live())
-            except* _Crash:
-                self._event(f"died: {self.death}")
-            finally:
-                if self._phase is _Phase.STANDING and self.alive and not self._midway:
-                    self._send_end()
-                self._phase = _Phase.OVER
-                self._over.set()
-
     async def end(self) -> None:
-        """Send END, and return when the connection is over: END back within 1 s, then the close ("Roles")."""
+        """Send END, and wait for the end of the connection: END back within 1 s, then the close ("Roles")."""
         async with self._sending:
-            if self._phase is _Phase.STANDING:
+            if self._phase is _Phase.CONNECTED:
                 self._phase, self._waited_s = _Phase.ENDING, 0.0
                 self._send_end()
         if self._phase is not _Phase.LISTENING:
             await self._over.wait()
 
     async def cut(self) -> None:
-        """Break the connection without a word, as a computer that loses its power would."""
+        """Reset the connection, as a computer that loses its power would."""
         async with self._sending:
             if self._conn is not None:
-                self._conn.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                reset_on_close(self._conn)
                 self._conn.close()
                 self._finish("the vehicle cut the connection")
 
     # The connection
 
-    async def _accept(self, server: socket.socket, sockets: contextlib.ExitStack) -> None:
-        """Serve the first connection; take all others and say nothing ("A server accepts one client")."""
-        assert self._tasks is not None
-        loop = asyncio.get_running_loop()
-        conn, _ = await loop.sock_accept(server)
-        conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._conn, self._phase = sockets.enter_context(conn), _Phase.STANDING
-        self._tasks.create_task(self._talk())
-        frozen: list[socket.socket] = []
-        while True:
-            conn, peer = await loop.sock_accept(server)
-            self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase.name.lower()}")
-            frozen.append(sockets.enter_context(conn))
-            for old in frozen[:-_FROZEN_KEPT]:
-                old.close()
-            del frozen[:-_FROZEN_KEPT]
+    def _begin(self, conn: socket.socket) -> None:
+        self._conn, self._phase = conn, _Phase.CONNECTED
+        self._start(self._talk())
+
+    def _phase_name(self) -> str:
+        return self._phase.name.lower()
+
+    def _work(self) -> Iterable[Work]:
+        return (self._live(),)
+
+    def _before_close(self) -> None:
+        if self._phase is _Phase.CONNECTED and self.alive and not self._midway:
+            self._send_end()
+        self._phase = _Phase.OVER
 
     def _finish(self, why: str) -> None:
-        """Have done with the connection; the socket itself is closed at the end, a send may be waiting for it."""
+        """Leave the connection. The socket is closed at the end of the server: a send may be waiting for it."""
         self._event(why)
         if self._conn is not None:
             with contextlib.suppress(OSError):
@@ -163,25 +136,21 @@ class FragileVehicle(Judge):
         self._over.set()
 
     async def _live(self) -> None:
-        """Read, judge and move in cycles; the judge's clock counts a late cycle as one that was not."""
-        cycle_s = self._times.cycle_s
-        due = last = time.monotonic()
+        """Read, judge and move in cycles. A late cycle counts as one of the right length."""
+        ticker = Ticker(self._times.cycle_s)
         while True:
-            due = max(due + cycle_s, time.monotonic())
-            await asyncio.sleep(due - time.monotonic())
-            now = time.monotonic()
-            self._late_s = max(self._late_s, now - due)
-            passed_s = min(now - last, cycle_s)
+            await ticker.tick()
+            self._late_s = max(self._late_s, ticker.late_s)
             if self._conn is not None:
+                passed_s = min(ticker.passed_s, self._times.cycle_s)
                 self._commands, self._waited_s = 0, self._waited_s + passed_s
                 self._listen(self._conn)
                 self._wait(passed_s)
-            self._move(min(now - last, 0.1))
-            last = now
+            self._move(min(ticker.passed_s, _MOST_MOVE_S))
 
     def _listen(self, conn: socket.socket) -> None:
-        """Take all that came since the last cycle, and how it ended if it did."""
-        data, end = _drain(conn)
+        """Take all that came since the last cycle, and the end of the connection."""
+        data, end = drain(conn)
         for heard in self._reader.take(data):
             self._hear(heard)
         if end:
@@ -197,8 +166,8 @@ class FragileVehicle(Judge):
         self._finish(f"the HQ closed the connection {how}: {end}")
 
     def _wait(self, passed_s: float) -> None:
-        """Judge what did not come."""
-        if self._phase is _Phase.STANDING and self.drive:
+        """Judge what is overdue: drive commands, END, the close."""
+        if self._phase is _Phase.CONNECTED and self.drive:
             if problem := self.repeats.cycle(passed_s, self._commands):
                 late = f" (this process woke {self._late_s * 1000:.0f} ms late)"
                 self._violate(problem + late * (self._late_s > self._times.cycle_s / 4))
@@ -225,7 +194,7 @@ class FragileVehicle(Judge):
             self._violate(f"{heard.problem}: {raw}")
         if heard.kind == wire.END:
             self._leave()
-        elif self._phase is _Phase.STANDING:
+        elif self._phase is _Phase.CONNECTED:
             self._obey(heard)
         elif self._waited_s > self._times.flight_s:
             self._violate(f"a message {self._waited_s:.2f} s after the vehicle's END: {raw}")
@@ -245,14 +214,13 @@ class FragileVehicle(Judge):
             self._idle_cycles = 0
 
     def _leave(self) -> None:
-        """Take the HQ's END: answer it if it is not the answer, close this side, wait for the other (255)."""
-        assert self._tasks is not None
+        """Take the HQ's END: answer it unless it is an answer, close this side, wait for the other (255)."""
         if self._command is not None and self._command[0]:
             self._event(f"END while the last command had speed {self._command[0]}")
-        answer = self._phase is _Phase.STANDING
+        answer = self._phase is _Phase.CONNECTED
         self._phase, self._waited_s = _Phase.CLOSING, 0.0
         if self._sending.locked():
-            self._tasks.create_task(self._close_later(answer))
+            self._start(self._close_later(answer))
         else:
             self._close(answer)
 
@@ -261,7 +229,7 @@ class FragileVehicle(Judge):
             self._close(answer)
 
     def _close(self, answer: bool) -> None:
-        """Close this side only: the judge wants to hear what the HQ still says."""
+        """Close this side only: what the HQ still sends is to be judged."""
         if answer:
             self._send_end()
         if self._conn is not None:
@@ -269,7 +237,7 @@ class FragileVehicle(Judge):
                 self._conn.shutdown(socket.SHUT_WR)
 
     def _move(self, dt: float) -> None:
-        """Move; stop the motor after some cycles without a command, even when nobody is there any more."""
+        """Move; stop the motor after some cycles without a command, connected or not."""
         if not self.drive:
             return
         self._idle_cycles += 1
@@ -283,22 +251,19 @@ class FragileVehicle(Judge):
 
     async def _talk(self) -> None:
         """Send 2 once, 4 at once and then every second, 1 ten times a second ("Dialect `text`")."""
-        assert self._tasks is not None
         if self.laser:
             await self._tell(wire.INIT)
-            self._tasks.create_task(self._repeat(wire.SCAN, self._times.scan_s, self._times.scan_s))
+            self._start(self._repeat(wire.SCAN, Ticker(self._times.scan_s)))
         if self.drive:
-            self._tasks.create_task(self._repeat(wire.INFO, 0.0, self._times.info_s))
+            self._start(self._repeat(wire.INFO, Ticker(self._times.info_s, first_s=0.0)))
 
-    async def _repeat(self, kind: int, first_s: float, every_s: float) -> None:
-        due = time.monotonic() + first_s
-        while self._phase is _Phase.STANDING:
-            await asyncio.sleep(due - time.monotonic())
+    async def _repeat(self, kind: int, ticker: Ticker) -> None:
+        while self._phase is _Phase.CONNECTED:
+            await ticker.tick()
             await self._tell(kind)
-            due = max(due + every_s, time.monotonic())
 
     def _send_end(self) -> None:
-        """Send END, between two messages and without waiting: it is too short to be sent in part."""
+        """Send END between two messages, without waiting: it is too short to be sent in part."""
         if self._conn is not None:
             with contextlib.suppress(OSError):
                 self._conn.send(wire.write(self.dialect, wire.END, [1]))
@@ -315,10 +280,10 @@ class FragileVehicle(Judge):
         await self._send(wire.write(self.dialect, kind, fields))
 
     async def _send(self, data: bytes) -> None:
-        """Send a message whole, if nothing has ended yet."""
+        """Send a message whole, unless the conversation is ending."""
         async with self._sending:
             conn = self._conn
-            if conn is None or self._phase is not _Phase.STANDING:
+            if conn is None or self._phase is not _Phase.CONNECTED:
                 return
             try:
                 self._midway = True
@@ -328,7 +293,7 @@ class FragileVehicle(Judge):
             except TimeoutError:
                 self._finish(f"the HQ read nothing for {self._times.send_s:g} s")
             except OSError as error:
-                self._broken = error  # the kernel tells once: a read will only see an end
+                self._broken = error  # reported once: the next read only sees an end
 
 
 async def simulate_fragile(
@@ -345,7 +310,7 @@ async def simulate_fragile(
     """Run a fragile vehicle until cancelled or dead; log each violation, and print what it died of.
 
     Without ``laser_port`` one server does everything; with it (0: any) ``port`` drives and ``laser_port`` measures.
-    ``ready`` is told both ports, once both are listened on.
+    ``ready`` is called with both ports once both listen.
     """
     one = laser_port is None
     drive = FragileVehicle(
@@ -355,13 +320,19 @@ async def simulate_fragile(
         points=points,
         seed=seed,
         times=times,
-        note=_logger("vehicle" if one else "drive"),
+        note=log_violations(_log, "vehicle" if one else "drive"),
     )
     if laser_port is None:
         await _run(drive, host, port, lambda number: ready(number, None))
         return
     laser = FragileVehicle(
-        dialect, laser=True, drive=False, seed=seed, times=times, machine=drive.machine, note=_logger("laser")
+        dialect,
+        laser=True,
+        drive=False,
+        seed=seed,
+        times=times,
+        machine=drive.machine,
+        note=log_violations(_log, "laser"),
     )
     ports: dict[str, int] = {}
 
@@ -375,28 +346,6 @@ async def simulate_fragile(
         tasks.create_task(_run(laser, host, laser_port, lambda number: listening("laser", number)))
 
 
-def _logger(name: str) -> Callable[[str], None]:
-    return lambda text: _log.error("violation, %s: %s", name, text)
-
-
 async def _run(vehicle: FragileVehicle, host: str, port: int, ready: Callable[[int], None]) -> None:
     await vehicle.serve(host, port, ready)
-    if not vehicle.alive:
-        sys.stdout.write(f"died: {vehicle.death}\n")
-        sys.stdout.flush()
-
-
-def _drain(conn: socket.socket) -> tuple[bytes, str]:
-    """Read what there is; how the connection ended, empty if it stands."""
-    data = b""
-    for _ in range(_READS):
-        try:
-            part = conn.recv(_READ_BYTES)
-        except BlockingIOError:
-            break
-        except OSError as error:
-            return data, repr(error)
-        if not part:
-            return data, "closed"
-        data += part
-    return data, ""
+    print_death(vehicle)

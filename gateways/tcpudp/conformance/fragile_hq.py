@@ -1,7 +1,7 @@
 """A simulated HQ program as fragile as the deployed ones: the judge of a gateway that plays robot.
 
-It notes each thing the protocol page ``tcpudp.md`` forbids towards HQ programs, and dies of what cripples them. By
-intention it shares no code with the gateway: not its messages, session, settings or translation. Section names in the
+It records each violation of what the protocol page ``tcpudp.md`` demands towards HQ programs, and dies of what cripples
+them. It shares no code with the gateway: not its messages, session, settings or translation. Section names in the
 docstrings are those of that page.
 """
 
@@ -14,26 +14,25 @@ import errno
 import logging
 import socket
 import struct
-import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.parser import Feature, HqTimes, Packet, show
-from zbridge.simulation.judge import Judge
+from gateways.tcpudp.conformance.parser import Feature, HqTimes, Packet
+from zbridge.simulation.fragile import log_violations, print_death
+from zbridge.simulation.judge import Ended, Judge, show
+from zbridge.simulation.sockets import connected
+from zbridge.simulation.stream_reader import STAMPED, Read, StreamReader
 
 Channel = Literal["tcp", "udp"]
 
-_READ_BYTES = _DATAGRAM_BYTES = 65536
+_DATAGRAM_BYTES = 65536
 _SMALLEST_READ = 6
 _WAITING = 1000
 DEPLOYED_PORT = 11000
 """The UDP port that deployed programs bind ("Handshake", Ports)."""
-_STAMPS = 35
-"""SO_TIMESTAMPNS of Linux, which Python does not name."""
 _log = logging.getLogger(__name__)
 
 
@@ -46,27 +45,11 @@ class _Phase(enum.Enum):
     ENDED = enum.auto()
 
 
-class _Over(Exception):
-    """The program has died, or its connection has ended."""
-
-
-class _Read(NamedTuple):
-    """What one read gave; nothing at the end of the stream. ``late_s``: how late this process itself may have been."""
-
-    at: float
-    channel: Channel
-    data: bytes
-    late_s: float = 0.0
-    why: str = ""
-
-
 _DEPLOYED = HqTimes()
 
 
 class FragileHq(Judge):
-    """An HQ program of one version, for one connection, that notes every violation and dies of the deadly ones."""
-
-    _DEATH = _Over
+    """An HQ program of one version, for one connection: records every violation and dies of the deadly ones."""
 
     def __init__(
         self,
@@ -85,10 +68,10 @@ class FragileHq(Judge):
         """Set up the program.
 
         ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
-        ``unasked``: one of 1.1 has handlers for 53 and 55 before it asked, which its first programs have not;
-        ``repeat_s``: how often the stick is repeated, None: a viewer that sends nothing by itself; ``udp_port``: what
-        to bind, 0 for any; None: what deployed programs bind, or any where that is taken; ``keep``: bound of every
-        list; ``note``: called with each violation.
+        ``unasked``: a 1.1 program has handlers for 53 and 55 before it asked, unlike the first programs of 1.1;
+        ``repeat_s``: seconds between repetitions of the stick, None for a viewer that sends nothing by itself;
+        ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken; ``keep``: most
+        entries of every list; ``note``: called with each violation.
         """
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
@@ -109,7 +92,7 @@ class FragileHq(Judge):
         self._phase = _Phase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
         self._stick = (wire.STOP, b"")
-        self._inbox: asyncio.Queue[_Read] = asyncio.Queue(_WAITING)
+        self._inbox: asyncio.Queue[tuple[Channel, Read]] = asyncio.Queue(_WAITING)
         self._tasks: asyncio.TaskGroup | None = None
         self._tcp: socket.socket | None = None
         self._robot: tuple[str, int] = ("", 0)
@@ -128,32 +111,31 @@ class FragileHq(Judge):
     async def run(self, host: str, port: int) -> None:
         """Connect, and serve until cancelled, dead, or the robot closes (``events`` say which); once per object."""
         loop, since = asyncio.get_running_loop(), time.time()
-        self._tcp = await _connect(host, port)
-        self._robot = self._tcp.getpeername()
-        reader = _Reader(self._tcp, since, lambda read: loop.call_soon_threadsafe(self._arrive, read))
-        reader.start()
-        try:
-            await self._work()
-        except asyncio.CancelledError:
-            self._event("cancelled")
-            raise
-        finally:
-            self._phase = _Phase.ENDED
-            self._close(reader, loop)
+        async with connected(host, port, STAMPED) as self._tcp:
+            self._tcp.setblocking(True)  # for the thread that reads
+            self._robot = self._tcp.getpeername()
+            reader = StreamReader(self._tcp, since, lambda read: loop.call_soon_threadsafe(self._arrive, "tcp", read))
+            reader.start()
+            try:
+                await self._work()
+            except asyncio.CancelledError:
+                self._event("cancelled")
+                raise
+            finally:
+                self._phase = _Phase.ENDED
+                self._close(self._tcp, reader, loop)
 
     async def _work(self) -> None:
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 self._tasks.create_task(self._converse())
-        except* _Over:
+        except* Ended:
             self._event(f"died: {self.death}" if self.death else "ended")
 
-    def _close(self, reader: threading.Thread, loop: asyncio.AbstractEventLoop) -> None:
-        assert self._tcp is not None
+    def _close(self, tcp: socket.socket, reader: StreamReader, loop: asyncio.AbstractEventLoop) -> None:
         with contextlib.suppress(OSError):
-            self._tcp.shutdown(socket.SHUT_RDWR)  # ends the read of the thread
+            tcp.shutdown(socket.SHUT_RDWR)  # ends the read of the thread
         reader.join()
-        self._tcp.close()
         if self._udp is not None:
             loop.remove_reader(self._udp.fileno())
             self._udp.close()
@@ -248,9 +230,9 @@ class FragileHq(Judge):
 
     # What arrives
 
-    def _arrive(self, read: _Read) -> None:
+    def _arrive(self, channel: Channel, read: Read) -> None:
         try:
-            self._inbox.put_nowait(read)
+            self._inbox.put_nowait((channel, read))
         except asyncio.QueueFull:
             self._event(f"{_WAITING} reads wait, one was dropped")
 
@@ -261,53 +243,55 @@ class FragileHq(Judge):
             while True:
                 data, source = self._udp.recvfrom(_DATAGRAM_BYTES)
                 if source == self._robot:
-                    self._arrive(_Read(time.monotonic(), "udp", data))
+                    self._arrive("udp", Read(time.monotonic(), data))
                 else:
                     self._event(f"a datagram from {source[0]}:{source[1]}, not from the robot: {show(data)}")
 
     async def _converse(self) -> None:
         while True:
-            read = await self._inbox.get()
-            if read.channel == "udp":
+            channel, read = await self._inbox.get()
+            if channel == "udp":
                 received = wire.datagram(read.data)
                 if received is None:
                     self._die(f"a datagram whose length field is wrong: {show(read.data)}")
-                self._take(received, read)
+                self._take(received, channel, read.at)
             elif read.data:
                 self._read(read)
             else:
-                self._event(read.why or "the robot closed the connection")
-                raise _Over
+                why = read.why or "the robot closed the connection"
+                self._event(why)
+                raise Ended(why)
 
-    def _read(self, read: _Read) -> None:
+    def _read(self, read: Read) -> None:
         """Take one read as one packet ("The gateway as robot")."""
         if len(read.data) < _SMALLEST_READ:
             self._violate(f"a read of {len(read.data)} bytes, taken as a disconnect: {show(read.data)}")
-            self._event("hung up: took a short read as a disconnect")
-            raise _Over
+            why = "hung up: took a short read as a disconnect"
+            self._event(why)
+            raise Ended(why)
         received, problem = self._reads.take(read.data)
         late = f" (this process read {read.late_s * 1000:.0f} ms late)"
         if self._reads.hopeless:
             self._die(problem)
         if received is not None:
-            self._take(received, read)
+            self._take(received, "tcp", read.at)
         elif self._reads.joined and read.late_s >= self._excuse_s(len(self._reads.joined)):
             self._event(f"joined by this process: {problem}{late}")
             for packet in self._reads.joined:
-                self._take(packet, read)
+                self._take(packet, "tcp", read.at)
         elif problem:
             self._violate(problem + late * (read.late_s > 0.002))
 
     def _excuse_s(self, packets: int) -> float:
-        """How late this process must have been to have joined so many packets itself, had they been spaced."""
+        """Give how late the reader must have been to be at fault itself for joining so many spaced packets."""
         return 0.8 * self._times.gap_s * (packets - 1)
 
     # Packets
 
-    def _take(self, packet: Packet, read: _Read) -> None:
+    def _take(self, packet: Packet, channel: Channel, at: float) -> None:
         kind, body = packet.kind, packet.body
-        raw = f"{read.channel} packet {kind}, body {show(body)}"
-        self.received.append((read.at, read.channel, kind, body))
+        raw = f"{channel} packet {kind}, body {show(body)}"
+        self.received.append((at, channel, kind, body))
         del self.received[: -self._keep]
         self.counts[kind] += 1
         if kind not in wire.KNOWN_TO_HQ[self.version]:
@@ -316,8 +300,8 @@ class FragileHq(Judge):
             self._die(f"{problem}: {raw}")
         if packet.sender != wire.SERVER_ID:
             self._violate(f"id byte {packet.sender} instead of {wire.SERVER_ID}: {raw}")
-        if (channel := self._channel(kind, body)) not in (read.channel, None):
-            self._violate(f"packet {kind} by {read.channel.upper()} instead of {channel.upper()}: {raw}")
+        if (due := self._channel(kind, body)) not in (channel, None):
+            self._violate(f"packet {kind} by {channel.upper()} instead of {due.upper()}: {raw}")
         if problem := self._untimely(kind):
             return self._violate(f"{problem}: {raw}")
         if problem := wire.hq_value_problem(kind, body, self.settings.side if self.settings else 0):
@@ -325,9 +309,9 @@ class FragileHq(Judge):
         return self._obey(kind, body)
 
     def _channel(self, kind: int, body: bytes) -> Channel | None:
-        """Tell what carries a packet ("Packets"); none: either, as nothing was agreed for lack of an answer 6."""
+        """Tell what must carry a packet ("Packets"); None: either, as without a 6 nothing was agreed."""
         if kind == wire.UDP_ANSWER:
-            return "udp" if any(body) else "tcp"  # which is reproached for itself
+            return "udp" if any(body) else "tcp"  # 6(false) is a violation by itself
         if kind in wire.BY_UDP and self._udp is not None:
             return None if self._works is None else "udp" if self._works else "tcp"
         return "tcp"
@@ -453,7 +437,7 @@ class FragileHq(Judge):
             self._start(self._repeat(self._repeat_s))
 
     async def _repeat(self, period_s: float) -> None:
-        """Say what the stick says, 13 while idle ("Packets")."""
+        """Repeat the stick, 13 while idle ("Packets")."""
         while True:
             self.send(*self._stick)
             await asyncio.sleep(period_s)
@@ -461,30 +445,6 @@ class FragileHq(Judge):
     def _start(self, work: Coroutine[None, None, None]) -> None:
         assert self._tasks is not None
         self._tasks.create_task(work)
-
-
-class _Reader(threading.Thread):
-    """Reads the stream whatever the event loop does, and tells how late it was itself.
-
-    The kernel joins what waits, so what is joined accuses the robot only where this thread was not late: between the
-    arrival of the last packet and the next read, and while it was ready to run and had no processor.
-    """
-
-    def __init__(self, tcp: socket.socket, since: float, give: Callable[[_Read], object]) -> None:
-        super().__init__(name="fragile-hq-reads", daemon=True)
-        self._tcp, self._arrived, self._give = tcp, since, give
-
-    def run(self) -> None:
-        data = b" "
-        while data:
-            began, waited, why = time.time(), _waited_s(), ""
-            try:
-                data, stamps, _, _ = self._tcp.recvmsg(_READ_BYTES, 64)
-            except OSError as error:
-                data, stamps, why = b"", [], f"the connection broke: {error!r}"
-            late_s = max(began - self._arrived, _waited_s() - waited)
-            self._arrived = _stamp(stamps)
-            self._give(_Read(time.monotonic(), "tcp", data, late_s, why))
 
 
 async def simulate_fragile_hq(
@@ -506,41 +466,7 @@ async def simulate_fragile_hq(
         skips_map_flag=skips_map_flag,
         udp_port=udp_port,
         times=times,
-        note=lambda text: _log.error("violation: %s", text),
+        note=log_violations(_log),
     )
     await hq.run(host, port)
-    if not hq.alive:
-        sys.stdout.write(f"died: {hq.death}\n")
-        sys.stdout.flush()
-
-
-async def _connect(host: str, port: int) -> socket.socket:
-    """Connect, and leave the socket blocking for its reading thread."""
-    tcp = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    tcp.setblocking(False)
-    try:
-        tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if sys.platform == "linux":
-            tcp.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
-        await asyncio.get_running_loop().sock_connect(tcp, (host, port))
-    except BaseException:
-        tcp.close()
-        raise
-    tcp.setblocking(True)
-    return tcp
-
-
-def _stamp(stamps: Sequence[tuple[int, int, bytes]]) -> float:
-    """Give the time of day when the kernel took the last byte read; now where it does not tell."""
-    for level, kind, data in stamps:
-        if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMPS, 16):
-            seconds, nanoseconds = struct.unpack("qq", data)
-            return float(seconds + nanoseconds * 1e-9)
-    return time.time()
-
-
-def _waited_s() -> float:
-    """Give how long this thread was ready to run and had no processor so far; 0 where the system does not tell."""
-    with contextlib.suppress(OSError, ValueError, IndexError), open("/proc/thread-self/schedstat", "rb") as file:
-        return int(file.read().split()[1]) * 1e-9
-    return 0.0
+    print_death(hq)

@@ -1,7 +1,7 @@
 """A simulated TCP/UDP robot as fragile as the deployed ones: the judge of a gateway that plays HQ.
 
-It notes each thing the protocol page ``tcpudp.md`` forbids towards robots, and dies of what kills them. By intention it
-shares no code with the gateway: not its messages, session, settings or translation. Section names in the docstrings
+It records each violation of what the protocol page ``tcpudp.md`` demands towards robots, and dies of what kills them.
+It shares no code with the gateway: not its messages, session, settings or translation. Section names in the docstrings
 are those of that page.
 """
 
@@ -14,21 +14,23 @@ import logging
 import math
 import random
 import socket
-import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from typing import Literal
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.parser import Feature, Loss, Packet, Times, show
-from zbridge.simulation.judge import Judge
+from gateways.tcpudp.conformance.machine import Machine
+from gateways.tcpudp.conformance.parser import Feature, Loss, Packet, Times
+from zbridge.simulation.fragile import FragileServer, Work, log_violations, print_death
+from zbridge.simulation.judge import show
+from zbridge.simulation.sockets import bind_tcp_and_udp, readable
+from zbridge.simulation.ticker import Ticker
 
 Channel = Literal["tcp", "udp"]
 
-_TICK_S = 0.02
+_STEP_S, _MOST_MOVE_S = 0.02, 0.1
+"""Seconds between two steps of the robot, and most seconds for which it moves in one."""
 _DATAGRAM_BYTES = 65536
-_BIND_TRIES = 20
-_FROZEN_KEPT = 16
 _LOOK_S = 0.006
 """Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
 _log = logging.getLogger(__name__)
@@ -43,10 +45,6 @@ class _Phase(enum.Enum):
     FROZEN = enum.auto()
 
 
-class _Crash(Exception):
-    """The robot's process has died."""
-
-
 _DEPLOYED = Times()
 _EXPECTED = {
     _Phase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
@@ -55,10 +53,8 @@ _EXPECTED = {
 }
 
 
-class FragileRobot(Judge):
-    """A robot of one version that serves one connection, notes every violation and dies of the deadly ones."""
-
-    _DEATH = _Crash
+class FragileRobot(FragileServer):
+    """A robot of one version: serves one connection, records every violation and dies of the deadly ones."""
 
     def __init__(
         self,
@@ -82,10 +78,10 @@ class FragileRobot(Judge):
 
         ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
         announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
-        fraction of positions sent as id 53; ``misread``: the fraction of what is dropped after the handshake, of
-        each packet id in an order of its own; ``again``: take a connection after the first, which loses half of all
-        packets in both directions and gets no telemetry ("One usable connection"); ``keep``: bound of every list;
-        ``note``: called with each violation.
+        fraction of positions sent as id 53; ``misread``: the fraction of packets dropped after the handshake, chosen
+        for each packet id by itself; ``again``: serve a connection after the first, which loses half of all packets in
+        both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of every list; ``note``:
+        called with each violation.
         """
         known = frozenset(list(Feature)[: wire.FLAGS[version]])
         others = known if features is None else frozenset(features)
@@ -98,8 +94,8 @@ class FragileRobot(Judge):
         self.received: list[tuple[float, Channel, int, bytes]] = []
         self.misread: list[tuple[float, Channel, int, bytes]] = []
         self.piled: list[tuple[float, Channel, int, bytes]] = []
-        """What was lost in a read that this process itself joined, for it was late."""
-        self.machine = wire.Machine(random.Random(f"{seed} talk"))
+        """What was lost in a read that this process itself joined, because it was late."""
+        self.machine = Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
         self._sleeps, self._answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
@@ -112,14 +108,13 @@ class FragileRobot(Judge):
         self._broken: ConnectionResetError | None = None
         self._udp: socket.socket | None = None
         self._sending = asyncio.Lock()
-        self._tasks: asyncio.TaskGroup | None = None
         self._empty_at = self._unread_s = 0.0
         self._wake_at = 0.0
         self._closed_at = 0.0
         self._forget()
 
     def _forget(self) -> None:
-        """Know nothing of an HQ."""
+        """Forget the HQ."""
         self._reads = wire.Reads()
         self._awake = asyncio.Event()
         self._hq_features: frozenset[Feature] = frozenset()
@@ -133,47 +128,32 @@ class FragileRobot(Judge):
     def __repr__(self) -> str:
         return f"<FragileRobot {self.version} {self._phase.name} violations={len(self.violations)} alive={self.alive}>"
 
-    async def serve(self, host: str, port: int, ready: Callable[[int], None]) -> None:
-        """Serve on TCP and UDP port ``port`` (0: any, told to ``ready``) until cancelled or dead."""
-        tcp, self._udp = _bind(host, port)
-        with contextlib.ExitStack() as sockets:
-            sockets.enter_context(tcp)
-            sockets.enter_context(self._udp)
-            ready(tcp.getsockname()[1])
-            try:
-                async with asyncio.TaskGroup() as self._tasks:
-                    self._tasks.create_task(self._accept(tcp, sockets))
-                    self._tasks.create_task(self._hear(self._udp))
-                    self._tasks.create_task(self._move())
-            except* _Crash:
-                self._event(f"died: {self.death}")
+    def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:
+        """Bind TCP and UDP to the same number ("Handshake", Ports)."""
+        tcp, self._udp = bind_tcp_and_udp(host, port)
+        sockets.enter_context(self._udp)
+        return sockets.enter_context(tcp)
+
+    def _work(self) -> Iterable[Work]:
+        assert self._udp is not None
+        return self._hear(self._udp), self._move()
+
+    def _phase_name(self) -> str:
+        return self._phase.name.lower()
 
     # TCP
 
-    async def _accept(self, tcp: socket.socket, sockets: contextlib.ExitStack) -> None:
-        """Serve the first connection; take all others and say nothing ("One usable connection per start")."""
-        assert self._tasks is not None
-        loop = asyncio.get_running_loop()
-        frozen: list[socket.socket] = []
-        while True:
-            conn, peer = await loop.sock_accept(tcp)
-            if self._phase is _Phase.LISTENING or (self._again and self._conn is None):
-                self._begin(conn)
-                self._tasks.create_task(self._converse(sockets.enter_context(conn)))
-                continue
-            self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase.name.lower()}")
-            frozen.append(sockets.enter_context(conn))
-            for old in frozen[:-_FROZEN_KEPT]:
-                old.close()
-            del frozen[:-_FROZEN_KEPT]
+    def _free(self) -> bool:
+        """True with ``again`` once the connection before has ended ("One usable connection per start")."""
+        return self._again and self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
-        """Begin with an HQ; with one that is not the first, poorly."""
-        conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        """Begin with an HQ; a connection after the first is a poor one."""
         if self._phase is not _Phase.LISTENING:
             self._poor, self.client_id = True, max(2, self.client_id) % 255 + 1
             self._forget()
         self._phase, self._conn = _Phase.GREETED, conn
+        self._start(self._converse(conn))
 
     def cut(self) -> None:
         """Break the connection."""
@@ -189,7 +169,7 @@ class FragileRobot(Judge):
             while data := await self._next(conn):
                 await self._read(data)
                 await self._nap()
-            if self._broken:  # a send was told of it first, and the kernel tells once
+            if self._broken:  # reported to a send, and only once
                 raise self._broken
             self._event("the HQ closed the connection")
         except OSError as error:
@@ -201,16 +181,16 @@ class FragileRobot(Judge):
                 conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
 
     async def _next(self, conn: socket.socket) -> bytes:
-        """Read as soon as there is anything; know at any time since when there was nothing."""
+        """Read as soon as there is anything; look often, to know since when there was nothing."""
         while (data := self._waiting()) is None:
-            await _readable(conn, _LOOK_S)
+            await readable(conn, _LOOK_S)
         return data
 
     async def _read(self, data: bytes) -> None:
-        """Take what one read gave as one packet: what piled up while this process stood still is lost.
+        """Take one read as one packet: what piled up while this process was stalled is lost.
 
-        Packets that were spaced as they are to be need a while to pile up. Those that came within less, after a moment
-        at which there was nothing to read, were not spaced: the HQ joined them, however late this process is.
+        Joined packets are the HQ's fault if they came in less time, since a look found nothing, than correctly spaced
+        packets need; the text says how long this process did not read if it may be at fault itself.
         """
         received, problem = self._reads.take(data)
         joined = self._reads.joined
@@ -248,10 +228,10 @@ class FragileRobot(Judge):
 
     async def _hear(self, udp: socket.socket) -> None:
         while True:
-            await _readable(udp)
+            await readable(udp)
             try:
                 data, source = udp.recvfrom(_DATAGRAM_BYTES)
-            except OSError:  # another one's, or the news that ours was not delivered
+            except OSError:  # taken by another read, or the report that a datagram of ours was not delivered
                 continue
             await self._datagram(data, source[:2])
 
@@ -270,7 +250,7 @@ class FragileRobot(Judge):
         if received is None:
             self._die(f"a datagram whose length field is wrong: {show(data)}")
         if time.monotonic() >= self._wake_at:
-            await self._awake.wait()  # the loop may run the two readers in the wrong order
+            await self._awake.wait()  # the loop may run the two readers in either order
         if received.kind == wire.UDP_PROBE and self._source is None:
             self._source = source
         if self._source is None:
@@ -358,7 +338,7 @@ class FragileRobot(Judge):
     # Handshake
 
     async def _settle(self, body: bytes) -> None:
-        """Take the HQ's settings; harm comes from version strings ("Settings and version negotiation")."""
+        """Take the HQ's settings; judge its version string ("Settings and version negotiation")."""
         if self._phase is not _Phase.GREETED:
             return self._violate(f"a second clientSettings: {show(body)}")
         settings = wire.client_settings(body)
@@ -376,12 +356,11 @@ class FragileRobot(Judge):
 
     async def _offer_udp(self) -> None:
         """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake" 3 to 6)."""
-        assert self._tasks is not None
         self._offered, self._phase = True, _Phase.ASLEEP
         self._wake_at = time.monotonic() + self._times.probe_s
         self._quiet_until = time.monotonic() + self._times.silence_s
         await self._send(wire.START_UDP)
-        self._tasks.create_task(self._miss_status())
+        self._start(self._miss_status())
         await asyncio.sleep(self._times.probe_s)
         self._phase = _Phase.WOKEN
         self._awake.set()
@@ -414,29 +393,26 @@ class FragileRobot(Judge):
         return self._establish()
 
     def _establish(self) -> None:
-        assert self._tasks is not None
         self._phase = _Phase.ESTABLISHED
         if self._poor:
             return
         if self._times.unasked_s:
-            self._tasks.create_task(self._chatter(self._conn))
+            self._start(self._chatter(self._conn))
         if self.version == "1.4" and Feature.LIDAR_SIM in self._hq_features:
-            self._tasks.create_task(self._send_parts(self._conn))
+            self._start(self._send_parts(self._conn))
 
     def _loses(self) -> bool:
-        """Tell whether a poor connection loses the packet."""
+        """True if the connection is a poor one and loses the packet."""
         return self._poor and self._losses.random() < 0.5
 
     # Motion, maps, talk
 
     async def _move(self) -> None:
-        """Move as told, for ever: a deployed robot does not stop by itself."""
-        last = time.monotonic()
+        """Move as commanded, for ever: a deployed robot does not stop by itself."""
+        ticker = Ticker(_STEP_S)
         while True:
-            await asyncio.sleep(_TICK_S)
-            now = time.monotonic()
-            self.machine.step(min(now - last, 0.1))
-            last = now
+            await ticker.tick()
+            self.machine.step(min(ticker.passed_s, _MOST_MOVE_S))
 
     async def _send_map(self) -> None:
         """Answer 52; the first answer of a 1.1 robot says no map yet, the handler of a "1.4" is empty ("Packets")."""
@@ -467,7 +443,7 @@ class FragileRobot(Judge):
                 await self._send(kind, body or self.machine.body(kind))
 
     def _waiting(self) -> bytes | None:
-        """Read what is there without waiting: none where nothing is, empty at the end of the stream."""
+        """Read without waiting: None if nothing is there, empty at the end of the stream."""
         if self._conn is None:
             return b""
         looked_at, data = time.monotonic(), None
@@ -490,48 +466,6 @@ async def simulate_fragile(
     times: Times = _DEPLOYED,
 ) -> None:
     """Run a fragile robot until cancelled or dead; log each violation, and print what it died of."""
-    robot = FragileRobot(
-        version=version, udp=udp, seed=seed, times=times, note=lambda text: _log.error("violation: %s", text)
-    )
+    robot = FragileRobot(version=version, udp=udp, seed=seed, times=times, note=log_violations(_log))
     await robot.serve(host, port, ready)
-    if not robot.alive:
-        sys.stdout.write(f"died: {robot.death}\n")
-        sys.stdout.flush()
-
-
-def _bind(host: str, port: int) -> tuple[socket.socket, socket.socket]:
-    """Bind TCP and UDP to the same number ("Handshake", Ports)."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for left in reversed(range(_BIND_TRIES)):
-        tcp, udp = socket.create_server((host, port), family=family), socket.socket(family, socket.SOCK_DGRAM)
-        tcp.setblocking(False)
-        udp.setblocking(False)
-        try:
-            udp.bind((host, tcp.getsockname()[1]))
-        except OSError:
-            tcp.close()
-            udp.close()
-            if port or not left:
-                raise
-        else:
-            break
-    return tcp, udp
-
-
-async def _readable(sock: socket.socket, most_s: float = math.inf) -> None:
-    """Wait until a read would give something, or for ``most_s``; the same with asyncio's and uvloop's loop."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[None] = loop.create_future()
-    loop.add_reader(sock.fileno(), _wake, future)
-    timer = loop.call_later(most_s, _wake, future) if most_s < math.inf else None
-    try:
-        await future
-    finally:
-        loop.remove_reader(sock.fileno())
-        if timer is not None:
-            timer.cancel()
-
-
-def _wake(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)
+    print_death(robot)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from gateways.tcpudp.hq.options import HqOptions
 from gateways.tcpudp.maps import TCP_BYTES, Geometry
 from gateways.tcpudp.messages import PACKETS, Packet, ServerPosition, ServerSLAMMap, encode_packet
-from gateways.tcpudp.session import RobotSession
+from gateways.tcpudp.session import RobotRole
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from zbridge.protocol import Datagram, EncodeError, Limits, Send
 
@@ -17,7 +17,7 @@ _ASKING = ("1.1",)
 _ON_REQUEST = frozenset({ServerSLAMMap.spec.id, ServerPosition.spec.id})
 
 
-class HqClient(RobotSession):
+class HqClient(RobotRole):
     """One program: the geometry of the map that it was announced, and the packets that it knows."""
 
     def __init__(self, bounds: Limits, settings: Settings, number: int, options: HqOptions, geometry: Geometry) -> None:
@@ -65,7 +65,7 @@ class HqClient(RobotSession):
 
 def newest_of(slot: str, packet: Packet) -> Send:
     """Encode a packet once for all clients, to be queued as the newest of its slot, by datagram where it may be."""
-    frame = encode_packet(packet, RobotSession.sender_id)
+    frame = encode_packet(packet, RobotRole.sender_id)
     datagram = Datagram(frame) if packet.spec.carrier.value == "udp*" else frame
 
     def send(session: HqClient, now: float) -> None:
@@ -79,7 +79,7 @@ def each_once(packet: Packet) -> Send:
 
     Raises EncodeError if it is longer than programs take by TCP.
     """
-    frame = encode_packet(packet, RobotSession.sender_id)
+    frame = encode_packet(packet, RobotRole.sender_id)
     if len(frame) > TCP_BYTES:
         raise EncodeError(f"packet of {len(frame)} bytes, HQ programs take {TCP_BYTES} by TCP")
     packet_id = frame[5]

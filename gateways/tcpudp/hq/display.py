@@ -37,7 +37,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.session import RobotSession
+from gateways.tcpudp.session import RobotRole
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.translate import NAME, OFF, ON
 from zbridge.fleet import topics
@@ -170,7 +170,7 @@ def _request(session: HqClient, now: float) -> None:
         session.leave_out(ServerGetSimulatedLidarData.spec.id)
 
 
-_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotSession.sender_id)
+_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotRole.sender_id)
 _SHOWN: dict[str, Callable[[Display, Any], Send | None]] = {
     topics.POSE.path: Display._pose,
     topics.MAP.path: Display._map,

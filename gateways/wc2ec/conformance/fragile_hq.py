@@ -1,7 +1,7 @@
 """A simulated external controller as fragile as the deployed ones: the judge of a gateway that plays Webots.
 
-It notes each thing the protocol page ``wc2ec.md`` forbids towards external controllers, and ends of what ends them. By
-intention it shares no code with the gateway: not its messages, sessions or translation. Section names in the
+It records each violation of what the protocol page ``wc2ec.md`` demands towards external controllers, and dies of what
+ends them. It shares no code with the gateway: not its messages, sessions or translation. Section names in the
 docstrings are those of that page.
 """
 
@@ -12,7 +12,6 @@ import logging
 import math
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
 
@@ -28,9 +27,10 @@ from gateways.wc2ec.conformance.parser import (
     SET,
     SET_VALUE,
     Dialect,
-    show,
 )
-from zbridge.simulation.judge import Judge
+from zbridge.simulation.fragile import log_violations, print_death
+from zbridge.simulation.judge import Ended, Judge, show
+from zbridge.simulation.sockets import connected
 
 REGISTER, ERROR = 0, 127
 MOTOR_TYPES = (53, 46)
@@ -112,14 +112,8 @@ class Reader:
         return None if raw[0] == ERROR else raw[_HEADER + 1 :].decode("utf-8", "backslashreplace")
 
 
-class _Gone(Exception):
-    """The controller's task has ended, and why."""
-
-
 class FragileController(Judge):
-    """One start of an external controller, that notes every violation and dies of the deadly ones."""
-
-    _DEATH = _Gone
+    """One start of an external controller: records every violation and dies of the deadly ones."""
 
     def __init__(
         self,
@@ -133,7 +127,7 @@ class FragileController(Judge):
         """Set up the controller.
 
         ``split``: it writes a command field by field; ``flight_s``: how long after a disableSensor data may still come;
-        ``keep``: bound of every list; ``note``: called with each violation.
+        ``keep``: most entries of every list; ``note``: called with each violation.
         """
         if dialect not in _DATA:
             raise ValueError(f"no such controller: dialect {dialect!r}")
@@ -143,11 +137,11 @@ class FragileController(Judge):
         """Monotonic seconds, command, sensor type, sensor number, name or value; good or bad."""
         self.connected = asyncio.Event()
         self.ready = asyncio.Event()
-        """It does something: with the first data after its connection ("The gateway as Webots controller")."""
+        """Set by the first data after the connection: before that it does nothing ("The gateway as Webots ...")."""
         self.devices: dict[int, tuple[int, str]] = {}
         """Type and name of what was registered, by number."""
         self.values: dict[int, float] = {}
-        """The last value by number, whether it was registered, or enabled, or not."""
+        """The last value by number; also of sensors that were neither registered nor enabled."""
         self.counts: dict[int, int] = {}
         """How many values came, by number."""
         self.enabled: set[int] = set()
@@ -161,7 +155,7 @@ class FragileController(Judge):
         self._work: asyncio.Task[None] | None = None
 
     def __repr__(self) -> str:
-        state = "over" if self._over.is_set() else "standing" if self.connected.is_set() else "connecting"
+        state = "over" if self._over.is_set() else "connected" if self.connected.is_set() else "connecting"
         return f"<FragileController {self.dialect} {state} violations={len(self.violations)} alive={self.alive}>"
 
     @property
@@ -174,10 +168,7 @@ class FragileController(Judge):
 
         Raise OSError if nobody listens ("it never retries").
         """
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as conn:
-            conn.setblocking(False)
-            conn.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await asyncio.get_running_loop().sock_connect(conn, (host, port))
+        async with connected(host, port) as conn:
             self._conn = conn
             self.connected.set()
             if self.dialect == "draft":
@@ -191,7 +182,7 @@ class FragileController(Judge):
                 self.ready.set()
 
     async def end(self) -> None:
-        """Leave, by closing the connection: there is no word for it ("Roles")."""
+        """Leave, by closing the connection: the protocol has no message for it ("Roles")."""
         if self._work is not None and self._conn is not None:
             self._event("the external controller left")
             self._work.cancel()
@@ -202,7 +193,7 @@ class FragileController(Judge):
     async def set(self, device: str | int, value: float) -> None:
         """Send setValue to a device by name or number ("Dialect `deployed`" 130); KeyError if it is not registered.
 
-        Before it is ready it does nothing: wait for that.
+        Waits until it is ready: before that a controller does nothing.
         """
         self._only("deployed")
         if self._conn is not None:
@@ -260,8 +251,8 @@ class FragileController(Judge):
                     self._hear(told)
             if self._reader.rest:
                 self._violate(f"the connection ended within a message: {show(self._reader.rest)}")
-        except _Gone as gone:
-            self._event(str(gone))
+        except Ended as ended:
+            self._event(str(ended))
 
     async def _read(self, conn: socket.socket) -> bytes:
         how = "EOF"
@@ -330,8 +321,6 @@ async def simulate_fragile_hq(host: str, port: int, *, dialect: Dialect, split: 
 
     Raise OSError if nobody listens.
     """
-    controller = FragileController(dialect=dialect, split=split, note=lambda text: _log.error("violation: %s", text))
+    controller = FragileController(dialect=dialect, split=split, note=log_violations(_log))
     await controller.run(host, port)
-    if not controller.alive:
-        sys.stdout.write(f"died: {controller.death}\n")
-        sys.stdout.flush()
+    print_death(controller)

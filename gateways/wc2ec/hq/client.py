@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 from gateways.wc2ec.messages import Dialect, SetValue, Wc2EcMessage
-from gateways.wc2ec.session import ControllerSession
+from gateways.wc2ec.session import ControllerRole
 from zbridge.protocol import Limits
 
 LEFT, RIGHT = "left", "right"
 """The motors of a robot that has none of its own."""
 
 
-class HqClient(ControllerSession):
+class HqClient(ControllerRole):
     """One controller: which devices it was told, which it enabled (draft), and how it set the two wheels."""
 
     handled = frozenset({SetValue})

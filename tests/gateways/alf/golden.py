@@ -17,7 +17,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import AlfSession, HqSession, VehicleSession
+from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from tests.conformance.side import Receive, Side, plain
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
@@ -67,7 +67,7 @@ def heard(by: AlfSession, *reads: bytes) -> list[list[Any]]:
 
 def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
     """What ``kind`` is sent."""
-    sender, ids = ("vehicle", OF_VEHICLE) if kind is HqSession else ("hq", OF_HQ)
+    sender, ids = ("vehicle", OF_VEHICLE) if kind is HqRole else ("hq", OF_HQ)
     table, read, write = (
         (GOLDEN_TEXT, read_text, write_text) if dialect is TEXT else (GOLDEN_BINARY, read_binary, write_binary)
     )
@@ -82,11 +82,11 @@ def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
         lambda frame: read(frame, ids),
         write,
         receiver,
-        {Measurement, ScannerInit, DriveInfo, End} if kind is HqSession else {DriveCommand, End},
+        {Measurement, ScannerInit, DriveInfo, End} if kind is HqRole else {DriveCommand, End},
         # a binary measurement of another number of points: the session knows how many there must be
         lambda _, frame: dialect is BINARY and frame[0] == 1 and len(frame) >= 17 and (len(frame) - 17) % 8 == 0,
         ends=(End(),),
     )
 
 
-SIDES = [_side(kind, dialect) for dialect in Dialect for kind in (HqSession, VehicleSession)]
+SIDES = [_side(kind, dialect) for dialect in Dialect for kind in (HqRole, VehicleRole)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import AlfSession, HqSession, VehicleSession
+from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from gateways.alf.translate import AlfRobot, Options
 from tests.captures import payloads, stream
 from zbridge.fleet import topics
@@ -78,26 +78,26 @@ def told(robot: AlfRobot, link: str, name: str, port: int) -> list[tuple[Topic, 
 @pytest.mark.parametrize(("name", "port", "count"), [(DRIVE, DRIVE_PORT, 6), (LASER, LASER_PORT, 7)])
 def test_what_a_vehicle_sent_is_read_as_hq_and_written_as_vehicle_to_the_same_bytes(name, port, count) -> None:
     recorded = stream(name, source=port)
-    reader = session_of(HqSession(Dialect.TEXT))
+    reader = session_of(HqRole(Dialect.TEXT))
     messages = delivered(reader, recorded)
     assert len(messages) == count
     assert (reader.state, reader.reason) == (State.CLOSING, "ended")
-    assert written(session_of(VehicleSession(Dialect.TEXT)), messages) == recorded
+    assert written(session_of(VehicleRole(Dialect.TEXT)), messages) == recorded
 
 
 def test_what_an_hq_sent_is_read_as_vehicle_and_written_as_hq_to_the_same_bytes() -> None:
     recorded = stream(DRIVE, destination=DRIVE_PORT)
-    messages = delivered(session_of(VehicleSession(Dialect.TEXT)), recorded)
+    messages = delivered(session_of(VehicleRole(Dialect.TEXT)), recorded)
     assert messages == [NEUTRAL] * NEUTRALS + [RIGHT] * RIGHTS
-    assert written(session_of(HqSession(Dialect.TEXT)), messages) == recorded + END
+    assert written(session_of(HqRole(Dialect.TEXT)), messages) == recorded + END
 
 
 def test_the_messages_of_the_recorded_vehicle_are_what_it_says() -> None:
-    infos = delivered(session_of(HqSession(Dialect.TEXT)), stream(DRIVE, source=DRIVE_PORT))
+    infos = delivered(session_of(HqRole(Dialect.TEXT)), stream(DRIVE, source=DRIVE_PORT))
     assert infos == [
         DriveInfo(10 + number, number + 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999) for number in range(6)
     ]
-    init, *measurements = delivered(session_of(HqSession(Dialect.TEXT)), stream(LASER, source=LASER_PORT))
+    init, *measurements = delivered(session_of(HqRole(Dialect.TEXT)), stream(LASER, source=LASER_PORT))
     assert init == INIT
     for number, message in enumerate(measurements):
         assert isinstance(message, Measurement)
@@ -110,7 +110,7 @@ def test_the_messages_of_the_recorded_vehicle_are_what_it_says() -> None:
 
 
 def test_the_gateway_as_hq_drives_as_the_recorded_hq_did_and_answers_the_end() -> None:
-    session = HqSession(Dialect.TEXT, drives=NEUTRAL)
+    session = HqRole(Dialect.TEXT, drives=NEUTRAL)
     session.open(0.0006)
     sent: list[bytes] = []
     now = 0.0006
@@ -131,10 +131,10 @@ def test_the_gateway_as_hq_drives_as_the_recorded_hq_did_and_answers_the_end() -
 
 
 def test_the_gateway_as_vehicle_hears_its_hq_and_takes_its_answer_to_the_end() -> None:
-    session = session_of(VehicleSession(Dialect.TEXT))
+    session = session_of(VehicleRole(Dialect.TEXT))
     times = replay(session, DRIVE, destination=DRIVE_PORT)
     assert (times[0], times[-1], len(times)) == (0.0006, 2.3017, NEUTRALS + RIGHTS)
-    laser = session_of(VehicleSession(Dialect.TEXT))
+    laser = session_of(VehicleRole(Dialect.TEXT))
     laser.close("vehicle stopped", 0.7032)
     assert laser.outgoing(0.7032) == END
     assert replay(laser, LASER, destination=LASER_PORT) == []
@@ -143,7 +143,7 @@ def test_the_gateway_as_vehicle_hears_its_hq_and_takes_its_answer_to_the_end() -
 
 
 def test_a_vehicle_that_is_sent_the_recorded_end_answers_it() -> None:
-    laser = session_of(VehicleSession(Dialect.TEXT))
+    laser = session_of(VehicleRole(Dialect.TEXT))
     assert replay(laser, LASER, destination=LASER_PORT) == []
     assert laser.outgoing(0.7039) == END
     assert laser.outgoing(0.7039) is None

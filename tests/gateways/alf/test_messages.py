@@ -27,7 +27,7 @@ from gateways.alf.messages import (
     write_binary,
     write_text,
 )
-from gateways.alf.session import AlfSession, HqSession, VehicleSession
+from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from tests.conformance.side import plain
 from tests.gateways.alf.golden import (
     ALL,
@@ -144,7 +144,7 @@ def test_a_text_with_a_field_missing_or_empty_or_no_number_is_a_protocol_error(g
     for place in range(1, len(fields)):
         for instead in ([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]):
             broken = b"|".join(fields[:place] + instead + fields[place + 1 :]) + b";"
-            got = heard(session(HqSession, TEXT), broken) + heard(session(VehicleSession, TEXT), broken)
+            got = heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken)
             assert got == []
 
 
@@ -234,7 +234,7 @@ def test_a_full_scan_comes_whole_byte_by_byte(dialect: Dialect) -> None:
     else:
         points = b"".join(mm.to_bytes(8, "little") for mm in range(1000, 1769))
         frame = bytes.fromhex("01 07000000 88130000") + points + bytes.fromhex("2c000000 d5020000")
-    by = session(HqSession, dialect, 769)
+    by = session(HqRole, dialect, 769)
     assert heard(by, *(frame[at : at + 1] for at in range(len(frame)))) == [plain(scan)]
 
 
@@ -244,7 +244,7 @@ def test_a_thousand_scans_may_come_in_one_read(dialect: Dialect) -> None:
         frame = b"1|7|5000|" + b"1000|" * 769 + b"44|725;"
     else:
         frame = bytes.fromhex("01 07000000 88130000" + "e803000000000000" * 769 + "2c000000 d5020000")
-    by = session(HqSession, dialect, 769)
+    by = session(HqRole, dialect, 769)
     scans = by.receive(frame * 1000, 0.0)
     assert len(scans) == 1000
     assert all(isinstance(scan, Measurement) and (scan.points == 1000).all() for scan in scans)
@@ -263,7 +263,7 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
         held = max(held, len(buffer))
     assert held <= limit
     assert frames == reads * read_bytes // limit
-    by = session(HqSession, TEXT, 769)
+    by = session(HqRole, TEXT, 769)
     assert heard(by, *[b"1|7|" + b"7|" * 30_000] * 20) == []
     assert by.state is State.ESTABLISHED
     assert by.traffic.malformed >= 1
@@ -274,7 +274,7 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
 def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(length, read_bytes) -> None:
     """The end of a message that is too long may look like one: cut anywhere, it must not drive a vehicle."""
     long = b"1" + b"|3|80|0|30|1" * (length // 12) + b";"
-    by = session(VehicleSession, TEXT, 769)
+    by = session(VehicleRole, TEXT, 769)
     data = long + b"3|50|1|-90|0;"
     assert heard(by, *(data[at : at + read_bytes] for at in range(0, len(data), read_bytes))) == [
         plain(DriveCommand(50, 1, -90, False))
@@ -288,14 +288,14 @@ def test_nothing_of_a_text_that_is_too_long_is_taken_for_a_message_wherever_it_i
     """And an END in it ends nothing."""
     limit = text_limit(769)
     for tail in (b"3|80|0|30|1;", b"255|1;"):
-        by = session(VehicleSession, TEXT, 769)
+        by = session(VehicleRole, TEXT, 769)
         long = b"1|" + b"9" * (limit - 2 - offset) + tail
         assert heard(by, long, b"3|50|1|-90|0;") == [plain(DriveCommand(50, 1, -90, False))]
         assert by.state is State.ESTABLISHED
 
 
 def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
-    by = session(HqSession, TEXT)
+    by = session(HqRole, TEXT)
     good = b"1|7|5000|1000|0|3|1|2;"
     bad = (b"1|7|5000|1000|0|3|1;", b"9|9;", b";", b"hello;", b"3|80|0|30|1;", b"4|1|2;", b"1|" + GOOGOL4 + b";")
     for number, text in enumerate(bad, 1):
@@ -309,18 +309,18 @@ def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
 @pytest.mark.parametrize(
     ("kind", "garbage"),
     [
-        (HqSession, b"\x00"),
-        (HqSession, bytes(10_000)),
-        (HqSession, bytes.fromhex("03 50 00 78 00")),
-        (HqSession, b"hello, vehicle"),
-        (HqSession, bytes(range(5, 255))),
-        (HqSession, b"]^-[\\"),
-        (VehicleSession, bytes.fromhex("00 01 02 04 05 fe")),
-        (VehicleSession, b"hello, hq"),
+        (HqRole, b"\x00"),
+        (HqRole, bytes(10_000)),
+        (HqRole, bytes.fromhex("03 50 00 78 00")),
+        (HqRole, b"hello, vehicle"),
+        (HqRole, bytes(range(5, 255))),
+        (HqRole, b"]^-[\\"),
+        (VehicleRole, bytes.fromhex("00 01 02 04 05 fe")),
+        (VehicleRole, b"hello, hq"),
     ],
 )
 def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[AlfSession], garbage: bytes) -> None:
-    golden = INFO_BYTES if kind is HqSession else DRIVE_BYTES
+    golden = INFO_BYTES if kind is HqRole else DRIVE_BYTES
     message = plain(read_binary(golden, ALL))
     for reads in ((garbage + golden,), (golden + garbage, golden), (garbage, golden)):
         by = session(kind, BINARY)
@@ -331,7 +331,7 @@ def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[A
 
 
 def test_binary_garbage_byte_by_byte_is_skipped_too() -> None:
-    by = session(HqSession, BINARY)
+    by = session(HqRole, BINARY)
     assert heard(by, *[b"\x00"] * 5000, INFO_BYTES) == [plain(DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5))]
     assert by.traffic.malformed >= 1
 
@@ -353,7 +353,7 @@ def test_a_binary_measurement_that_is_not_whole_is_kept_and_no_more_of_it_than_i
 
 
 def test_the_length_of_a_binary_measurement_may_change_while_the_link_stands() -> None:
-    by = session(HqSession, BINARY, 3)
+    by = session(HqRole, BINARY, 3)
     assert len(heard(by, MEASUREMENT_BYTES)) == 1
     by.points = 2
     shorter = bytes.fromhex("01 07000000 88130000 e803000000000000 0000000000000000 01000000 02000000")
@@ -379,10 +379,10 @@ PIECES = st.one_of(
 )
 
 
-@given(st.sampled_from(list(Dialect)), st.sampled_from([HqSession, VehicleSession]), st.lists(PIECES, max_size=12))
+@given(st.sampled_from(list(Dialect)), st.sampled_from([HqRole, VehicleRole]), st.lists(PIECES, max_size=12))
 def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(dialect, kind, reads) -> None:
     by = session(kind, dialect)
-    ids = OF_VEHICLE if kind is HqSession else OF_HQ
+    ids = OF_VEHICLE if kind is HqRole else OF_HQ
     for read in reads:
         for message in by.receive(read, 0.0):
             assert message.spec.id in ids

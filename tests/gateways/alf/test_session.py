@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, End, Measurement, ScannerInit
-from gateways.alf.session import AlfSession, HqSession, VehicleSession
+from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from zbridge.errors import Refused
 from zbridge.protocol.session import Role, State
 
@@ -28,14 +28,14 @@ COMMAND = {TEXT: AHEAD_TEXT, BINARY: bytes.fromhex("03 50 00 3c 01")}
 COMMAND_MESSAGE = {TEXT: AHEAD, BINARY: DriveCommand(80, 0, 60, True)}
 
 
-def hq(dialect: Dialect = TEXT, drives: DriveCommand | None = NEUTRAL, *, points: int = 3) -> HqSession:
-    session = HqSession(dialect, points=points, drives=drives)
+def hq(dialect: Dialect = TEXT, drives: DriveCommand | None = NEUTRAL, *, points: int = 3) -> HqRole:
+    session = HqRole(dialect, points=points, drives=drives)
     session.open(0.0)
     return session
 
 
-def vehicle(dialect: Dialect = TEXT) -> VehicleSession:
-    session = VehicleSession(dialect, points=3)
+def vehicle(dialect: Dialect = TEXT) -> VehicleRole:
+    session = VehicleRole(dialect, points=3)
     session.open(0.0)
     return session
 
@@ -72,7 +72,7 @@ def timed(sent: list[tuple[float, bytes]]) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-@pytest.mark.parametrize(("kind", "role"), [(HqSession, Role.HQ), (VehicleSession, Role.ROBOT)])
+@pytest.mark.parametrize(("kind", "role"), [(HqRole, Role.HQ), (VehicleRole, Role.ROBOT)])
 def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, role, dialect) -> None:
     session = kind(dialect)
     before = session.state
@@ -151,7 +151,7 @@ def test_an_urgent_command_replaces_what_stands_and_goes_first() -> None:
 
 
 def test_two_messages_keep_the_gap_that_is_configured() -> None:
-    session = HqSession(TEXT, drives=NEUTRAL, gap_s=0.005)
+    session = HqRole(TEXT, drives=NEUTRAL, gap_s=0.005)
     session.open(0.0)
     assert waiting(session, 0.0) == [NEUTRAL_TEXT]
     session.drive(AHEAD, 0.001)
@@ -299,7 +299,7 @@ def test_a_connection_that_breaks_is_lost_at_once_and_nothing_is_written_or_wait
 
 
 def test_a_session_that_is_closed_before_it_was_connected_says_nothing() -> None:
-    session = HqSession(TEXT, drives=NEUTRAL)
+    session = HqRole(TEXT, drives=NEUTRAL)
     session.close("gateway stopped", 0.0)
     session.open(0.0)
     assert waiting(session, 0.0) == []
@@ -348,7 +348,7 @@ def test_malformed_binary_is_counted_shown_and_the_session_kept(bad: str) -> Non
 
 
 def test_a_measurement_with_another_number_of_points_says_so() -> None:
-    session = HqSession(TEXT)
+    session = HqRole(TEXT)
     session.open(0.0)
     session.receive(b"1|7|5000|" + b"1000|" * 768 + b"44|725;", 0.1)
     assert session.last_malformed == "measurement of 768 points, expected 769"

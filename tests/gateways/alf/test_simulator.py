@@ -7,11 +7,12 @@ import pytest
 
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
-from gateways.alf.session import HqSession, VehicleSession
-from gateways.alf.simulator import SCANNER, STEP_S, Car
+from gateways.alf.session import HqRole, VehicleRole
+from gateways.alf.simulator import SCANNER, Car
 from zbridge.address import Address
 from zbridge.errors import ConfigError
 from zbridge.protocol.plugin import Simulation
+from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import BOXES, HALF_SIDE_M
 
 TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
@@ -375,7 +376,7 @@ def test_info_says_how_fast_it_turns_and_what_pulls_it_to_the_side(right_deg: in
 @pytest.mark.parametrize("speed", [0, 60, 100, 255])
 def test_everything_it_says_can_be_sent_and_is_read_back(speed: int, dialect: Dialect) -> None:
     told = car(dialect=dialect)
-    sender, reader = VehicleSession(dialect), HqSession(dialect)
+    sender, reader = VehicleRole(dialect), HqRole(dialect)
     for session in (sender, reader):
         session.open(0.0)
     for right_deg in (-90, 90):

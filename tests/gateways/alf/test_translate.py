@@ -10,7 +10,7 @@ import pytest
 
 from gateways.alf import PROTOCOL
 from gateways.alf.messages import DriveInfo, Measurement, ScannerInit
-from gateways.alf.session import HqSession
+from gateways.alf.session import HqRole
 from gateways.alf.translate import AlfRobot, Options, points_of, ranges_m
 from zbridge.app import config
 from zbridge.app.templates import robot_template
@@ -51,7 +51,7 @@ class Wire:
         self.robot = AlfRobot(options or Options(points=3), links, self.metrics)
         self.now = 0.0
         self.arrived_ns = STAMP
-        self.sessions: list[HqSession] = []
+        self.sessions: list[HqRole] = []
         for link in range(links):
             self.connect(link)
 

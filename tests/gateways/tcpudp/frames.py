@@ -6,7 +6,7 @@ Nothing here encodes with the code under test.
 from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet
-from gateways.tcpudp.session import HqSession, RobotSession
+from gateways.tcpudp.session import HqRole, RobotRole
 from zbridge.protocol.session import Datagram
 
 LISTED = b"1.1,1.2,1.3"
@@ -60,7 +60,7 @@ class Sent:
 class Timed:
     """A session whose timers fire when they are due, and what left it when and by which channel."""
 
-    def __init__(self, session: HqSession | RobotSession) -> None:
+    def __init__(self, session: HqRole | RobotRole) -> None:
         self.session = session
         self.now = 0.0
         self.sent: list[Sent] = []

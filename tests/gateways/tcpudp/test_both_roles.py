@@ -20,7 +20,7 @@ from gateways.tcpudp.messages import (
     ServerPosition,
     ServerSLAMMap,
 )
-from gateways.tcpudp.session import HqSession, RobotSession, limits
+from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
 from tests.gateways.tcpudp.frames import server_settings
 from zbridge.protocol.session import Datagram, State
@@ -72,14 +72,14 @@ class Weather:
 class End:
     """One session on the network, and everything that left it and came out of it."""
 
-    def __init__(self, session: HqSession | RobotSession) -> None:
+    def __init__(self, session: HqRole | RobotRole) -> None:
         self.session = session
         self.sent: list[tuple[float, bytes]] = []
         self.by_stream: list[Packet] = []
         self.by_datagram: list[Packet] = []
         self.heard: list[tuple[float, bytes]] = []
         self.arrived_until = 0.0
-        self.claimed = isinstance(session, HqSession)
+        self.claimed = isinstance(session, HqRole)
 
 
 class Network:
@@ -154,8 +154,8 @@ def ends(version: str, *, robot_udp: bool, hq_udp: bool) -> tuple[End, End]:
     versions, announced = VERSIONS[version]
     fields = {name: getattr(announced, name) for name in announced.__struct_fields__}
     announced = type(announced)(**{**fields, "udp": robot_udp})
-    robot = RobotSession(limits(0.0), announced, 5, versions)
-    return End(robot), End(HqSession(limits(0.01), udp=hq_udp))
+    robot = RobotRole(limits(0.0), announced, 5, versions)
+    return End(robot), End(HqRole(limits(0.01), udp=hq_udp))
 
 
 def frames(end: End, packet_id: int, *, channel: type | None = None) -> list[bytes]:

@@ -14,7 +14,7 @@ from gateways.tcpudp.messages import (
     ServerPosition,
     ServerSLAMMap,
 )
-from gateways.tcpudp.session import HqSession, RobotSession, limits
+from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
 from tests.gateways.tcpudp.frames import Timed
@@ -57,7 +57,7 @@ def recorded(name: str, index: int, *, from_robot: bool) -> bytes:
 
 
 def test_the_gateway_as_hq_understands_a_robot_of_1_1() -> None:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     delivered = replay(timed, OLD, from_robot=True)
     assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.1")
     assert (timed.session.transport, timed.session.features) == ("tcp", ())
@@ -67,7 +67,7 @@ def test_the_gateway_as_hq_understands_a_robot_of_1_1() -> None:
 
 
 def test_the_gateway_as_robot_of_1_1_understands_its_hq() -> None:
-    timed = Timed(RobotSession(limits(0.0), Settings(), 1, ("1.1",)))
+    timed = Timed(RobotRole(limits(0.0), Settings(), 1, ("1.1",)))
     delivered = replay(timed, OLD, from_robot=False)
     assert timed.frames("tcp") == [recorded(OLD, 0, from_robot=True)]
     assert timed.frames("udp") == []
@@ -78,7 +78,7 @@ def test_the_gateway_as_robot_of_1_1_understands_its_hq() -> None:
 
 
 def test_the_gateway_as_hq_understands_a_robot_of_1_3() -> None:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     delivered = replay(timed, NEW, from_robot=True)
     assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.3")
     assert (timed.session.transport, timed.session.features) == ("udp", ("udp", "lidar_sim", "slam_map"))
@@ -96,7 +96,7 @@ def test_the_gateway_as_hq_understands_a_robot_of_1_3() -> None:
 
 def test_the_gateway_as_robot_of_1_3_understands_its_hq() -> None:
     announced = RobotSettings13(udp=True, lidar_sim=True, slam_map=True, slam_map_size=2048, slam_map_interval=1)
-    timed = Timed(RobotSession(limits(0.0), announced, 1))
+    timed = Timed(RobotRole(limits(0.0), announced, 1))
     delivered = replay(timed, NEW, from_robot=False)
     assert timed.frames("tcp") == [recorded(NEW, 0, from_robot=True), bytes.fromhex("02000000 01 04")]
     assert timed.frames("udp") == [bytes.fromhex("03000000 01 06 01")]

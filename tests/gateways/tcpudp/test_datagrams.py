@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from gateways.tcpudp import PROTOCOL
-from gateways.tcpudp import session as sessions
 from gateways.tcpudp.hq import HqOptions
+from gateways.tcpudp.session import robot_role as sessions
 from tests.hq.test_operator import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
@@ -222,7 +222,7 @@ class Program:
     async def lose_probe(self) -> None:
         """Shake hands, the 5 being lost."""
         await self.greet()
-        await self.scene.until(lambda: self.scene.session(self.number)._probe.verdict.value == "failed")
+        await self.scene.until(lambda: self.scene.session(self.number)._handshake.step is sessions.Step.UNANSWERED)
         await self.report(heard=False)
 
     async def take_stick(self) -> None:
@@ -321,7 +321,7 @@ async def test_a_client_whose_5_was_lost_gets_no_6_and_drives(version: str) -> N
 async def test_a_client_whose_5_came_late_gets_no_6_and_drives(version: str) -> None:
     async with serving() as scene, program(scene, version) as client:
         await client.greet()
-        await scene.until(lambda: scene.session()._probe.verdict.value == "failed")
+        await scene.until(lambda: scene.session()._handshake.step is sessions.Step.UNANSWERED)
         client.send_udp(probe(client.number))
         await scene.taken_in()
         await client.report(heard=False)
@@ -367,7 +367,7 @@ async def test_of_two_clients_of_one_host_a_packet_from_the_port_binds_the_one_w
         await first.take_stick()
         await second.drive(by_udp=True)
         first_session, second_session = scene.session(2), scene.session(3)
-        assert (first_session.traffic.frames_in, second_session._sourced) == (4, True), "3, 7, 13 and 10"
+        assert (first_session.traffic.frames_in, second_session._source.bound) == (4, True), "3, 7, 13 and 10"
         second.send_udp(move(first.number))
         await scene.until(lambda: second_session.traffic.malformed == 1)
         assert second_session.last_malformed == "datagram with id 2, which is another client's"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gateways.tcpudp.messages import ClientControllMode, ServerSLAMMapPart
-from gateways.tcpudp.session import HqSession, limits
+from gateways.tcpudp.session import HqRole, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import STOP, Timed, framed, server_settings
 from tests.robot.test_device import serving
@@ -39,7 +39,7 @@ FIRST, SECOND, LAST = part(0, (0, 0, 1)), part(3, (0, 2, 2)), part(6, (0, 0, 1))
 
 
 def hq(settings: bytes = SETTINGS) -> Timed:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     timed.stream(settings, 0.1)
     return timed
 

@@ -22,7 +22,7 @@ from gateways.tcpudp.messages import (
     ServerPosition,
     ServerSLAMMap,
 )
-from gateways.tcpudp.session import HqSession, RobotSession, limits
+from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import Feature, RobotSettings13
 from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.session import Role, State
@@ -47,20 +47,20 @@ def hq_settings(versions: bytes = b"1.1,1.2,1.3", sender: int = 5, flags: str = 
     return (2 + len(body)).to_bytes(4, "little") + bytes([sender, 3]) + body
 
 
-def opened_hq(*force: Feature | int) -> HqSession:
-    session = HqSession(limits(0.01), force=force)
+def opened_hq(*force: Feature | int) -> HqRole:
+    session = HqRole(limits(0.01), force=force)
     session.open(0.0)
     return session
 
 
-def established_hq(*force: Feature | int, flags: str = ALL) -> HqSession:
+def established_hq(*force: Feature | int, flags: str = ALL) -> HqRole:
     session = opened_hq(*force)
     assert session.receive(robot_settings(flags=flags), 0.1) == []
     assert session.outgoing(0.1) == HQ_SETTINGS
     return session
 
 
-def opened_robot() -> RobotSession:
+def opened_robot() -> RobotRole:
     announced = RobotSettings13(
         cam=True,
         joystick=True,
@@ -71,12 +71,12 @@ def opened_robot() -> RobotSession:
         slam_map_size=1000,
         slam_map_interval=10,
     )
-    session = RobotSession(limits(0.0), announced, client_id=5)
+    session = RobotRole(limits(0.0), announced, client_id=5)
     session.open(0.0)
     return session
 
 
-def established_robot() -> RobotSession:
+def established_robot() -> RobotRole:
     session = opened_robot()
     assert session.outgoing(0.0) == ROBOT_SETTINGS
     assert session.receive(HQ_SETTINGS, 0.1) == []
@@ -484,7 +484,7 @@ def test_an_hq_that_never_answers_is_given_up() -> None:
 # Both
 
 
-def carry(source: HqSession | RobotSession, sink: HqSession | RobotSession, now: float, size: int) -> list[Packet]:
+def carry(source: HqRole | RobotRole, sink: HqRole | RobotRole, now: float, size: int) -> list[Packet]:
     messages: list[Packet] = []
     while (frame := source.outgoing(now)) is not None:
         for start in range(0, len(frame), size):

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from gateways.tcpudp.session import HqSession, limits
+from gateways.tcpudp.session import HqRole, limits
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import (
     ANSWER_FALSE,
@@ -53,7 +53,7 @@ class Link:
 
 def probed(client_id: int, answer: bytes | None) -> Timed:
     """A connection with UDP, established at second 2.6; ``answer`` came by UDP, or never."""
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     timed.stream(settings(client_id, udp=True) + START, 0.1)
     if answer is not None:
         timed.datagram(answer, 0.2)

@@ -25,7 +25,8 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.simulator import SIDE, SILENCE_S, SPEED_M_S, STEP_S, TURN_RAD_S, Vehicle
+from gateways.tcpudp.simulator import SIDE, SILENCE_S, SPEED_M_S, TURN_RAD_S, Vehicle
+from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import BOXES, HALF_SIDE_M
 
 FORWARD = ClientJoystickMove(0.0, 1.0, 1.0)

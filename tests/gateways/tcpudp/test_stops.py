@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gateways.tcpudp.session import HqSession
+from gateways.tcpudp.session import HqRole
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import LISTED, SIZE_100_10, START, server_settings
 from tests.robot.test_device import Program, Rig, established, serving
@@ -46,7 +46,7 @@ class Stage:
         self.connect(settings or SETTINGS[version])
 
     def connect(self, settings: bytes) -> None:
-        self.session: HqSession = self.robot.session("robot", "tcp://robot.test:1")
+        self.session: HqRole = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(self.now)
         self.session.receive(settings, self.now)
         self.session.outgoing(self.now)

@@ -18,7 +18,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerUDPConnection,
 )
-from gateways.tcpudp.session import HqSession
+from gateways.tcpudp.session import HqRole
 from gateways.tcpudp.translate import Options, TcpUdpRobot, polar_ranges
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import topics
@@ -40,7 +40,7 @@ class Wire:
 
     def __init__(self, options: Options | None = None, announced: bytes = settings()) -> None:
         self.robot = TcpUdpRobot(options or Options())
-        self.session: HqSession = self.robot.session("robot", "tcp://robot.test:1")
+        self.session: HqRole = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(0.0)
         self.session.receive(announced, 0.0)
         self.session.outgoing(0.0)

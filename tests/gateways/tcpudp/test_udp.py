@@ -23,7 +23,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMapPart,
     encode_packet,
 )
-from gateways.tcpudp.session import HqSession, RobotSession, limits
+from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13
 from tests.gateways.tcpudp.frames import (
     ALL,
@@ -58,7 +58,7 @@ HQ_ANSWER = framed(5, 3, counted(LISTED) + bytes.fromhex("01000000000100"))
 
 
 def greeted() -> Timed:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     timed.stream(server_settings(), 0.1)
     return timed
 
@@ -199,7 +199,7 @@ def test_a_datagram_with_a_packet_and_a_half_gives_none() -> None:
 @pytest.mark.parametrize("flags", ["00010101010101", ALL])
 def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str) -> None:
     """The robot sleeps all the same, and wants its 7."""
-    timed = Timed(HqSession(limits(0.01), udp=flags != ALL))
+    timed = Timed(HqRole(limits(0.01), udp=flags != ALL))
     timed.stream(server_settings(block=flags + SIZE_100_10), 0.1)
     assert timed.session.state is State.ESTABLISHED
     timed.stream(START, 0.2)
@@ -212,7 +212,7 @@ def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str) -> 
 
 
 def test_a_start_before_the_settings_is_not_due() -> None:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     timed.stream(START, 0.05)
     timed.stream(server_settings(), 0.1)
     timed.until(0.2)
@@ -221,7 +221,7 @@ def test_a_start_before_the_settings_is_not_due() -> None:
 
 
 def test_a_start_in_the_read_of_the_settings_finds_them_answered_first_and_alone() -> None:
-    timed = Timed(HqSession(limits(0.01)))
+    timed = Timed(HqRole(limits(0.01)))
     timed.stream(server_settings() + START, 0.1)
     timed.until(5.0)
     assert timed.frames("tcp")[0] == HQ_ANSWER
@@ -343,7 +343,7 @@ ANNOUNCED = RobotSettings13(
 
 
 def waiting() -> Timed:
-    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
+    timed = Timed(RobotRole(limits(0.0), ANNOUNCED, 5))
     timed.stream(client_settings(), 0.1)
     return timed
 
@@ -370,10 +370,10 @@ def test_a_robot_asks_for_the_datagram_and_answers_it_by_udp() -> None:
 
 
 def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once() -> None:
-    timed = Timed(RobotSession(limits(0.0), RobotSettings13(), 5))
+    timed = Timed(RobotRole(limits(0.0), RobotSettings13(), 5))
     timed.stream(client_settings(), 0.1)
     assert timed.session.state is State.ESTABLISHED
-    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
+    timed = Timed(RobotRole(limits(0.0), ANNOUNCED, 5))
     timed.stream(client_settings(block="00000000000100"), 0.1)
     assert timed.session.state is State.ESTABLISHED
     timed.until(6.0)
@@ -513,12 +513,12 @@ def test_a_probe_that_is_none_is_counted_and_waited_past(datagram: bytes) -> Non
 
 
 def test_nothing_is_claimed_before_the_settings_of_the_hq() -> None:
-    before = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
+    before = Timed(RobotRole(limits(0.0), ANNOUNCED, 5))
     assert not any(before.session.claims(datagram, PORT) for datagram in (PROBE, MOVE, ROTATE, STOP))
 
 
 def test_nothing_is_claimed_for_an_hq_that_has_no_datagrams() -> None:
-    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5))
+    timed = Timed(RobotRole(limits(0.0), ANNOUNCED, 5))
     timed.stream(client_settings(block="00000000000100"), 0.1)
     assert timed.session.state is State.ESTABLISHED
     assert not any(timed.session.claims(datagram, PORT) for datagram in (PROBE, MOVE, ROTATE, STOP))
@@ -526,7 +526,7 @@ def test_nothing_is_claimed_for_an_hq_that_has_no_datagrams() -> None:
 
 def unheard(*, client_port: int = PORT) -> Timed:
     """A robot whose HQ's 5 was lost, and which has reported."""
-    timed = Timed(RobotSession(limits(0.0), ANNOUNCED, 5, client_port=client_port))
+    timed = Timed(RobotRole(limits(0.0), ANNOUNCED, 5, client_port=client_port))
     timed.stream(client_settings(), 0.1)
     timed.stream(STATUS_TRUE, 2.2)
     assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, "tcp")
@@ -593,7 +593,7 @@ def test_a_probe_of_a_second_source_is_claimed_until_the_report() -> None:
 
 def rivalled(*datagrams: bytes, gap_s: float = 0.0) -> Timed:
     """A robot that was sent a 5 by another source at 0.2, after these by the first at 0.199."""
-    timed = Timed(RobotSession(limits(gap_s), ANNOUNCED, 5))
+    timed = Timed(RobotRole(limits(gap_s), ANNOUNCED, 5))
     timed.stream(client_settings(), 0.195)
     for datagram in datagrams:
         timed.datagram(datagram, 0.199)

@@ -13,7 +13,7 @@ from gateways.tcpudp.messages import (
     OpaquePacket,
     Packet,
 )
-from gateways.tcpudp.session import HqSession, RobotSession, limits
+from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings, Settings12
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import (
@@ -33,7 +33,7 @@ LISTED_14 = LISTED + b",1.4"
 
 
 def hq(versions: bytes, block: str, *, udp: bool = True) -> Timed:
-    timed = Timed(HqSession(limits(0.01), udp=udp))
+    timed = Timed(HqRole(limits(0.01), udp=udp))
     timed.stream(server_settings(versions, block), 0.1)
     return timed
 
@@ -232,7 +232,7 @@ HQS = {"1.1": (b"1.1", "0100000000"), "1.2": (b"1.2", "010000000001"), "1.3": (L
 
 def robot(version: str) -> Timed:
     listed, settings, _ = ROBOTS[version]
-    return Timed(RobotSession(limits(0.0), settings, 5, listed.decode().split(",")))
+    return Timed(RobotRole(limits(0.0), settings, 5, listed.decode().split(",")))
 
 
 @pytest.mark.parametrize("version", ROBOTS)
@@ -309,7 +309,7 @@ def robot_packet(packet_id: int) -> Packet:
 
 @pytest.mark.parametrize("version", KNOWN)
 def test_an_hq_is_sent_no_packet_that_its_version_does_not_know(version: str) -> None:
-    session = RobotSession(limits(0.0), Settings(), 5, LISTED_14.decode().split(","))
+    session = RobotRole(limits(0.0), Settings(), 5, LISTED_14.decode().split(","))
     session.open(0.0)
     session.receive(client_settings(version.encode(), "00000000000000"), 0.1)
     assert session.version == version

@@ -4,7 +4,7 @@ The values are read off the bytes by hand: twelve registrations, then twenty rou
 """
 
 from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
-from gateways.wc2ec.session import ControllerSession, ExternalSession
+from gateways.wc2ec.session import ControllerRole, ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
@@ -36,7 +36,7 @@ ROUNDS = 20
 READINGS = ROUND * ROUNDS + [SensorData(37, 6, 1000.0)]
 
 
-def delivered(session: ExternalSession, data: bytes) -> list[Wc2EcMessage]:
+def delivered(session: ExternalRole, data: bytes) -> list[Wc2EcMessage]:
     session.open(0.0)
     messages = session.receive(data, 0.0)
     assert session.traffic.malformed == 0
@@ -56,7 +56,7 @@ def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
 
 
 def test_the_recorded_session_gives_the_registrations_and_the_readings() -> None:
-    messages = delivered(ExternalSession(Dialect.DEPLOYED), stream(NAME, source=PORT))
+    messages = delivered(ExternalRole(Dialect.DEPLOYED), stream(NAME, source=PORT))
     assert messages[:12] == REGISTRATIONS
     assert messages[12:] == READINGS
     assert len(messages) == 133
@@ -64,16 +64,16 @@ def test_the_recorded_session_gives_the_registrations_and_the_readings() -> None
 
 def test_what_is_read_as_external_controller_is_written_as_controller_to_the_same_bytes() -> None:
     recorded = stream(NAME, source=PORT)
-    writer, written = ControllerSession(Dialect.DEPLOYED), b""
+    writer, written = ControllerRole(Dialect.DEPLOYED), b""
     writer.open(0.0)
-    for message in delivered(ExternalSession(Dialect.DEPLOYED), recorded):
+    for message in delivered(ExternalRole(Dialect.DEPLOYED), recorded):
         writer.send(message)
         written += writer.outgoing(0.0) or b""
     assert written == recorded
 
 
 def test_the_recorded_controller_is_established_with_its_first_data() -> None:
-    session = ExternalSession(Dialect.DEPLOYED)
+    session = ExternalRole(Dialect.DEPLOYED)
     session.open(0.0)
     for record in payloads(NAME, source=PORT):
         assert (session.state is State.ESTABLISHED) == (record.seconds > 0.0220 or session.traffic.frames_in > 12)

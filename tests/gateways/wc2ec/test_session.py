@@ -17,7 +17,7 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
-from gateways.wc2ec.session import ControllerSession, ExternalSession, Wc2EcSession
+from gateways.wc2ec.session import ControllerRole, ExternalRole, Wc2EcSession
 from zbridge.errors import EncodeError
 from zbridge.protocol.session import Role, State
 
@@ -29,14 +29,14 @@ WHEEL_MESSAGE, DIST_MESSAGE = RegisterSensor(53, 0, b"wheel1"), RegisterSensor(3
 READING_MESSAGE = SensorData(37, 6, 750.5)
 
 
-def external(dialect: Dialect = DEPLOYED) -> ExternalSession:
-    session = ExternalSession(dialect)
+def external(dialect: Dialect = DEPLOYED) -> ExternalRole:
+    session = ExternalRole(dialect)
     session.open(0.0)
     return session
 
 
-def controller(dialect: Dialect = DEPLOYED, values: int = 3) -> ControllerSession:
-    session = ControllerSession(dialect, values=values)
+def controller(dialect: Dialect = DEPLOYED, values: int = 3) -> ControllerRole:
+    session = ControllerRole(dialect, values=values)
     session.open(0.0)
     return session
 

@@ -15,10 +15,11 @@ from gateways.wc2ec.messages import (
     SetSensor,
     SetValue,
 )
-from gateways.wc2ec.simulator import DEVICES, STEP_S, Machine
+from gateways.wc2ec.simulator import DEVICES, Machine
 from zbridge.address import Address
 from zbridge.errors import ConfigError
 from zbridge.protocol.plugin import Simulation
+from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import HALF_SIDE_M, SOLID
 
 NUMBERS = {device.name: device.number for device in DEVICES}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gateways.wc2ec import PROTOCOL
-from gateways.wc2ec.session import ExternalSession
+from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from zbridge.app import config
@@ -105,7 +105,7 @@ class Wire:
         self.metrics = Metrics()
         self.robot = Wc2EcRobot(options or options_of(), 1, self.metrics)
         self.now = 0.0
-        self.session: ExternalSession
+        self.session: ExternalRole
         self.begun: tuple[tuple[Topic, FleetMessage], ...] = ()
         self.connect()
         if greeting:

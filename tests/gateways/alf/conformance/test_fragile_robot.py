@@ -16,7 +16,8 @@ import pytest
 
 from gateways.alf.conformance import parser
 from gateways.alf.conformance.fragile_robot import FragileVehicle, simulate_fragile
-from gateways.alf.conformance.parser import Dialect, Machine, Repeats, Scale, Times
+from gateways.alf.conformance.machine import Machine
+from gateways.alf.conformance.parser import Dialect, Repeats, Scale, Times
 from tests.conformance.scene import LONG_S, Peer, Scene, Script, scripts, serving, until
 
 QUICK = Times(
@@ -596,7 +597,7 @@ async def test_it_leaves_without_a_word_when_it_is_cancelled_within_a_measuremen
         assert not said.endswith(hq.raw("END"))
 
 
-@pytest.mark.parametrize("after", ["standing", "over"])
+@pytest.mark.parametrize("after", ["connected", "over"])
 async def test_a_second_connection_is_accepted_and_never_answered(after: str) -> None:
     vehicle = quick(laser=True)
     async with connected(vehicle) as hq:

@@ -16,7 +16,8 @@ import pytest
 
 from gateways.wc2ec.conformance import parser
 from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
-from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Motor, Reader, Robot, Times
+from gateways.wc2ec.conformance.machine import Motor, Robot
+from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Reader, Times
 from tests.conformance.scene import LONG_S, Peer, Scene, scripts, serving, until
 
 QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)

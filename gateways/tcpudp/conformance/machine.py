@@ -1,0 +1,119 @@
+"""The simulated robot of the judge: it moves, sees and talks. Sans-IO: no channel, no clock.
+
+Source: "Packets" and "Translation" of the protocol page ``tcpudp.md``.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Collection, Iterator
+from random import Random
+
+import numpy as np
+
+from gateways.tcpudp.conformance.parser import (
+    CAMERA,
+    CELL_CM,
+    CHAT,
+    DEBUG,
+    GET_SCAN,
+    LIDAR_STATUS,
+    MAP,
+    MAP_CM,
+    POSITION,
+    Feature,
+    maps,
+    packet,
+    string,
+)
+from zbridge.simulation.world import Body, Grid, cast
+
+_SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
+_RANGE_M = 8.0
+_PROGRAM = (0.2, 0.0, 0.3)
+"""How the robot's own program drives: m/s forward and left, rad/s."""
+
+
+class Machine:
+    """One robot; ``random`` seeds what it says."""
+
+    def __init__(self, random: Random) -> None:
+        self.place = Body()
+        self.lidar_on = self.camera_on = False
+        self._random = random
+        self._drive = (0.0, 0.0, 0.0)
+        self._on_its_own = False
+        grid, angles = Grid(MAP_CM // CELL_CM, CELL_CM / 100), np.radians(np.arange(360.0))
+        grid.see(0.0, 0.0, angles, cast(0.0, 0.0, angles, _RANGE_M), _RANGE_M)
+        self._map = grid.cells.tobytes()
+
+    def steer(self, body: bytes) -> None:
+        """Take the body of 11 (12 bytes), 12 (4 bytes) or 13 (none): y forward, x right, + right ("Packets")."""
+        if self._on_its_own:
+            return
+        x, y, speed = struct.unpack("<3f", body) if len(body) == 12 else (0.0, 0.0, 0.0)
+        turn = struct.unpack("<f", body)[0] if len(body) == 4 else 0.0
+        speed, turn = (min(max(value, -1.0), 1.0) for value in (speed, turn))
+        self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
+
+    def choose(self, body: bytes) -> None:
+        """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
+
+        When it ends, the motors go on as they went: only a 13 after it stops them.
+        """
+        self._on_its_own = body[0] == 3
+        if self._on_its_own:
+            self._drive = _PROGRAM
+
+    @property
+    def moving(self) -> bool:
+        """Whether the robot moves, and will go on: it never stops by itself."""
+        return any(self._drive)
+
+    def step(self, dt: float) -> None:
+        """Move for ``dt`` seconds as steered, in mode 3 as the robot's own program wants."""
+        if self._on_its_own:
+            self._drive = _PROGRAM
+        self.place.step(*self._drive, dt)
+
+    def body(self, kind: int) -> bytes:
+        """Give the body of a packet about the robot as it is ("Packets", "Translation")."""
+        if kind == DEBUG:
+            return string(f"battery {self._random.randint(0, 100)} %")
+        if kind == CHAT:
+            return self._random.randbytes(self._random.randint(1, 40))
+        if kind == CAMERA:
+            self.camera_on = not self.camera_on
+            return struct.pack("<i", 1 if self.camera_on else 2)
+        if kind == LIDAR_STATUS:
+            return struct.pack("<i", 1 if self.lidar_on else 2)
+        if kind == POSITION:  # centimetres; heading = radians(h) + pi/2
+            degrees = math.degrees(self.place.heading - math.pi / 2)
+            return struct.pack("<3f", self.place.x * 100, self.place.y * 100, degrees)
+        return struct.pack("<i", len(self._map)) + self._map if kind == MAP else b""
+
+    def parts(self, count: int) -> Iterator[bytes]:
+        """Give the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
+        size = len(self._map) // count + 1
+        for start in range(0, len(self._map), size):
+            yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")
+
+    def unasked(
+        self, version: str, features: Collection[Feature], hq_features: Collection[Feature]
+    ) -> Iterator[tuple[int, bytes]]:
+        """Give what the robot says unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
+
+        An empty body: ask :meth:`body` for it when it is sent.
+        """
+        told = [(DEBUG, packet(DEBUG, string("two headers")))]
+        kinds = [DEBUG] + [CAMERA] * (Feature.CAM in features) + [CHAT] * (Feature.CHAT in features)
+        kinds += [LIDAR_STATUS] * (Feature.LIDAR in features)
+        if maps(version, features):
+            kinds += [POSITION] + [MAP] * (version != "1.4")
+        kinds += [GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
+        while True:
+            told += [(kind, b"") for kind in kinds]
+            self._random.shuffle(told)
+            yield from told
+            told = []

@@ -1,0 +1,258 @@
+"""The handshake of the gateway as HQ with one robot, and the signs of a poor connection. Sans-IO.
+
+Source: "Handshake", "Settings and version negotiation" and "The gateway as HQ" of the protocol page.
+
+Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
+:class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
+steps STREAM, GIVEN_UP and DONE on. A robot that sent 4 sleeps 2 s and then takes one read as one packet, so for
+:data:`SILENCE_S` nothing leaves by TCP but one 7: before the handshake ends, and in the LATE steps, where commands are
+refused with :data:`LATE_START`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from enum import Enum
+
+from gateways.tcpudp.messages import (
+    HEADER,
+    SERVER_ID,
+    ClientSettings,
+    ClientUDPConnection,
+    ClientUDPConnectionStatus,
+    DebugMessage,
+    Packet,
+    ServerSettings,
+    ServerStartUDP,
+    ServerUDPConnection,
+)
+from gateways.tcpudp.session.packets import PacketSession, decoders
+from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, Settings, read_settings
+from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
+from gateways.tcpudp.versions import VERSIONS, announced
+from zbridge.protocol import Datagram, Handshake, Limits, ProtocolError, Role, agree, parse_versions
+
+PROBE_S = 2.0
+"""Seconds a robot has for packet 4, and then for packet 6."""
+SILENCE_S = 2.5
+"""Seconds after packet 4 in which only one packet 7 may be sent by TCP: the robot sleeps 2 s, and may be late."""
+LATE_START = "handshaking"
+_HEADER_SIZE = HEADER.size
+_FROM_ROBOT = {bytes((SERVER_ID, packet_id)): decode for packet_id, decode in decoders(Role.HQ).items()}
+"""How to read what a robot may send, by ``id`` byte and packet id."""
+
+
+class Step(Enum):
+    """What the handshake waits for."""
+
+    GREETING = "waits for 2"
+    OFFERED = "answered 3, waits for 4"
+    PROBING = "got 4 and sent 5, waits for 6; silent"
+    SILENT = "sent 7; silent"
+    STREAM = "established; UDP was not agreed"
+    GIVEN_UP = "established; no 4 came"
+    LATE_PROBING = "established, got a late 4, waits for 6; silent"
+    LATE_SILENT = "established, sent 7; silent"
+    DONE = "established after a 4"
+
+
+class Event(Enum):
+    """What can happen in a handshake."""
+
+    SETTINGS_UDP = "2, and both set the UDP flag"
+    SETTINGS_TCP = "2, and not both set the UDP flag"
+    START = "4"
+    WORKS = "6(true) by UDP"
+    FAILS = "any other 6"
+    TIMEOUT = "the step lasts longer than 2 s"
+    SILENCE_OVER = "2.5 s after the 4"
+
+
+class HqHandshake(PacketSession):
+    """The conversation with a robot up to ``established``, and its timers.
+
+    ``udp``: offer datagrams. ``announce``: the features that we announce. ``signs``: of the connection before.
+    """
+
+    role = Role.HQ
+    handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, DebugMessage})
+
+    def __init__(self, limits: Limits, *, udp: bool, announce: Iterable[Feature], signs: Signs | None) -> None:
+        super().__init__(limits)
+        self.sender_id = 0
+        self.settings: Settings | None = None
+        """What the robot announced."""
+        self._announce = frozenset(announce)
+        self._udp = udp and Feature.UDP in self._announce
+        self._agreed = ""
+        within_s = {Step.OFFERED: PROBE_S, Step.PROBING: PROBE_S, Step.LATE_PROBING: PROBE_S}
+        self._handshake = Handshake(self, TABLE, Step.GREETING, timeout=Event.TIMEOUT, within_s=within_s)
+        self._silent_until = math.inf
+        self._answered: bool | None = None
+        """True if the robot got our 5 and we its 6; None if no 5 was sent."""
+        self._signs: Signs = Signs(signs)
+        self._look_at = math.inf
+        self._others = 0
+        """Packets received that are no telemetry."""
+
+    def decode(self, frame: bytes) -> Packet:
+        decode = _FROM_ROBOT.get(frame[4:6])
+        if decode is None:
+            raise self.misplaced(frame)
+        return decode(frame, _HEADER_SIZE)
+
+    def overdue(self) -> str:
+        if self.last_malformed is not None:
+            return f"no settings that can be read within {self.limits.handshake_s:g} s: {self.last_malformed}"
+        return (
+            f"connected, but no settings within {self.limits.handshake_s:g} s: "
+            "its one connection may be used up, restart the robot program"
+        )
+
+    # Messages of the handshake
+
+    def accept(self, message: Packet, now: float) -> bool:
+        return self._accept(message, now, by_datagram=False)
+
+    def accept_datagram(self, message: Packet, now: float) -> bool:
+        return self._accept(message, now, by_datagram=True)
+
+    def _accept(self, message: Packet, now: float, *, by_datagram: bool) -> bool:
+        if isinstance(message, ServerUDPConnection) and (by_datagram or self.settings is not None):
+            self._take_answer(works=message.received and by_datagram, now=now)
+        elif isinstance(message, ServerSettings):
+            self._take_settings(message, now)
+        elif self.settings is None:
+            raise ProtocolError(f"{type(message).__name__} before serverSettings")
+        elif isinstance(message, ServerStartUDP):
+            if not self._handshake.fire(Event.START, now):
+                raise ProtocolError("serverStartUDP a second time")
+        else:
+            self._others += isinstance(message, DebugMessage)
+            return True
+        self._others += 1
+        return False
+
+    def _take_settings(self, message: ServerSettings, now: float) -> None:
+        if self.settings is not None:
+            raise ProtocolError("serverSettings a second time")
+        self.sender_id = message.client_id
+        self._doubt()
+        listed = parse_versions(message.versions)
+        agreed = agree(VERSIONS, listed)
+        if agreed is None:
+            self.refuse_versions(message.versions, VERSIONS, now)
+            return
+        self.settings = read_settings(message.versions, message.block, ROBOT_BLOCKS)
+        self._agreed = agreed
+        udp = self._udp and self.settings.udp
+        answer = VERSIONS[agreed].answer or message.versions
+        features = self._announce if udp else self._announce - {Feature.UDP}
+        self.send_first(ClientSettings(answer, announced(answer, features)))
+        self._handshake.fire(Event.SETTINGS_UDP if udp else Event.SETTINGS_TCP, now)
+
+    def _take_answer(self, *, works: bool, now: float) -> None:
+        self._answered = self._answered or works
+        if not self._handshake.fire(Event.WORKS if works else Event.FAILS, now):
+            raise ProtocolError("serverUDPConnection was not due")
+
+    # Actions of the table
+
+    def _await_start(self, now: float) -> None:
+        """Wait for a 4, without the time limit of the settings."""
+        self.lift_limit()
+
+    def _probe(self, now: float) -> None:
+        """Send 5 by UDP; begin the silence by TCP."""
+        self._fall_silent(now)
+        self._answered = False
+        self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
+
+    def _probe_late(self, now: float) -> None:
+        """Refuse commands; send 5 by UDP; begin the silence by TCP."""
+        self.busy = LATE_START
+        self._probe(now)
+
+    def _fall_silent_late(self, now: float) -> None:
+        """Refuse commands; begin the silence by TCP: the robot sleeps, though nobody offered UDP."""
+        self.busy = LATE_START
+        self._fall_silent(now)
+
+    def _fall_silent(self, now: float) -> None:
+        self._silent_until = now + SILENCE_S
+        self.outbox.quiet(self._silent_until)
+
+    def _report_works(self, now: float) -> None:
+        """Send 7(true), and use datagrams."""
+        self.transport = "udp"
+        self.send_first(ClientUDPConnectionStatus(True))
+
+    def _report_fails(self, now: float) -> None:
+        """Send 7(false)."""
+        self.send_first(ClientUDPConnectionStatus(False))
+
+    def _finish(self, now: float) -> None:
+        """Establish the session."""
+        assert self.settings is not None
+        self.establish(self._agreed, tuple(feature.value for feature in self.settings.features))
+        self._look_at = now + LOOK_S
+
+    def _take_commands(self, now: float) -> None:
+        """Take commands again."""
+        self.busy = None
+
+    # Timers
+
+    def timers(self) -> float:
+        return min(self._handshake.deadline, self._silent_until, self._look_at)
+
+    def on_timer(self, now: float) -> None:
+        self._handshake.expire(now)
+        if now >= self._silent_until:
+            self._silent_until = math.inf
+            self._handshake.fire(Event.SILENCE_OVER, now)
+        if now >= self._look_at:
+            self._signs.look(self._heard, unanswered=self._answered is False)
+            self._doubt()
+            self._look_at = now + LOOK_AGAIN_S
+
+    # Signs of a connection that is not the robot's one usable connection
+
+    def malformed(self, what: str) -> None:
+        super().malformed(what)
+        self._doubt()
+
+    @property
+    def _heard(self) -> int:
+        return self.traffic.frames_in - self.traffic.malformed - self._others
+
+    def _doubt(self) -> None:
+        self.doubts = self._signs.gather(self.sender_id, self.traffic)
+
+
+TABLE: dict[Step, dict[Event, tuple[Callable[[HqHandshake, float], None], Step]]] = {
+    Step.GREETING: {
+        Event.SETTINGS_UDP: (HqHandshake._await_start, Step.OFFERED),
+        Event.SETTINGS_TCP: (HqHandshake._finish, Step.STREAM),
+    },
+    Step.OFFERED: {
+        Event.START: (HqHandshake._probe, Step.PROBING),
+        Event.TIMEOUT: (HqHandshake._finish, Step.GIVEN_UP),
+    },
+    Step.PROBING: {
+        Event.WORKS: (HqHandshake._report_works, Step.SILENT),
+        Event.FAILS: (HqHandshake._report_fails, Step.SILENT),
+        Event.TIMEOUT: (HqHandshake._report_fails, Step.SILENT),
+    },
+    Step.SILENT: {Event.SILENCE_OVER: (HqHandshake._finish, Step.DONE)},
+    Step.STREAM: {Event.START: (HqHandshake._fall_silent_late, Step.LATE_PROBING)},
+    Step.GIVEN_UP: {Event.START: (HqHandshake._probe_late, Step.LATE_PROBING)},
+    Step.LATE_PROBING: {
+        Event.WORKS: (HqHandshake._report_works, Step.LATE_SILENT),
+        Event.FAILS: (HqHandshake._report_fails, Step.LATE_SILENT),
+        Event.TIMEOUT: (HqHandshake._report_fails, Step.LATE_SILENT),
+    },
+    Step.LATE_SILENT: {Event.SILENCE_OVER: (HqHandshake._take_commands, Step.DONE)},
+    Step.DONE: {},
+}

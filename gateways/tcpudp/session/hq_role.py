@@ -1,0 +1,141 @@
+"""The gateway plays HQ towards one robot: what may be sent, and what must arrive. Sans-IO.
+
+Source: "The gateway as HQ" and "Translation" of the protocol page. The handshake is :mod:`.hq_handshake`.
+
+Robots of 1.1 and 1.2 misread a tenth of what they get: what is sent once and matters (mode, lidar) is sent to them
+again after :data:`AGAIN_S`. A stop cancels these repetitions, and takes back what might move the robot after it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from gateways.tcpudp.messages import (
+    HEADER,
+    ClientControllMode,
+    ClientGetPosition,
+    ClientGetSLAMMap,
+    ClientLidarMode,
+    DebugMessage,
+    Packet,
+)
+from gateways.tcpudp.session.hq_handshake import HqHandshake
+from gateways.tcpudp.session.registered import Registered
+from gateways.tcpudp.settings import Feature
+from gateways.tcpudp.versions import ANNOUNCED
+from zbridge.protocol import LIMIT, EncodeError, Limits, Malformed
+
+MAX_WRITE = 4096
+"""Bytes of the longest packet a deployed robot reads whole."""
+AGAIN_S = 0.3
+"""Seconds after which a mode or a lidar mode is sent again to robots that misread a tenth of what they get."""
+_AUTONOMOUS = 3
+_MODE_AGAIN, _LIDAR_AGAIN = "mode again", "lidar again"
+_MISREADING = frozenset({"1.1", "1.2"})
+_ANSWERED = (ClientGetSLAMMap, ClientGetPosition)
+
+
+class _Chosen(bytes):
+    """A packet 10 that was commanded, unlike the 1 of a stop."""
+
+    @property
+    def autonomous(self) -> bool:
+        """True if it lets the robot's own program drive."""
+        return self[HEADER.size] == _AUTONOMOUS
+
+
+class HqRole(HqHandshake):
+    """One conversation with a robot.
+
+    ``udp``: offer datagrams. ``force``: features and packet ids to use although the robot does not announce them.
+    ``announce``: the features that we announce. ``predecessor``: the session of the connection before.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        *,
+        udp: bool = True,
+        force: Iterable[Feature | int] = (),
+        announce: Iterable[Feature] = ANNOUNCED,
+        predecessor: HqRole | None = None,
+    ) -> None:
+        signs = predecessor._signs if predecessor is not None else None
+        super().__init__(limits, udp=udp, announce=announce, signs=signs)
+        self.autonomous: bool = predecessor is not None and predecessor.autonomous
+        """True from a mode 3 that was sent until another mode is commanded and sent; outlives connections."""
+        self._registered = Registered(force)
+        self._chosen: _Chosen | None = None
+        """The mode that was commanded last."""
+        self._raw: deque[bytes] = deque(maxlen=LIMIT)
+        """The undefined packets that were queued; at most as many as the queue holds."""
+
+    def encode(self, message: Packet) -> bytes:
+        """Write a packet; raise Refused for one the robot may not know, EncodeError for one it cannot take whole."""
+        self.may_send(message)
+        if isinstance(message, DebugMessage) and not message.text:
+            raise Malformed("an empty text crashes the robot")
+        frame = super().encode(message)
+        if len(frame) > MAX_WRITE:
+            raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
+        return frame
+
+    def may_send(self, message: Packet) -> None:
+        """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
+        self._registered.check(message, self.settings, self._agreed)
+
+    # What is sent once and matters
+
+    def choose_mode(self, mode: int, now: float) -> None:
+        """Send a control mode that was commanded; raise Refused."""
+        frame = _Chosen(self.encode(ClientControllMode(mode)))
+        self._send_surely(frame, _MODE_AGAIN, now)
+        self._chosen = frame
+
+    def switch_lidar(self, mode: int, now: float) -> None:
+        """Send a lidar mode; raise Refused."""
+        self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
+        self._signs.asked(self._heard, 1 + self.outbox.is_set(_LIDAR_AGAIN))
+
+    def send_nothing_again(self) -> None:
+        """Cancel all repetitions: the robot is stopped."""
+        self.outbox.clear(_MODE_AGAIN)
+        self.outbox.clear(_LIDAR_AGAIN)
+
+    def send_raw(self, packet: Packet) -> None:
+        """Queue an undefined packet; raise Refused, EncodeError."""
+        frame = self.encode(packet)
+        self.outbox.put(frame)
+        self._raw.append(frame)
+
+    def withdraw_raw(self) -> None:
+        """Drop the undefined packets that still wait: they might move a robot after its stop."""
+        waiting = len(self.outbox)
+        while self._raw:
+            self.outbox.unqueue(self._raw.popleft())
+        self.traffic.dropped += waiting - len(self.outbox)
+
+    def withdraw_autonomous(self) -> None:
+        """Drop a mode 3 that still waits, and its repetition."""
+        if self._chosen is not None and self._chosen.autonomous:
+            self.outbox.unqueue(self._chosen)
+            self.outbox.clear(_MODE_AGAIN)
+
+    def send(self, message: Packet) -> None:
+        super().send(message)
+        if isinstance(message, _ANSWERED):
+            self._signs.asked(self._heard)
+
+    def outgoing(self, now: float) -> bytes | None:
+        frame = super().outgoing(now)
+        if type(frame) is _Chosen:
+            # A robot that may have misread another mode is in mode 3 until that was sent again.
+            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.is_set(_MODE_AGAIN))
+        return frame
+
+    def _send_surely(self, frame: bytes, again: str, now: float) -> None:
+        """Send a packet, to robots that misread some again; a newer one replaces the repetition of an older one."""
+        self.outbox.put(frame)
+        if self._agreed in _MISREADING:
+            self.outbox.set(again, (frame,), now + AGAIN_S)

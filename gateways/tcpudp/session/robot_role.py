@@ -1,0 +1,291 @@
+"""The gateway plays the robot towards one HQ program. Sans-IO.
+
+Source: "Handshake", "Settings and version negotiation" and "The gateway as robot" of the protocol page.
+
+Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
+:class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
+steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only; :class:`ClientSource`
+decides whose they are. The client's 7 never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3
+always send it. A program that gets a 6 sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 tells that
+the program got no 6: the 5 may have been somebody else's, and the source is dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from enum import Enum
+
+from gateways.tcpudp.messages import (
+    HEADER,
+    SERVER_ID,
+    ClientSettings,
+    ClientUDPConnection,
+    ClientUDPConnectionStatus,
+    Packet,
+    ServerSettings,
+    ServerStartUDP,
+    ServerUDPConnection,
+)
+from gateways.tcpudp.session.packets import PacketSession, id_of
+from gateways.tcpudp.session.source import CLIENT_PORT, FROM_HQ, ClientSource
+from gateways.tcpudp.settings import HQ_BLOCKS, Settings, read_settings
+from gateways.tcpudp.versions import LISTED, VERSIONS
+from zbridge.protocol import (
+    Datagram,
+    Handshake,
+    Limits,
+    NotReady,
+    ProtocolError,
+    Role,
+    State,
+    Unsupported,
+    agree,
+    newest,
+    parse_versions,
+)
+
+PROBE_S = 2.0
+"""Seconds an HQ program has for its datagram 5."""
+REPORT_S = 3.0
+"""Seconds it has for packet 7: it may wait 2 s for a 6 that was lost."""
+RIVAL = "another source of datagrams claims to be this client"
+_HEADER_SIZE = HEADER.size
+_HANDSHAKING, _ESTABLISHED = State.HANDSHAKING, State.ESTABLISHED
+"""As plain names: every client of a host is asked about every datagram that has no owner yet."""
+
+
+class Step(Enum):
+    """What the handshake waits for."""
+
+    GREETED = "sent 2, waits for 3"
+    PROBED = "sent 4, waits for 5"
+    ANSWERED = "got 5 and sent 6, waits for 7"
+    UNANSWERED = "sent no 6, waits for 7"
+    STREAM = "established; no 4 was sent"
+    DONE = "established after a 4"
+
+
+class Event(Enum):
+    """What can happen in a handshake."""
+
+    SETTINGS_UDP = "3, and both set the UDP flag"
+    SETTINGS_TCP = "3, and not both set the UDP flag"
+    PROBE = "5 by UDP from the source"
+    REPORT_TRUE = "7(true) within 2 s of the 4"
+    REPORT_FALSE = "7(false), or later"
+    RIVAL = "a second source sends a 5"
+    TIMEOUT = "the step lasts too long"
+
+
+class RobotRole(PacketSession):
+    """One conversation with an HQ program.
+
+    ``settings``: announced; ``block``: the settings block as sent, default that of ``settings``; ``client_id``: given
+    to the HQ; ``versions``: listed verbatim; ``known``: packet ids that the HQ knows besides those of its version;
+    ``client_port``: the UDP port that it is known to bind, 0 for none. The ``id`` byte of what it sends by TCP is
+    ignored: the connection identifies it, and programs send 0 before they have read the settings.
+    """
+
+    role = Role.ROBOT
+    handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
+    sender_id = SERVER_ID
+
+    def __init__(
+        self,
+        limits: Limits,
+        settings: Settings,
+        client_id: int,
+        versions: Iterable[str] = LISTED,
+        *,
+        block: bytes | None = None,
+        known: Iterable[int] = (),
+        client_port: int = CLIENT_PORT,
+    ) -> None:
+        super().__init__(limits)
+        self.settings = settings
+        self.client_id = client_id
+        self.client: Settings | None = None
+        """What the HQ announced."""
+        self.known: frozenset[int] = frozenset()
+        """The packet ids that the HQ knows; one it does not know cripples it for good."""
+        self._block = settings.encode() if block is None else block
+        self._also_known = frozenset(known)
+        self._versions = tuple(versions)
+        self._agreed = ""
+        self._source = ClientSource(client_id, client_port)
+        self._answer: Datagram | None = None
+        """Packet 6, once it was queued."""
+        self._report_until = -math.inf
+        """Until when a 7(true) answers a 6 that was received."""
+        within_s = {Step.PROBED: PROBE_S, Step.ANSWERED: REPORT_S, Step.UNANSWERED: REPORT_S}
+        self._handshake = Handshake(self, TABLE, Step.GREETED, timeout=Event.TIMEOUT, within_s=within_s)
+
+    def decode(self, frame: bytes) -> Packet:
+        decode = FROM_HQ.get(frame[5])
+        if decode is None:
+            raise self.misplaced(frame)
+        return decode(frame, _HEADER_SIZE)
+
+    def may_send(self, message: Packet) -> None:
+        """Raise Unsupported for a packet that this HQ does not know."""
+        if id_of(message) not in self.known:
+            raise Unsupported(f"an HQ of version {self._agreed} does not know packet {id_of(message)}")
+
+    # The stream
+
+    def opened(self, now: float) -> None:
+        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self._block))
+
+    def accept(self, message: Packet, now: float) -> bool:
+        if isinstance(message, ClientSettings):
+            self._take_settings(message, now)
+        elif self.client is None:
+            raise ProtocolError(f"{type(message).__name__} before clientSettings")
+        elif isinstance(message, ClientUDPConnectionStatus):
+            heard = message.connected and now < self._report_until
+            self._fire(Event.REPORT_TRUE if heard else Event.REPORT_FALSE, now)
+        elif isinstance(message, ClientUDPConnection):
+            raise ProtocolError("clientUDPConnection by TCP")
+        else:
+            return True
+        return False
+
+    def _take_settings(self, message: ClientSettings, now: float) -> None:
+        if self.client is not None:
+            raise ProtocolError("clientSettings a second time")
+        agreed = agree(self._versions, parse_versions(message.versions))
+        if agreed is None:
+            self.refuse_versions(message.versions, self._versions, now)
+            return
+        self.client = read_settings(message.versions, message.block, HQ_BLOCKS)
+        self._agreed = agreed
+        row = newest((agreed,), known=VERSIONS)
+        self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
+        self._fire(Event.SETTINGS_UDP if self.settings.udp and self.client.udp else Event.SETTINGS_TCP, now)
+
+    # Datagrams
+
+    def claims(self, datagram: bytes, port: int) -> bool:
+        """Claim a 5 between our 4 and its 7; later a packet with the client's id from its port."""
+        step = self._handshake.step
+        if self.state is _ESTABLISHED:
+            return step is Step.DONE and self._source.claims_late(datagram, port)
+        probed = self.state is _HANDSHAKING and (step is Step.PROBED or step is Step.ANSWERED)
+        return probed and self._source.claims_probe(datagram, port)
+
+    def rivalled(self, now: float) -> None:
+        """Take datagrams of neither source; in the handshake see :meth:`_reject_both`."""
+        self.left_out[RIVAL] += 1
+        established = self.state is State.ESTABLISHED
+        self._source.lose(for_good=established)
+        self.transport = "tcp"
+        if not established:
+            self._handshake.fire(Event.RIVAL, now)
+
+    def stray(self, datagram: bytes) -> None:
+        """Count a datagram with this client's id from an unknown port; raise NotReady with what to tell the client."""
+        if self.state is State.ESTABLISHED and self._source.sender_of(datagram) == self.client_id:
+            self.traffic.foreign += 1
+            text = "packets by UDP from another port than this client's are not taken"
+            raise NotReady(f"{text} (client_port = {self._source.client_port})")
+
+    def receive_datagram(self, datagram: bytes, now: float) -> list[Packet]:
+        """Take one datagram of the client's source, unless it bears the id of another client."""
+        self._source.bind()
+        sender_id = self._source.sender_of(datagram)
+        if self._source.may_bear(sender_id):
+            return super().receive_datagram(datagram, now)
+        self.malformed(f"datagram with id {sender_id}, which is another client's")
+        return []
+
+    def accept_datagram(self, message: Packet, now: float) -> bool:
+        if isinstance(message, ClientUDPConnection):
+            self._fire(Event.PROBE, now)
+            return False
+        if self.state is not State.ESTABLISHED:  # until the 7 the source may be somebody else's
+            raise ProtocolError(f"{type(message).__name__} by UDP before the handshake is over")
+        return self.accept(message, now)
+
+    # Timers
+
+    def timers(self) -> float:
+        return self._handshake.deadline
+
+    def on_timer(self, now: float) -> None:
+        self._handshake.expire(now)
+
+    # Actions of the table
+
+    def _fire(self, event: Event, now: float) -> None:
+        """Take a message of the handshake; raise ProtocolError if it is not due."""
+        if not self._handshake.fire(event, now):
+            raise ProtocolError(f"{_MESSAGES[event]} was not due")
+
+    def _offer_udp(self, now: float) -> None:
+        """Send 4; the time limit of the settings ends."""
+        self.lift_limit()
+        self.send_first(ServerStartUDP())
+        self._report_until = now + PROBE_S
+
+    def _answer_probe(self, now: float) -> None:
+        """Send 6(true) by UDP to the source of the 5."""
+        self.transport = "udp"
+        self._answer = Datagram(self.encode(ServerUDPConnection(True)))
+        self.outbox.put_exempt(self._answer)
+
+    def _send_no_answer(self, now: float) -> None:
+        """Send no 6: any 6, false too, makes programs of 1.1 and 1.2 believe in UDP."""
+
+    def _reject_both(self, now: float) -> None:
+        """Take the 6 back; close if it has left: the program believes in UDP then."""
+        answer, self._answer = self._answer, None
+        if answer is not None and not self.outbox.withdraw(answer):
+            self.close(RIVAL, now)
+
+    def _drop_source(self, now: float) -> None:
+        """Drop the source; establish the session without UDP."""
+        if self._source.bound:
+            self._source.lose()
+            self.transport = "tcp"
+            self.drops_source = True
+        self._finish(now)
+
+    def _finish(self, now: float) -> None:
+        """Establish the session."""
+        assert self.client is not None
+        self.establish(self._agreed, tuple(feature.value for feature in self.client.features))
+
+
+_MESSAGES = {
+    Event.PROBE: "clientUDPConnection",
+    Event.REPORT_TRUE: "clientUDPConnectionStatus",
+    Event.REPORT_FALSE: "clientUDPConnectionStatus",
+}
+TABLE: dict[Step, dict[Event, tuple[Callable[[RobotRole, float], None], Step]]] = {
+    Step.GREETED: {
+        Event.SETTINGS_UDP: (RobotRole._offer_udp, Step.PROBED),
+        Event.SETTINGS_TCP: (RobotRole._finish, Step.STREAM),
+    },
+    Step.PROBED: {
+        Event.PROBE: (RobotRole._answer_probe, Step.ANSWERED),
+        Event.TIMEOUT: (RobotRole._send_no_answer, Step.UNANSWERED),
+        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
+        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
+        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
+    },
+    Step.ANSWERED: {
+        Event.RIVAL: (RobotRole._reject_both, Step.UNANSWERED),
+        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
+        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
+        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    },
+    Step.UNANSWERED: {
+        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
+        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
+        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
+        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    },
+    Step.STREAM: {},
+    Step.DONE: {},
+}

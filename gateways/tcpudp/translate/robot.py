@@ -1,0 +1,231 @@
+"""One robot of the TCP/UDP package protocol, seen from its HQ: commands to packets, and its stop. Sans-IO.
+
+Source: "Translation" and "The gateway as HQ" of the protocol page. Telemetry is translated by :mod:`.telemetry`.
+
+Theory of operation of the stop. One slot of the outbox holds what is repeated: the packets of the last drive, or packet
+13. From a mode 3 until another mode was sent, 13 alone does not stop the robot: then the stop is the pair 1, 13. A mode
+that is commanded while a stop is repeated stays in force: with mode 3 the repetitions end, with another mode they go on
+as 13 alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from gateways.tcpudp.messages import (
+    PACKETS,
+    ChatMessage,
+    ClientControllMode,
+    ClientGetPosition,
+    ClientGetSLAMMap,
+    ClientJoystickMove,
+    ClientJoystickRotate,
+    ClientJoystickStop,
+    ClientMoveAI,
+    ClientSimulatedLidarData,
+    DebugMessage,
+    OpaquePacket,
+    Packet,
+)
+from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp.settings import Feature
+from gateways.tcpudp.translate.options import NAME, Options
+from gateways.tcpudp.translate.scans import polar_ranges
+from gateways.tcpudp.translate.telemetry import OFF, ON, TelemetryTranslator
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive, FleetMessage, Mode, Raw, Scan, Switch, Text
+from zbridge.fleet.topics import Topic
+from zbridge.protocol import (
+    Malformed,
+    Metrics,
+    NotReady,
+    Outcome,
+    Refused,
+    Robot,
+    Translate,
+    Unsupported,
+)
+
+REPEAT_S = 0.25
+"""Seconds after which a drive command is repeated while the robot moves."""
+STOP_REPEAT_S = 0.1
+"""Seconds between the repetitions of a stop: a late datagram can restart motion."""
+AUTONOMOUS = "autonomous"
+_MODES = {"none": 1, "manual": 2, AUTONOMOUS: 3}
+_MOTION = "motion"
+_NOTHING = Outcome()
+
+
+class TcpUdpRobot(Robot):
+    """One robot of the TCP/UDP package protocol, seen from its HQ."""
+
+    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+        self.options = options
+        self.link_names = ("robot",)
+        self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)
+        self._announce = tuple(Feature(name) for name in options.announce)
+        self._telemetry = TelemetryTranslator(options)
+        self._session: HqRole | None = None
+        self._chosen: str | None = None
+        """The mode that was commanded last."""
+        self._rests_until = self._paired_until = -math.inf
+        """How long packet 13 is repeated, and how long as the pair 1, 13."""
+
+    @property
+    def driving(self) -> HqRole | None:
+        return self._session
+
+    def session(self, link: str, peer: str) -> HqRole:
+        self._session = HqRole(
+            limits(self.options.gap_s),
+            udp=self.options.udp,
+            force=self._force,
+            announce=self._announce,
+            predecessor=self._session,
+        )
+        self._rests_until = self._paired_until = -math.inf
+        self._telemetry.begin(self._session)
+        return self._session
+
+    def translator(self, kind: type) -> Translate:
+        return self._telemetry.translator(kind)
+
+    # Commands to packets
+
+    def command(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
+        carry_out = _COMMANDS.get(topic.path)
+        if carry_out is None:
+            raise Unsupported("a TCP/UDP robot has no such command")
+        return carry_out(self, command, now) or _NOTHING
+
+    def stop(self, now: float, until: float) -> None:
+        """Send packet 13, in mode 3 the pair 1, 13.
+
+        A stop that is repeated cancels the repetitions of other commands; a single one, which is routine, does not.
+        """
+        session = self._connected()
+        session.withdraw_autonomous()
+        session.withdraw_raw()
+        if until > now:
+            session.send_nothing_again()
+        self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
+
+    def known(self, topic: Topic) -> FleetMessage | None:
+        return self._telemetry.known_map() if topic is topics.MAP else None
+
+    def ask(self, topic: Topic) -> None:
+        if topic is not topics.MAP:
+            self._send(ClientGetPosition())
+            return
+        if not self._telemetry.sends_parts:
+            self._send(ClientGetSLAMMap())
+        self._telemetry.await_map()
+
+    def _drive(self, command: Drive, now: float) -> Outcome:
+        left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
+        if not command.moving:
+            session, on_its_own = self._connected(), self._chosen == AUTONOMOUS
+            if on_its_own:
+                session.withdraw_autonomous()
+            paired = on_its_own and session.autonomous
+            self._rest(now, period_s=REPEAT_S, until=now + 1.0, paired=paired, urgent=paired)
+            return Outcome(left_out=left_out)
+        translation = math.hypot(command.forward, command.left)
+        packets: list[Packet] = []
+        if translation:
+            speed = min(1.0, translation) * self.options.speed_full
+            packets.append(ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed))
+        if command.turn:
+            packets.append(ClientJoystickRotate(-command.turn * self.options.turn_full))
+        if len(packets) == 2 and self.options.combine == "exclusive":
+            rotates = abs(command.turn) > translation
+            packets = packets[1:] if rotates else packets[:1]
+            left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
+        session = self._connected()
+        frames = tuple(session.encode(packet) for packet in packets)
+        session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
+        self._rests_until = self._paired_until = -math.inf
+        return Outcome(left_out=left_out) if left_out else _NOTHING
+
+    def _mode(self, command: Mode, now: float) -> None:
+        """Send the mode. While a stop is repeated: mode 3 ends it, any other mode turns the pair into 13 alone."""
+        self._connected().choose_mode(_MODES[command.mode], now)
+        self._chosen = command.mode
+        if command.mode == AUTONOMOUS:
+            if now < self._rests_until:
+                self._connected().outbox.clear(_MOTION)
+        elif now < self._paired_until:
+            self._rest(now, period_s=STOP_REPEAT_S, until=self._paired_until, paired=False, urgent=False)
+
+    def _switch_lidar(self, command: Switch, now: float) -> None:
+        self._connected().switch_lidar(ON if command.on else OFF, now)
+
+    def _switch_camera(self, command: Switch, now: float) -> None:
+        raise Unsupported("no packet turns a camera on or off")
+
+    def _say(self, command: Text, now: float) -> None:
+        if command.kind != "debug":
+            raise Unsupported(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
+        self._send(DebugMessage(command.text))
+
+    def _feed_scan(self, command: Scan, now: float) -> Outcome:
+        self._send(ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
+        return Outcome(telemetry=((topics.SCAN, command),))
+
+    def _send_raw(self, command: Raw, now: float) -> None:
+        self._connected().send_raw(_raw_packet(command))
+
+    def _send(self, message: Packet) -> None:
+        self._connected().send(message)
+
+    def _rest(self, now: float, *, period_s: float, until: float, paired: bool, urgent: bool) -> None:
+        """Repeat packet 13, ``paired`` with a mode 1 before it; raise Refused if the robot may be sent neither."""
+        session = self._connected()
+        packets = (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
+        session.outbox.set(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
+        self._rests_until, self._paired_until = until, until if paired else -math.inf
+
+    def _connected(self) -> HqRole:
+        if self._session is None:
+            raise NotReady("offline")
+        return self._session
+
+
+def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
+    """Write the packets that the robot may be sent; raise Refused if it may be sent none of them."""
+    frames, refusal = [], None
+    for packet in packets:
+        try:
+            frames.append(session.encode(packet))
+        except Refused as refused:
+            refusal = refused
+    if refusal is not None and not frames:
+        raise refusal
+    return tuple(frames)
+
+
+def _raw_packet(command: Raw) -> Packet:
+    """Make the packet of a raw command; raise Refused if a fleet message holds that packet."""
+    spec = PACKETS.get(command.id)
+    if spec is None:
+        if not 0 <= command.id <= 255:
+            raise Malformed(f"packet id {command.id}, expected 0 to 255")
+        return OpaquePacket(command.id, command.body)
+    if spec.packet is ClientMoveAI:
+        return ClientMoveAI(command.body)
+    if spec.packet is ChatMessage:
+        return ChatMessage(command.body)
+    raise Unsupported(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
+
+
+_COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
+    topics.CMD_DRIVE.path: TcpUdpRobot._drive,
+    topics.CMD_MODE.path: TcpUdpRobot._mode,
+    topics.CMD_LIDAR.path: TcpUdpRobot._switch_lidar,
+    topics.CMD_CAMERA.path: TcpUdpRobot._switch_camera,
+    topics.CMD_TEXT.path: TcpUdpRobot._say,
+    topics.CMD_SCAN.path: TcpUdpRobot._feed_scan,
+    topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
+}

@@ -1,0 +1,57 @@
+"""Executes the table of a handshake: ``{step: {event: (action, next step)}}``. Sans-IO.
+
+A session contributes the table, the time that each step may last, and the actions, which are its own methods. It fires
+an event for each message of the handshake and calls :meth:`Handshake.expire` at :attr:`Handshake.deadline`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, Generic, TypeVar
+
+Step = TypeVar("Step", bound=Hashable)
+Event = TypeVar("Event", bound=Hashable)
+Action = Callable[[Any, float], object]
+"""``action(session, now)``; called when the next step has been taken."""
+
+
+class Handshake(Generic[Step, Event]):
+    """One run through a table. ``within_s``: seconds that a step may last; a step that is not in it may last for ever.
+
+    ``timeout``: the event of a step that has lasted too long.
+    """
+
+    def __init__(
+        self,
+        session: object,
+        table: Mapping[Step, Mapping[Event, tuple[Action, Step]]],
+        first: Step,
+        *,
+        timeout: Event,
+        within_s: Mapping[Step, float],
+    ) -> None:
+        self.step = first
+        self.deadline = math.inf
+        """When the step has lasted too long."""
+        self._session, self._table = session, table
+        self._timeout, self._within_s = timeout, within_s
+
+    def __repr__(self) -> str:
+        return f"<Handshake {self.step}>"
+
+    def fire(self, event: Event, now: float) -> bool:
+        """Take the next step, then act; False, and nothing happens, if the event is not due in this step."""
+        row = self._table[self.step].get(event)
+        if row is None:
+            return False
+        action, self.step = row
+        self.deadline = now + self._within_s.get(self.step, math.inf)
+        action(self._session, now)
+        return True
+
+    def expire(self, now: float) -> None:
+        """Fire the timeout if the step has lasted too long. Call at :attr:`deadline`, or later."""
+        if now >= self.deadline:
+            self.deadline = math.inf
+            self.fire(self._timeout, now)

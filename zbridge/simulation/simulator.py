@@ -1,0 +1,139 @@
+"""Serves a simulated robot to the HQ programs that connect: links, conversations, and the steps of its life.
+
+Uses the gateway's sessions and transport, unlike :mod:`zbridge.simulation.fragile`. Knows no bus and no protocol.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from typing import Any, Generic, TypeVar
+
+from zbridge.errors import EncodeError, Refused
+from zbridge.protocol.plugin import Simulation
+from zbridge.protocol.session import Session, State
+from zbridge.simulation.ticker import Ticker
+from zbridge.transport.conversation import Accepted, Conversation
+from zbridge.transport.link import Link, Receiver
+from zbridge.transport.tcp import listen
+
+STEP_S = 0.02
+"""Seconds between two steps of a simulated robot, in its own time too."""
+CATCH_UP_S = 1.0
+"""Most seconds of its life that a robot makes up for after this process was late."""
+
+M = TypeVar("M")
+
+
+class Simulator(ABC, Generic[M]):
+    """One simulated robot on its links. A protocol contributes :meth:`session`, :meth:`take` and :meth:`step`.
+
+    ``links``: one name for each address of the simulation. ``datagrams``: take datagrams on the number of the TCP port.
+    """
+
+    def __init__(self, log: logging.Logger, *, links: tuple[str, ...] = ("robot",), datagrams: bool = False) -> None:
+        self._log, self._links, self._datagrams = log, links, datagrams
+        self._loop = asyncio.get_running_loop()
+        self._clients: dict[Conversation, str] = {}
+
+    # What a protocol contributes
+
+    @abstractmethod
+    def session(self, peer: str, link: str) -> Session[M] | None:
+        """Make the session for a connection to the link of this name; None closes it: no place is free."""
+
+    @abstractmethod
+    def take(self, client: Conversation, message: M) -> None:
+        """Obey or answer one message of an HQ program."""
+
+    @abstractmethod
+    def step(self, steps: int) -> None:
+        """Live for :data:`STEP_S`, and tell what is due; ``steps`` counts from 1."""
+
+    def greet(self, client: Conversation, link: str) -> None:
+        """Send what a new client gets first. Nothing that :meth:`tell` sends comes before it."""
+
+    def dismiss(self, client: Conversation) -> None:
+        """Forget a client whose conversation has ended."""
+
+    def check(self, session: Session[M], message: M) -> None:
+        """Raise Refused for a message that a client may not be sent."""
+
+    # What a protocol calls
+
+    def clients(self, link: str | None = None) -> Iterator[Conversation]:
+        """Give the clients whose sessions are established, of one link or of all."""
+        for client, name in tuple(self._clients.items()):
+            if link in (None, name) and client.session.state is State.ESTABLISHED:
+                yield client
+
+    def tell(self, *messages: M, link: str | None = None) -> None:
+        """Send messages to the clients of one link, or of all."""
+        for client in self.clients(link):
+            self.send(client, *messages)
+
+    def send(self, client: Conversation, *messages: M) -> None:
+        """Send messages to one client, up to the first that it may not be sent or that does not fit."""
+        session = client.session
+        if session.state is State.ESTABLISHED:
+            try:
+                for message in messages:
+                    self.check(session, message)
+                    session.send(message)
+            except (Refused, EncodeError) as error:
+                self._log.debug("%s: not sent, %s", session.name, error)
+            client.pump()
+
+    # Life
+
+    async def run(self, simulation: Simulation) -> None:
+        """Listen on each address and live until cancelled; then close every conversation."""
+        async with contextlib.AsyncExitStack() as stack:
+            addresses = [
+                await stack.enter_async_context(listen(address, self._accepting(name), datagrams=self._datagrams))
+                for name, address in zip(self._links, simulation.addresses, strict=True)
+            ]
+            simulation.ready(tuple(addresses))
+            try:
+                await self._live()
+            finally:
+                for client in tuple(self._clients):
+                    client.close("simulator ended")
+
+    async def _live(self) -> None:
+        ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
+        while True:
+            await ticker.tick()
+            steps += 1
+            self.step(steps)
+
+    def _accepting(self, name: str) -> Callable[[], Receiver]:
+        return lambda: Accepted(lambda link: self._admit(link, name))
+
+    def _admit(self, link: Link, name: str) -> Conversation | None:
+        session = self.session(link.peer, name)
+        if session is None:
+            return None
+        client: Conversation = Conversation(
+            session, self._loop, deliver=lambda messages: self._deliver(client, messages)
+        )
+        client.ended.add_done_callback(lambda _: self._dismiss(client))
+        self._log.info("%s: connected as %s", link.peer, session.name)
+        self._loop.call_soon(self._greet, client, name)  # the session is opened first
+        return client
+
+    def _greet(self, client: Conversation, name: str) -> None:
+        self.greet(client, name)
+        if not client.ended.done():
+            self._clients[client] = name
+
+    def _deliver(self, client: Conversation, messages: list[Any]) -> None:
+        for message in messages:
+            self.take(client, message)
+
+    def _dismiss(self, client: Conversation) -> None:
+        self._clients.pop(client, None)
+        self.dismiss(client)

@@ -177,7 +177,7 @@ def test_a_long_silence_allows_no_jump() -> None:
 def test_a_robot_that_was_stopped_begins_from_standing() -> None:
     limits = MotionLimits(slew_per_s=1.0)
     limits.sent(Drive(forward=1.0, left=-1.0, turn=1.0), 0.0)
-    limits.stands()
+    limits.at_rest()
     assert limits.limit(Drive(forward=1.0, left=-1.0, turn=1.0), 0.125) == Drive(forward=0.125, left=-0.125, turn=0.125)
 
 

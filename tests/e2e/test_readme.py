@@ -1,4 +1,4 @@
-"""The README's programs, run as they stand (only the router's address is the test's)."""
+"""The programs of README and ``docs/keys.md``, run as they stand (only the router's address is the test's)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from pathlib import Path
 
 from tests.e2e.conftest import Bench, free_port, until
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
+ROOT = Path(__file__).parents[2]
 
 
-PROGRAMS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-
-
-def run_program(bench: Bench, program: str) -> list[str]:
-    """Run one of the README's programs against a simulated robot; give the lines it printed."""
+def run_program(bench: Bench, page: str) -> list[str]:
+    """Run a page's one Python program against a simulated robot; give the lines that the program printed."""
+    (program,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
     port = free_port()
     bench.simulator(port)
     bench.gateway("tcpudp1", port)
@@ -32,7 +30,7 @@ def run_program(bench: Bench, program: str) -> list[str]:
 
 
 def test_the_readmes_client_drives(bench: Bench) -> None:
-    first, last = run_program(bench, PROGRAMS[0])
+    first, last = run_program(bench, "README.md")
     state, x, *shape = first.split()
     assert state == "established"
     assert " ".join(shape) == "(100, 100)"
@@ -43,15 +41,7 @@ def test_the_readmes_client_drives(bench: Bench) -> None:
     assert bench.fleet.last("tcpudp1/control")["state"] == "free"
 
 
-def test_the_readmes_plain_program_prints_poses_and_drives(bench: Bench) -> None:
-    poses = [eval(line) for line in run_program(bench, PROGRAMS[1])]
+def test_the_plain_program_of_the_keys_page_prints_poses_and_drives(bench: Bench) -> None:
+    poses = [eval(line) for line in run_program(bench, "docs/keys.md")]
     assert len(poses) > 10
     assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
-
-
-def test_every_key_of_the_readme_is_known() -> None:
-    from zbridge.fleet import topics
-
-    for path in ("pose", "map", "lidar", "camera", "text", "scan", "raw/tcpudp", "status", "control"):
-        assert topics.find(path) is not None
-        assert path.split("/")[0] in README

@@ -44,6 +44,14 @@ TOY: Protocol = toy.PROTOCOL
 LINES = TOY.codecs[0]
 
 
+@pytest.fixture(autouse=True)
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Watch the toy for a shorter time: it shows its pose ten times a second."""
+    times = {"DRIVE_S": 0.5, "IDLE_S": 0.1, "STAND_S": 0.4, "TURN_S": 0.3, "WATCHED_S": 0.5}
+    for name, seconds in times.items():
+        monkeypatch.setattr(f"zbridge.simulation.check_motion.{name}", seconds)
+
+
 @pytest.fixture(scope="module")
 def heard() -> Recording:
     """What the sound robot says."""
@@ -290,16 +298,24 @@ def test_a_simulated_robot_that_does_not_move_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         await deaf(simulation, 0.0)
 
-    (claim,) = failed(check_motion(broken(simulate=simulate), 5.0))
-    assert claim == "the simulated robot drives"
+    drives, turns = failed(check_motion(broken(simulate=simulate), 5.0))
+    assert (drives, turns) == ("the simulated robot drives", "a turn of the simulated robot is counter-clockwise")
+
+
+def test_a_robot_that_drives_backwards_and_turns_clockwise_is_found() -> None:
+    def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
+        toy.ToyRobot._go(self, -forward, -turn, now, **more)
+
+    drives, turns = failed(check_motion(with_robot(_go=go), 5.0)).values()
+    assert drives.startswith("it moved -0.")
+    assert turns.startswith("its heading changed by -0.")
 
 
 def test_a_simulated_robot_that_does_not_stand_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         await deaf(simulation, 0.1)
 
-    (claim,) = failed(check_motion(broken(simulate=simulate), 5.0))
-    assert claim == "the simulated robot stands after its stop"
+    assert "the simulated robot stands after its stop" in failed(check_motion(broken(simulate=simulate), 5.0))
 
 
 async def deaf(simulation: Simulation, step_m: float) -> None:

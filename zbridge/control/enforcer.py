@@ -2,9 +2,9 @@
 
 Theory of operation. The authority decides and has no clock; the enforcer carries out. A command of the holder's passes
 three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is told,
-:meth:`Enforcer.moved` after it was told. Whoever calls a method of the authority calls :meth:`Enforcer.settle` after
-it: that sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms
-the timer. The timer stands at the authority's deadline or before it: commands mostly postpone the deadline, and an
+:meth:`Enforcer.moved` after it was told. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
+sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms the timer
+for the authority's deadline. The timer is re-armed only for an earlier deadline: commands mostly postpone it, and an
 early wake-up is harmless. Before anything is written to the robot :meth:`Enforcer.keep_time` does what is due, since
 the process may have been frozen past its deadline.
 """
@@ -100,7 +100,7 @@ class Enforcer:
                 self._standstill.neutral(now)
 
     def commanded(self, command: FleetMessage) -> None:
-        """Note that the robot was told something that may move it: a mode, or what nobody here can read."""
+        """Note that the robot was told something that may move it: a mode, or a raw message."""
         if isinstance(command, Mode):
             self.authority.mode_chosen(autonomous=command.mode == "autonomous")
         elif isinstance(command, Raw):
@@ -186,7 +186,7 @@ class Enforcer:
             self._refused.value += 1
         else:
             if event.what is not EventKind.ACQUIRED and self._limits is not None:
-                self._limits.stands()
+                self._limits.at_rest()
             self._context.metrics.count("control", what=event.what.value).value += 1
         if event.stops:
             self._send_stop()

@@ -22,12 +22,12 @@ from zbridge.protocol.rate_limit import RateLimit
 TELLINGS_HZ = 20.0
 """Times a second that listeners, all together, may report what they refused."""
 TAKEOVERS_HZ = 5.0
-"""Takeovers a second, of whoever asks."""
+"""Takeovers a second, of all programs together."""
 _LISTENER = "hq."
 _COUNTED = 1_000_000
 """Most refusals of one kind that a report counts."""
 _NAMED = 64
-"""Characters of a name that are repeated to whoever uses it wrongly."""
+"""Characters of a wrong name that a refusal repeats."""
 _ANYBODY = "*"
 
 Decide = Callable[[IncomingQuery], FleetMessage]

@@ -50,8 +50,8 @@ class MotionLimits:
         """Record the drive that the robot was sent."""
         self._last, self._last_at = drive, now
 
-    def stands(self) -> None:
-        """Record that the robot is at rest, whatever it was sent last."""
+    def at_rest(self) -> None:
+        """Note that the robot is at rest, whatever it was told last."""
         self._last = Drive()
 
     def _count(self, now: float) -> None:

@@ -92,7 +92,7 @@ def _array(kind: Any, value: Any) -> Any:
 
 
 def _shaped(message: Map) -> Any:
-    """Give the cells their rows and columns; raise ValueError where they do not fill them."""
+    """Shape the cells to rows x columns; raise ValueError where their number differs."""
     rows, columns, cells = message.rows, message.columns, message.cells
     if rows < 0 or columns < 0 or rows * columns != cells.size:
         raise ValueError(f"{cells.size} cells do not fill {rows} rows x {columns} columns")

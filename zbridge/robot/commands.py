@@ -34,7 +34,7 @@ class Commands:
         self._pump = context.pump
         self._closing: str | None = None
         self.blocked = False
-        """Whether the robot's link takes nothing: drives wait in vain, and all else is refused."""
+        """Whether the robot's link takes nothing: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
         self._taken = context.metrics.count("commands")
         self._unwritten = context.metrics.count("drives_unwritten")
@@ -49,7 +49,7 @@ class Commands:
         try:
             topic = self._topics.get(sample.key)
             if topic is None:
-                if is_stop(sample.key):  # whatever the payload says and whoever says it
+                if is_stop(sample.key):  # of anybody, with any payload
                     self._enforcer.stop_commanded()
                     return
                 topic = self._find(sample.key)

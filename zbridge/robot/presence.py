@@ -120,7 +120,7 @@ class Presence:
             self._pending.refuse_all("the robot was lost")
 
     def _on_established(self, session: Session[Any]) -> None:
-        """Stop the robot, whoever drove it before, and show what there is to show at once."""
+        """Stop the robot, which something else may have driven before, and publish what it can show at once."""
         self._greeted = session
         with contextlib.suppress(Refused):  # the condition says so on status
             self._standstill.stop()

@@ -47,12 +47,12 @@ def main(arguments: list[str]) -> int:
     if len(arguments) != 1:
         sys.stderr.write("usage: python -m zbridge.simulation.check NAME\n")
         return 2
-    logging.disable(logging.CRITICAL)
     try:
         protocol = find_protocol(arguments[0])
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
+    logging.disable(logging.CRITICAL)
     failed = held = 0
     for finding in check(protocol):
         failed, held = failed + (finding.problem is not None), held + (finding.problem is None)
@@ -63,4 +63,5 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.CRITICAL)  # of this process alone: the findings say what is wrong
     sys.exit(main(sys.argv[1:]))

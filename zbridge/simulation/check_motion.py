@@ -1,11 +1,11 @@
-"""Conformance of the simulated robot: it drives when it is told to, and stands after its stop."""
+"""Conformance of the simulated robot: it drives ahead, stands after its stop, and turns to the left."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from zbridge.errors import Refused
 from zbridge.fleet import topics
@@ -20,6 +20,8 @@ IDLE_S = 0.3
 STAND_S = 0.7
 """Seconds after a stop in which the robot has to come to rest."""
 WATCHED_S = 1.2
+TURN_S = 0.6
+TURNED_RAD = 0.02
 MOVED_M = 0.02
 MOVING = 0.05
 """The speed, of full scale, at which a robot moves."""
@@ -49,7 +51,26 @@ async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[Findin
         scene.robot.stop(clock(), clock() + STAND_S / 2)
         stop = await _watch(scene, STAND_S)
         stand = await _watch(scene, WATCHED_S)
-        return [drive.moves(idle), stand.stands(stop, drive)]
+        return [drive.moves(idle), stand.stands(stop, drive), await _turn(scene, clock)]
+
+
+async def _turn(scene: Live, clock: Callable[[], float]) -> Finding:
+    """Turn to the left where the robot shows its heading."""
+    claim = "a turn of the simulated robot is counter-clockwise"
+    before = _Seen(scene).poses
+    if not before:
+        return Finding(claim, None, "not checked: it shows no pose")
+    for _ in range(round(TURN_S / AGAIN_S)):
+        try:
+            scene.robot.command(topics.CMD_DRIVE, Drive(turn=0.5), clock())
+        except Refused as refusal:
+            return Finding(claim, None, refusal.code)
+        await _watch(scene, AGAIN_S)
+    after = _Seen(scene).poses
+    scene.robot.stop(clock(), clock() + STAND_S / 2)
+    await _watch(scene, STAND_S / 2)
+    turned = math.remainder(after[-1].heading - before[-1].heading, 2 * math.pi) if after else 0.0
+    return Finding(claim, None if turned > TURNED_RAD else f"its heading changed by {turned:.3f} rad")
 
 
 async def _watch(scene: Live, seconds: float, *, keep: bool = False) -> _Seen:
@@ -75,9 +96,9 @@ class _Seen:
 
     @property
     def way_m(self) -> float:
-        """How far the robot is from where it was first."""
+        """How far ahead the robot is of where it was first, along the heading that it had; negative: behind."""
         first, last = self.poses[0], self.poses[-1]
-        return math.hypot(last.x - first.x, last.y - first.y)
+        return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
     def moves(self, idle: _Seen) -> Finding:
         """Tell whether it moved, or at least was told so."""
@@ -86,7 +107,7 @@ class _Seen:
             told = bool(self.written - idle.written)
             return Finding(claim, None if told else "nothing is written for a drive", "seen on the wire only")
         if self.poses and self.way_m < MOVED_M:
-            return Finding(claim, f"it moved {self.way_m:.3f} m in {DRIVE_S:g} s")
+            return Finding(claim, f"it moved {self.way_m:.3f} m ahead in {DRIVE_S:g} s")
         if self.speeds and max(map(abs, self.speeds)) < MOVING:
             return Finding(claim, f"it shows a speed of {max(map(abs, self.speeds)):g}")
         return Finding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")
@@ -97,7 +118,7 @@ class _Seen:
         if not self.poses and not self.speeds:
             told = bool(stop.written - drive.written)
             return Finding(claim, None if told else "nothing is written for a stop", "seen on the wire only")
-        if self.poses and self.way_m > MOVED_M:
+        if self.poses and abs(self.way_m) > MOVED_M:
             return Finding(claim, f"it moves on: {self.way_m:.3f} m in {WATCHED_S:g} s")
         if self.speeds and abs(self.speeds[-1]) > MOVING:
             return Finding(claim, f"it shows a speed of {self.speeds[-1]:g}")

@@ -31,7 +31,7 @@ def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding
     except Exception as error:
         yield Finding.broken("what the robot said establishes a session again", error)
         return
-    tried = f"{len(steps)} steps of the handshake"
+    tried = f"each step of the handshake ({len(steps)})"
     for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):
         problems = [problem for step in steps for problem in _at(step, protocol, recording, go_wrong)]
         yield Finding.of(f"{claim} at {tried} ends or spares the session", problems)

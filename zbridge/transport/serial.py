@@ -22,7 +22,7 @@ from zbridge.transport.backlog import Backlog
 from zbridge.transport.link import STALLED_S, Receiver
 
 READ_BYTES = 4096
-"""Most bytes taken from a line before the loop serves others; a terminal's own buffer holds no more."""
+"""Most bytes taken from a line before the loop serves others; the kernel's buffer of a terminal holds no more."""
 CLOSE_S = 1.0
 """Seconds a line is given to carry what was written before it was closed."""
 LOOK_S = 0.01
@@ -181,7 +181,10 @@ class SerialLink:
 
 
 def connect(address: SerialAddress, receiver: Receiver) -> SerialLink:
-    """Open the line for this process alone; raise LinkError where it is missing, in use, or not to be configured."""
+    """Open the line for this process alone; raise LinkError if it is missing, in use, or cannot be configured.
+
+    Runs on the event loop: a line opens within milliseconds, whether anybody is at its other end or not.
+    """
     link = SerialLink(address, _opened(address), receiver)
     link.begin()
     return link

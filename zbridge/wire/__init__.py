@@ -8,9 +8,11 @@ from zbridge.wire.binary import BinaryCodec
 from zbridge.wire.fields import (
     F32,
     F64,
+    I8,
     I16,
     I32,
     U8,
+    U16,
     U32,
     Blob,
     Bool,
@@ -30,9 +32,11 @@ from zbridge.wire.text import TextCodec
 __all__ = [
     "F32",
     "F64",
+    "I8",
     "I16",
     "I32",
     "U8",
+    "U16",
     "U32",
     "BinaryCodec",
     "Blob",

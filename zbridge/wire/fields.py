@@ -83,8 +83,10 @@ class Decimal(msgspec.Struct, frozen=True):
 WireType = Scalar | CountedText | CountedBytes | CountedArray | Remainder | Filling
 TextType = Whole | Decimal
 
+I8 = Annotated[int, Scalar("b")]
 U8 = Annotated[int, Scalar("B")]
 I16 = Annotated[int, Scalar("h")]
+U16 = Annotated[int, Scalar("H")]
 U32 = Annotated[int, Scalar("I")]
 I32 = Annotated[int, Scalar("i")]
 F32 = Annotated[float, Scalar("f")]

@@ -116,21 +116,21 @@ class ToyRobot(Robot):
 
 async def simulate(simulation: Simulation) -> None:
     """Be a robot that moves along x."""
-    place = [0.0, 0.0]
+    place, speed = [0.0, 0.0], [0.0, 0.0]
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         listening = asyncio.create_task(listen(reader))
         with contextlib.suppress(ConnectionError):
             while not listening.done():
-                place[0] += place[1] / 10
-                writer.write(b"at %f 0 0\n" % place[0])
+                place[:] = place[0] + speed[0] / 10, place[1] + speed[1] / 10
+                writer.write(b"at %f 0 %f\n" % (place[0], place[1]))
                 await writer.drain()
                 await asyncio.sleep(0.1)
         writer.close()
 
     async def listen(reader: asyncio.StreamReader) -> None:
         while line := await reader.readline():
-            place[1] = float(line.split()[1])
+            speed[:] = map(float, line.split()[1:])
 
     (address,) = simulation.addresses
     async with await asyncio.start_server(serve, address.host, address.port) as server:

@@ -48,7 +48,7 @@ _TIDY = 64
 _INGRESS = ("ingress",)
 _BOUNDED = ("put", "delete", "query")
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
-"""Where in Zenoh's source an error comes from: of no use to the reader of an error."""
+"""The place in Zenoh's source at the end of its error texts; cut off."""
 
 
 def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
@@ -58,9 +58,9 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
         "connect/endpoints": settings.connect,
         "scouting/multicast/enabled": settings.multicast,
         "open/return_conditions/connect_scouted": wait_for_peers,
-        # A pool of 28 MB in every process, for payloads a robot does not have.
+        # A pool of 28 MB in every process, for payloads larger than a robot has.
         "transport/shared_memory/enabled": False,
-        # A stream is dropped when the bus stands still, not when a thread of it is late by a millisecond.
+        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
     }
     if settings.listen:
@@ -81,7 +81,7 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
 
 
 def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
-    """Have Zenoh drop what comes in and is larger than its key allows."""
+    """Write the filters by which Zenoh drops input that is larger than its key allows."""
     return [
         {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
         for number, (key_exprs, most_bytes) in enumerate(bounds)

@@ -108,6 +108,9 @@ async def simulate(simulation: Simulation) -> None:
     (address,) = simulation.addresses
     async with await asyncio.start_server(serve, address.host, address.port) as server:
         simulation.ready((Address(*server.sockets[0].getsockname()[:2]),))
+        clock = asyncio.get_running_loop().time
+        lived = clock()
         while True:
             await asyncio.sleep(STEP_S)
-            robot.step(STEP_S)
+            before, lived = lived, clock()
+            robot.step(lived - before)

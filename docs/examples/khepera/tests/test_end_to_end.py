@@ -64,9 +64,10 @@ class SerialKhepera:
         os.close(self._near)
 
     def _live(self) -> None:
-        waiting = b""
+        waiting, lived = b"", time.monotonic()
         while not self._over.wait(STEP_S):
-            self.robot.step(STEP_S)
+            before, lived = lived, time.monotonic()
+            self.robot.step(lived - before)
             with contextlib.suppress(BlockingIOError):
                 waiting += os.read(self._far, 4096)
             *lines, waiting = waiting.split(b"\n")

@@ -1,0 +1,134 @@
+"""What the pages name exists: links, files, modules, commands with their options, keys; and no key is left out."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from zbridge.cli.app import app
+from zbridge.fleet import topics
+from zbridge.fleet.topics import Topic
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    page
+    for pattern in ("*.md", "docs/**/*.md", "deploy/**/*.md")
+    for page in ROOT.glob(pattern)
+    if not {"node_modules", ".venv"} & set(page.parts)
+)
+HISTORY = ROOT / "CHANGELOG.md"  # names what is gone
+PRESENT = [page for page in PAGES if page != HISTORY]
+
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+FILE = re.compile(r"(?<![\w/.-])(?:zbridge|gateways|tests|docs|deploy|\.ci)/[\w./<>*@-]*")
+BARE_FILE = re.compile(r"(?<![\w/.*-])\w+\.(?:py|toml|md|hex)\b(?!\()")
+MODULE = re.compile(r"(?<![\w./:@\"-])(?:zbridge|gateways|tests)(?:\.[A-Za-z_]\w*)+")
+COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z]+)(.*)", re.MULTILINE)
+SPAN = re.compile(r"`([^`\n]+)`")
+BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+GROUPS = ("zbridge.protocols",)
+"""Dotted names that are no modules: the entry-point group."""
+THEIRS = ("hq.toml", "r1.toml", "e1.toml", "pyproject.toml", "README.md", "CHANGELOG.md")
+"""Files that a reader writes, or that stand at the root of every package."""
+
+
+def on_every_page(pages: list[Path]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("page", pages, ids=lambda page: str(page.relative_to(ROOT)))
+
+
+def anchors(page: Path) -> set[str]:
+    """Give the anchors of a page's headings, as they are made where the pages are shown."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@on_every_page(PAGES)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    for target in LINK.findall(page.read_text()):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), target
+        assert not anchor or anchor in anchors(there), target
+
+
+@on_every_page(PRESENT)
+def test_every_file_that_is_named_exists(page: Path) -> None:
+    text = page.read_text()
+    for name in FILE.findall(text):
+        path = re.sub(r"<\w+>", "*", name).rstrip(".")
+        assert any((*ROOT.glob(path), *ROOT.glob(f"docs/examples/*/{path}"))), name
+    for name in BARE_FILE.findall("\n".join(SPAN.findall(BLOCK.sub("", text)))):
+        found = (
+            path for top in ("zbridge", "gateways", "tests", "docs", "deploy") for path in (ROOT / top).rglob(name)
+        )
+        assert name in THEIRS or next(found, None), name
+
+
+def test_the_page_of_the_architecture_names_every_room() -> None:
+    rooms = {f"`{path.parent.relative_to(ROOT)}/`" for path in ROOT.glob("zbridge/*/__init__.py")}
+    named = set(re.findall(r"^\| (`zbridge/\w+/`) \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE))
+    assert named == rooms
+
+
+@on_every_page(PRESENT)
+def test_every_module_that_is_named_exists(page: Path) -> None:
+    for name in MODULE.findall(page.read_text()):
+        assert name in GROUPS or is_there(name), name
+
+
+def is_there(name: str) -> bool:
+    """Tell whether a dotted name is a module, or something in one."""
+    chunks = name.split(".")
+    for length in range(len(chunks), 0, -1):
+        path = ROOT.joinpath(*chunks[:length])
+        if path.with_suffix(".py").exists() or (path / "__init__.py").exists():
+            break
+    else:
+        return False
+    if length == len(chunks):
+        return True
+    found: object = importlib.import_module(".".join(chunks[:length]))
+    for chunk in chunks[length:]:
+        found = getattr(found, chunk, None)
+    return found is not None
+
+
+@on_every_page(PRESENT)
+def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None:
+    commands = typer.main.get_group(app).commands
+    text = page.read_text()
+    for name, rest in COMMAND.findall("\n".join([*BLOCK.findall(text), *SPAN.findall(BLOCK.sub("", text))])):
+        assert name in commands, f"zbridge {name}"
+        known = {option for parameter in commands[name].params for option in parameter.opts}
+        unknown = set(re.findall(r"--[a-z-]+", rest.partition("#")[0].partition("&&")[0])) - known
+        assert not unknown, f"zbridge {name} {rest}"
+
+
+def documented_keys() -> Iterator[str]:
+    """Give each key of ``docs/keys.md`` as a path below the robot; the second and later of a row continue the first."""
+    for row in re.findall(r"^\| (`fleet/r1/[^|]+) \|", (ROOT / "docs" / "keys.md").read_text(), re.MULTILINE):
+        first, *others = (key.removeprefix("fleet/r1/") for key in SPAN.findall(row))
+        head = re.sub(r"[^/]+(/<\w+>)?$", "", first)
+        yield from (first, *(head + other for other in others))
+
+
+def test_the_page_of_keys_names_every_key_and_no_other() -> None:
+    documented = {re.sub(r"<\w+>$", "name", path) for path in documented_keys()}
+    found = {
+        path: topics.find(path) for path in documented if not path.startswith(("@wire/", "@alive/", "@rpc/claim/"))
+    }
+    assert [path for path, topic in found.items() if topic is None] == []
+    declared = {topic.path for topic in vars(topics).values() if isinstance(topic, Topic)}
+    assert declared - documented == set()
+    families = {
+        topic("").path.rpartition("/")[0] for name, topic in vars(topics).items() if name.isupper() and callable(topic)
+    }
+    assert families - {path.rpartition("/")[0] for path in documented} == set()

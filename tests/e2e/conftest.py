@@ -230,6 +230,12 @@ class Bench:
     def gateway(self, robot: str, port: int, more: str = "") -> subprocess.Popen[str]:
         return self.zbridge("run", str(self.configuration(robot, port, more)))
 
+    def serve(self, robot: str, port: int, more: str = "") -> subprocess.Popen[str]:
+        """Start a gateway and wait until its robot is established."""
+        process = self.gateway(robot, port, more)
+        until(lambda: self.fleet.state(robot) == "established", what="established")
+        return process
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:

@@ -35,8 +35,7 @@ def test_a_gateway_that_cannot_write_its_audit_log_says_so_once_serves_the_robot
     make(file)
     bench.simulator(port)
     more = f'[control]\naudit = "{file}"\n[metrics]\nlisten = "127.0.0.1:{metrics}"\n'
-    gateway = bench.gateway("r1", port, more)
-    until(lambda: bench.fleet.state("r1") == "established")
+    gateway = bench.serve("r1", port, more)
     for _ in range(3):
         bench.fleet.hold("r1", "driver", how="takeover")
     reason = f"the audit log is not written: {why}"

@@ -48,8 +48,7 @@ def reason(bench: Bench) -> str:
 def test_a_forged_claim_takes_the_robot_from_nobody_and_a_plausible_one_is_told(
     bench: Bench, robot: ScriptedRobot, held_s: float, plausible: bool
 ) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", robot.port)
     forged = msgpack.packb({"zid": "0", "held_s": held_s, "has": True})
     with joined(bench.endpoint) as forger:
         zid = str(forger.zid())
@@ -110,8 +109,7 @@ def halves(bench: Bench, tmp_path: Path) -> Iterator[Halves]:
 def test_of_two_that_meet_the_one_that_has_the_robot_keeps_it(bench, halves, robot) -> None:
     second = halves.gateway(free_port())  # it serves the robot for longer, and never reaches it
     until(halves.far.tokens, what="a gateway that serves the robot")
-    first = bench.gateway("r1", robot.port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    first = bench.serve("r1", robot.port)
     halves.join()
     assert second.stdout is not None
     assert any(LEFT in line for line in second.stdout)

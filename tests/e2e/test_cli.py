@@ -74,8 +74,7 @@ def test_the_module_of_a_protocol_runs_only_that_protocol(tmp_path: Path) -> Non
 def test_ls_lists_the_robot_and_stop_confirms(bench: Bench) -> None:
     port = free_port()
     bench.simulator(port)
-    bench.gateway("r1", port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", port)
     at = ("--connect", bench.endpoint)
     (robot,) = [json.loads(line) for line in zbridge("ls", "--json", *at).stdout.splitlines()]
     assert (robot["robot"], robot["state"], robot["version"]) == ("r1", "established", "1.3")
@@ -94,8 +93,7 @@ def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it_on_a_n
     port, listener = free_port(), free_port()
     bench.simulator(port)
     address = f"tcp://127.0.0.1:{listener}"
-    bench.gateway("r1", port, f'[[hq]]\nname = "desk"\nprotocol = "tcpudp"\nlisten = "{address}"\n')
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", port, f'[[hq]]\nname = "desk"\nprotocol = "tcpudp"\nlisten = "{address}"\n')
     program = bench.zbridge("simulate", "tcpudp", "--hq", address)
     at = ("--sessions", "--connect", bench.endpoint)
 
@@ -125,8 +123,7 @@ def test_simulate_is_either_a_robot_or_an_hq_program() -> None:
 def test_a_stop_typed_by_anybody_takes_the_robot_from_its_driver(bench: Bench) -> None:
     port = free_port()
     bench.simulator(port)
-    bench.gateway("r1", port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", port)
     bench.fleet.hold("r1", "driver")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     assert zbridge("stop", "r1", "--connect", bench.endpoint).stdout == "r1: stopped\n"

@@ -71,8 +71,7 @@ def refused(bench: Bench, code: str, command: str) -> dict[str, Any] | None:
 
 
 def test_whoever_overhears_everything_can_do_nothing_with_it(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", robot.port)
     with (
         zenoh.open(configuration("client", [bench.endpoint])) as ours,
         zenoh.open(configuration("client", [bench.endpoint])) as theirs,
@@ -118,8 +117,7 @@ def test_whoever_overhears_everything_can_do_nothing_with_it(bench: Bench, robot
 
 
 def test_of_what_has_wildcards_only_a_stop_is_carried_out(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: bench.fleet.state("r1") == "established")
+    bench.serve("r1", robot.port)
     session = bench.fleet.session
     held = acquired(session)
     wild = "fleet/*/@cmd/drive"

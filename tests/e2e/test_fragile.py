@@ -24,8 +24,7 @@ def test_a_fragile_robot_survives_fifty_mixed_commands(version: str, udp: bool) 
 
 def serve(bench: Bench, robot: Any) -> None:
     """Start the gateway of a fragile robot and take its lease."""
-    bench.gateway("r1", int(robot.stdout.readline()))
-    until(lambda: bench.fleet.state("r1") == "established", what="established")
+    bench.serve("r1", int(robot.stdout.readline()))
     bench.fleet.hold("r1")
 
 

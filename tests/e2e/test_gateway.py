@@ -63,8 +63,7 @@ def test_a_robot_is_seen_driven_and_asked(bench: Bench) -> None:
 
 
 def test_a_late_joiner_gets_the_last_states_by_plain_get(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     robot.send(bytes.fromhex("06000000013301000000"))  # lidar status: on
     until(lambda: bench.fleet.last("r1/lidar"))
     assert bench.fleet.get("fleet/r1/lidar")[0]["on"] is True
@@ -72,8 +71,7 @@ def test_a_late_joiner_gets_the_last_states_by_plain_get(bench: Bench, robot: Sc
 
 
 def test_position_bytes_become_a_pose_in_metres_and_radians(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     robot.send(position(150.0, -225.0, 90.0))
     pose = until(lambda: bench.fleet.last("r1/pose"))
     assert pose["x"] == pytest.approx(1.5)
@@ -85,8 +83,7 @@ def test_position_bytes_become_a_pose_in_metres_and_radians(bench: Bench, robot:
 def test_robot_killed_and_restarted_data_flows_again(bench: Bench) -> None:
     port = free_port()
     simulator = bench.simulator(port)
-    bench.gateway("r1", port)
-    until(lambda: established(bench))
+    bench.serve("r1", port)
     end(simulator, signal.SIGKILL)
     until(lambda: bench.fleet.state("r1") == "offline", what="offline")
     assert bench.fleet.last("r1/status")["reason"]
@@ -112,8 +109,7 @@ def test_kill_9_removes_the_liveliness_token(bench: Bench, robot: ScriptedRobot)
 
 
 def test_sigterm_stops_the_robot_and_ends_within_two_seconds(bench: Bench, robot: ScriptedRobot) -> None:
-    gateway = bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    gateway = bench.serve("r1", robot.port)
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11), what="drive at the robot")
@@ -130,8 +126,7 @@ def test_sigterm_stops_the_robot_and_ends_within_two_seconds(bench: Bench, robot
 
 @pytest.mark.parametrize("repetition", range(3))
 def test_driver_killed_the_robot_stops_within_the_deadman(bench: Bench, robot: ScriptedRobot, repetition: int) -> None:
-    bench.gateway("r1", robot.port, DEADMAN)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port, DEADMAN)
     with driving(bench, robot) as driver:
         withheld_s = bench.withheld_s
         driver.kill()
@@ -166,8 +161,7 @@ def refusals(bench: Bench) -> dict[str, Any]:
 
 
 def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman(bench, robot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     with driving(bench, robot, "operator.1") as driver:
         assert bench.fleet.last("r1/control")["holder"] == "driver"
         withheld_s = bench.withheld_s
@@ -181,8 +175,7 @@ def test_a_killed_driver_that_announced_itself_is_missed_long_before_the_deadman
 
 
 def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(bench, robot) -> None:
-    bench.gateway("r1", robot.port, DEADMAN)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port, DEADMAN)
     with driving(bench, robot, "operator.1") as driver:
         withheld_s = bench.withheld_s
         os.kill(driver.pid, signal.SIGSTOP)
@@ -195,8 +188,7 @@ def test_a_driver_that_froze_and_goes_on_moves_nothing_before_it_sends_neutral(b
 
 
 def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhile(bench, robot) -> None:
-    gateway = bench.gateway("r1", robot.port, DEADMAN)
-    until(lambda: established(bench))
+    gateway = bench.serve("r1", robot.port, DEADMAN)
     with driving(bench, robot):
         os.kill(gateway.pid, signal.SIGSTOP)
         time.sleep(1.0)
@@ -210,8 +202,7 @@ def test_a_gateway_that_froze_and_goes_on_stops_the_robot_whatever_came_meanwhil
 
 
 def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_on_its_own(bench, robot) -> None:
-    bench.gateway("r1", robot.port, "[control]\nlease_s = 0.6\n")
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port, "[control]\nlease_s = 0.6\n")
     bench.fleet.hold("r1")
     time.sleep(1.2)  # the stop that greets the robot is repeated for a second
     bench.fleet.put("r1/@cmd/mode", mode="autonomous")
@@ -228,8 +219,7 @@ def test_a_lease_lasts_while_it_is_renewed_and_its_end_stops_a_robot_that_moves_
 
 
 def test_of_two_programs_the_holder_drives_until_the_other_takes_over(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     fleet, other = bench.fleet, Fleet(bench.fleet.session)
     fleet.hold("r1", "first")
     assert [denied["holder"] for denied in fleet.get("fleet/r1/@rpc/control/acquire/second", who="second")] == ["first"]
@@ -251,8 +241,7 @@ def test_of_two_programs_the_holder_drives_until_the_other_takes_over(bench: Ben
 
 
 def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_was_expected(bench, robot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     (error,) = bench.fleet.get("fleet/r1/@rpc/control/acquire/me", priority=1)
     assert error["code"] == "malformed"
     assert error["reason"].startswith("Acquire: ")
@@ -261,8 +250,7 @@ def test_a_question_about_the_lease_that_cannot_be_read_is_answered_with_what_wa
 
 def test_limits_and_the_audit_log_are_as_configured(bench: Bench, robot: ScriptedRobot) -> None:
     file = bench.folder / "audit" / "r1.jsonl"
-    bench.gateway("r1", robot.port, f'[control]\nrate_hz = 5\nslew_per_s = 1.0\naudit = "{file}"\n')
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port, f'[control]\nrate_hz = 5\nslew_per_s = 1.0\naudit = "{file}"\n')
     lease = bench.fleet.hold("r1", "hq")
     for _ in range(5):
         bench.fleet.put("r1/@cmd/drive", forward=1.0)
@@ -304,8 +292,7 @@ with zenoh.open(config) as session:
 
 
 def test_the_bus_lost_while_driving_stops_the_robot_at_once(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
@@ -321,8 +308,7 @@ def test_the_bus_lost_while_driving_stops_the_robot_at_once(bench: Bench, robot:
 
 
 def test_one_packet_per_write_and_never_back_to_back(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     bench.fleet.hold("r1")
     for number in range(20):
         bench.fleet.put("r1/@cmd/text", text=f"number {number}")
@@ -338,8 +324,7 @@ def test_one_packet_per_write_and_never_back_to_back(bench: Bench, robot: Script
 
 
 def test_refusals_show_on_control(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     bench.fleet.hold("r1", "hq")
     bench.fleet.put("r1/@cmd/drive", forward=7.0)
     bench.fleet.put("r1/@cmd/camera", on=True)
@@ -369,8 +354,7 @@ def test_a_robot_of_another_version_is_told_and_left(bench: Bench) -> None:
 
 
 def test_rubbish_from_the_robot_ends_its_session_and_nothing_else(bench: Bench, robot: ScriptedRobot) -> None:
-    gateway = bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    gateway = bench.serve("r1", robot.port)
     robot.send(b"\xff" * 1000)
     until(lambda: "broken stream" in (bench.fleet.last("r1/status").get("reason") or ""))
     until(lambda: robot.connections > 1 and established(bench), what="connected again")
@@ -380,8 +364,7 @@ def test_rubbish_from_the_robot_ends_its_session_and_nothing_else(bench: Bench, 
 
 
 def test_a_second_gateway_waits_and_takes_over(bench: Bench, robot: ScriptedRobot) -> None:
-    first = bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    first = bench.serve("r1", robot.port)
     second = bench.gateway("r1", robot.port)
     assert second.stderr is None
     assert second.stdout is not None
@@ -394,8 +377,7 @@ def test_a_second_gateway_waits_and_takes_over(bench: Bench, robot: ScriptedRobo
 
 
 def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     second = bench.gateway("r1", robot.port)
     assert second.stdout is not None
     assert "another gateway serves r1" in second.stdout.readline()
@@ -410,8 +392,7 @@ def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies(bench: Ben
 
 
 def test_a_driver_that_goes_on_while_the_gateway_ends_moves_nothing(bench: Bench, robot: ScriptedRobot) -> None:
-    gateway = bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    gateway = bench.serve("r1", robot.port)
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
@@ -428,8 +409,7 @@ def test_a_driver_that_goes_on_while_the_gateway_ends_moves_nothing(bench: Bench
 
 
 def test_a_robot_is_stopped_when_its_connection_returns(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     bench.fleet.hold("r1")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: robot.packets(11))
@@ -485,8 +465,7 @@ def test_a_gateway_waits_for_a_bus_that_is_not_there_yet(bench: Bench, robot: Sc
 
 
 def test_raw_frames_are_published_while_somebody_listens(bench: Bench, robot: ScriptedRobot) -> None:
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     frames: list[bytes] = []
     watch = bench.fleet.session.declare_subscriber(
         "fleet/r1/@wire/*/*", lambda sample: frames.append(sample.payload.to_bytes())
@@ -502,8 +481,7 @@ def test_counters_are_served_to_prometheus(bench: Bench, robot: ScriptedRobot) -
     import urllib.request
 
     port = free_port()
-    bench.gateway("r1", robot.port, f'[metrics]\nlisten = "127.0.0.1:{port}"\n')
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port, f'[metrics]\nlisten = "127.0.0.1:{port}"\n')
     robot.send(position(1.0, 2.0, 3.0))
     until(lambda: bench.fleet.last("r1/pose"))
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=3) as page:
@@ -513,8 +491,7 @@ def test_counters_are_served_to_prometheus(bench: Bench, robot: ScriptedRobot) -
 
 def test_msgpack_and_zenoh_are_all_a_reader_needs(bench: Bench, robot: ScriptedRobot) -> None:
     """What the README shows: the payload is a plain MessagePack map, the encoding names it."""
-    bench.gateway("r1", robot.port)
-    until(lambda: established(bench))
+    bench.serve("r1", robot.port)
     samples: list[Any] = []
     watch = bench.fleet.session.declare_subscriber("fleet/r1/pose", samples.append)
     until(lambda: (robot.send(position(100.0, 0.0, 0.0)), samples)[1])

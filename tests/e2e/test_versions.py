@@ -64,8 +64,7 @@ def test_a_1_4_robot_is_driven_while_it_sends_its_map(bench: Bench, udp: bool) -
 def test_datagrams_from_elsewhere_are_dropped_and_counted(bench: Bench) -> None:
     port, metrics = free_port(), free_port()
     bench.simulator(port, "tcpudp", "--udp")
-    gateway = bench.gateway("r1", port, f'[metrics]\nlisten = "127.0.0.1:{metrics}"\n')
-    until(lambda: bench.fleet.state("r1") == "established")
+    gateway = bench.serve("r1", port, f'[metrics]\nlisten = "127.0.0.1:{metrics}"\n')
     forged = bytes.fromhex("0e000000013700007a4400007a4400000000")  # a position at (1000, 1000)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for ours in _udp_ports(gateway.pid):
@@ -104,8 +103,7 @@ def test_probe_warns_talks_only_with_yes_and_asks_a_gateway_first(bench: Bench) 
         assert "version: 1.3" in asked.stdout
         assert '"joystick"' in asked.stdout
         assert robot.connections == 1
-        bench.gateway("r1", robot.port)
-        until(lambda: bench.fleet.state("r1") == "established")
+        bench.serve("r1", robot.port)
         served = zbridge("probe", "tcpudp", at, "--connect", bench.endpoint)
         assert served.returncode == 0
         assert "served by the gateway of r1" in served.stdout

@@ -685,18 +685,6 @@ async def test_the_gateway_going_away_ends_the_drive() -> None:
         operator.command(topics.CMD_DRIVE, GO)
 
 
-async def test_a_lease_granted_after_the_gateway_was_lost_is_given_back() -> None:
-    scene = Scene()
-    operator = scene.operator()
-    operator.command(topics.CMD_DRIVE, STAND)
-    operator.command(topics.CMD_DRIVE, GO)
-    operator.gateway_lost()
-    await scene.settle()
-    assert scene.gateway.asked == ["acquire", "release"]
-    assert not operator.active
-    assert scene.gateway.taken() == []
-
-
 async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_operator() -> None:
     scene = Scene()
     scene.operator().gateway_lost()

@@ -120,34 +120,11 @@ def test_the_handshake_of_an_hq_may_be_cut_anywhere(cut: int) -> None:
     assert messages == [ServerPosition(1.5, -2.25, 90.0)]
 
 
-def test_settings_of_a_robot_1_4_are_read_like_those_of_1_3() -> None:
-    session = opened_hq()
-    session.receive(robot_settings(b"1.1,1.2,1.3,1.4"), 0.1)
-    assert session.version == "1.4"
-    assert session.features == FEATURES
-    assert session.outgoing(0.1) == HQ_SETTINGS
-
-
 def test_settings_with_an_unknown_tail_are_read() -> None:
     body = ROBOT_SETTINGS[4:] + b"\x01\x02\x03"
     session = opened_hq()
     session.receive(len(body).to_bytes(4, "little") + body, 0.1)
     assert session.state is State.ESTABLISHED
-
-
-def test_a_robot_without_a_common_version_is_told_so_and_closed() -> None:
-    session = opened_hq()
-    session.receive(robot_settings(b"9.9"), 0.1)
-    assert session.state is State.CLOSING
-    assert session.version is None
-    told = session.outgoing(0.1)
-    assert told is not None
-    assert told[4:6] == bytes([5, 1])
-    assert b"no common version: the peer speaks '9.9'" in told
-    assert session.outgoing(0.2) is None
-    assert session.state is State.CLOSED
-    assert session.reason is not None
-    assert session.reason.startswith("no common version")
 
 
 def test_a_robot_without_a_common_version_is_told_so_whatever_its_settings_block() -> None:
@@ -445,18 +422,6 @@ def test_settings_of_an_hq_that_come_again_change_nothing() -> None:
     assert session.traffic.malformed == 1
 
 
-def test_an_hq_without_a_common_version_is_told_so_and_closed() -> None:
-    session = opened_robot()
-    session.outgoing(0.0)
-    session.receive(hq_settings(b"7.0"), 0.1)
-    told = session.outgoing(0.1)
-    assert told is not None
-    assert told[4:6] == bytes([1, 1])
-    assert b"'7.0'" in told
-    assert session.outgoing(0.2) is None
-    assert session.state is State.CLOSED
-
-
 def test_a_long_version_list_of_an_hq_is_quoted_shortly() -> None:
     session = opened_robot()
     session.outgoing(0.0)
@@ -482,31 +447,6 @@ def test_an_hq_that_never_answers_is_given_up() -> None:
 
 
 # Both
-
-
-def carry(source: HqRole | RobotRole, sink: HqRole | RobotRole, now: float, size: int) -> list[Packet]:
-    messages: list[Packet] = []
-    while (frame := source.outgoing(now)) is not None:
-        for start in range(0, len(frame), size):
-            messages += sink.receive(frame[start : start + size], now)
-        now += 0.01
-    return messages
-
-
-@pytest.mark.parametrize("size", [1, 3, 4096])
-def test_both_roles_back_to_back_agree_and_understand_each_other(size: int) -> None:
-    robot, hq = opened_robot(), opened_hq()
-    assert carry(robot, hq, 0.1, size) == []
-    assert carry(hq, robot, 0.2, size) == []
-    assert (robot.state, hq.state) == (State.ESTABLISHED, State.ESTABLISHED)
-    assert (robot.version, hq.version) == ("1.3", "1.3")
-    hq.send(ClientControllMode(2))
-    hq.send(ClientGetPosition())
-    assert carry(hq, robot, 1.0, size) == [ClientControllMode(2), ClientGetPosition()]
-    robot.send(ServerPosition(1.5, -2.25, 90.0))
-    robot.send(DebugMessage("bye"))
-    assert carry(robot, hq, 2.0, size) == [ServerPosition(1.5, -2.25, 90.0), DebugMessage("bye")]
-    assert (robot.traffic.malformed, hq.traffic.malformed) == (0, 0)
 
 
 FRAMES = st.builds(

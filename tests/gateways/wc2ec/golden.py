@@ -1,6 +1,7 @@
 """The messages of both dialects, by hand from the tables of the protocol page."""
 
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from gateways.wc2ec.messages import (
     write,
 )
 from tests.conformance.side import Side, framed
+from zbridge.fleet.messages import Device
 
 DRAFT, DEPLOYED = Dialect.DRAFT, Dialect.DEPLOYED
 WC, EC = Sender.WC, Sender.EC
@@ -80,3 +82,31 @@ def _side(dialect: Dialect, sender: Sender) -> Side:
 
 
 SIDES = [_side(*side) for side in GOLDEN]
+
+DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
+NODE_TYPES = {"distance": DISTANCE, "linear": LINEAR, "rotational": ROTATIONAL}
+
+
+def registration(kind: int, number: int, name: bytes) -> bytes:
+    return bytes((0, kind, number, len(name))) + name
+
+
+def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> bytes:
+    return struct.pack("<BBBd", command, kind, number, value)
+
+
+def light(number: int, value: float) -> bytes:
+    return data(number, value, 0, 0)
+
+
+RECORDED = (
+    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
+    Device("slider_curb_lf", 4, "linear"),
+    Device("slider_curb_lf2", 5, "linear"),
+    *(
+        Device(name, 6 + at, "distance")
+        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
+    ),
+)
+"""The devices of the recorded controller, and the values of its sensors in every round."""
+RECORDED_VALUES = (1000.0, 750.5, 123.456, 0.0, -1.0, 0.001)

@@ -17,6 +17,16 @@ from gateways.wc2ec.messages import Wc2EcMessage
 from gateways.wc2ec.settings import DeviceOption, Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import stream
+from tests.gateways.wc2ec.golden import (
+    DISTANCE,
+    LINEAR,
+    RECORDED,
+    RECORDED_VALUES,
+    ROTATIONAL,
+    data,
+    light,
+    registration,
+)
 from zbridge.errors import ConfigError, ProtocolError
 from zbridge.fleet import payload, topics
 from zbridge.fleet.messages import (
@@ -39,7 +49,6 @@ from zbridge.protocol.session import Limits, Role, State
 NAN, INF = math.nan, math.inf
 LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)
 CAPTURE, PORT = "wc2ec-deployed.hex", 27515
-DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
 LEFT_RIGHT = bytes.fromhex("00 35 00 04 6c656674") + bytes.fromhex("00 35 01 05 7269676874")
 """The two motors of a robot without any: devices 0 and 1."""
 CAR = (Device("fl", 0, "rotational"), Device("fr", 1, "rotational"), Device("lift", 4, "linear"))
@@ -52,16 +61,6 @@ CAR_BYTES = (
 )
 CAR_FAULT = bytes.fromhex("01 25 07 000000000000f0bf")
 """-1 of its one sensor: nothing is known of it yet."""
-RECORDED = (
-    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
-    Device("slider_curb_lf", 4, "linear"),
-    Device("slider_curb_lf2", 5, "linear"),
-    *(
-        Device(name, 6 + at, "distance")
-        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
-    ),
-)
-RECORDED_VALUES = (1000.0, 750.5, 123.456, 0.0, -1.0, 0.001)
 LIGHTS = (DeviceOption("light0", 0), DeviceOption("light1", 9), DeviceOption("sector0", 3, "distance"))
 
 
@@ -155,18 +154,6 @@ def drained(client: HqClient, now: float = 0.0) -> list[bytes]:
         frames.append(frame)
         assert len(frames) < 1000
     return frames
-
-
-def registration(kind: int, number: int, name: bytes) -> bytes:
-    return bytes((0, kind, number, len(name))) + name
-
-
-def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> bytes:
-    return struct.pack("<BBBd", command, kind, number, value)
-
-
-def light(number: int, value: float) -> bytes:
-    return data(number, value, 0, 0)
 
 
 def set_value(number: int, value: float, kind: int = ROTATIONAL) -> bytes:
@@ -615,13 +602,13 @@ def joined(*said: tuple[float, bytes], join_s: float = 0.03, until: float = 1.0)
     """The drives that come of what is said at these moments, with theirs, to the millisecond."""
     scene = Scene("tcpudp", join_s=join_s)
     client, told = scene.clients[0], []
-    for at, data in (*said, (until, b"")):
+    for at, now_said in (*said, (until, b"")):
         due = scene.side.deadline(client)
         if due <= at:
             assert scene.side.expire(client, due - 0.0001) == ()
             told += [(due, command) for _, command in scene.side.expire(client, due)]
             assert scene.side.deadline(client) == INF
-        told += [(at, command) for _, command in scene.says(data, now=at)]
+        told += [(at, command) for _, command in scene.says(now_said, now=at)]
     return [(round(at, 3), command) for at, command in told]
 
 

@@ -12,6 +12,7 @@ from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
+from tests.gateways.wc2ec.golden import DISTANCE, LINEAR, ROTATIONAL, data, light, registration
 from zbridge.app import config
 from zbridge.app.templates import robot_template
 from zbridge.errors import ConfigError, EncodeError, ProtocolError, Refused
@@ -36,7 +37,6 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.session import State
 
 STAMP = 1_700_000_000_000_000_000
-DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
 WHEELS: dict[str, Any] = {
     "differential": {
         "left": ["fl", "rl"],
@@ -71,18 +71,6 @@ def options_of(**options: Any) -> Options:
 def draft(count: int = 2, **options: Any) -> Options:
     devices = [{"name": f"light{number}", "number": number} for number in range(count)]
     return options_of(**{"dialect": "draft", "devices": devices, **options})
-
-
-def registration(kind: int, number: int, name: bytes) -> bytes:
-    return bytes((0, kind, number, len(name))) + name
-
-
-def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> bytes:
-    return struct.pack("<BBBd", command, kind, number, value)
-
-
-def light(number: int, value: float) -> bytes:
-    return data(number, value, 0, 0)
 
 
 CAR = b"".join(

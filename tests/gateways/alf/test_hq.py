@@ -14,10 +14,11 @@ from msgspec.structs import replace
 from gateways.alf import hq as module
 from gateways.alf.conformance.fragile_hq import Reader
 from gateways.alf.conformance.parser import INIT, SCAN
-from gateways.alf.hq import AlfHq, HqClient, HqOptions
+from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import AlfMessage
 from gateways.alf.translate import AlfRobot, Options
 from tests.captures import payloads, stream
+from tests.gateways.rig import HqScene, drained
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as fleet_payload
 from zbridge.fleet import topics
@@ -25,11 +26,9 @@ from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Sca
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.intent import Action, Intent
-from zbridge.protocol.plugin import Telemetry
-from zbridge.protocol.session import Limits, Role, State
+from zbridge.protocol.session import Role, State
 
 NAN, INF = math.nan, math.inf
-LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)
 STAMP = 1_700_000_000_123_456_789
 DIALECTS = ("text", "binary")
 POINTS = 769
@@ -67,49 +66,26 @@ def turned(count: int) -> Scan:
     return scan_of((1 + number / 1000 for number in range(count)), angle_min=-math.pi, step=step, seq=0, device_ms=0)
 
 
-class Scene:
+class Scene(HqScene):
     """One listener, what is known of its robot, and its clients."""
 
     def __init__(self, *, protocol: str | None = "alf", clients: int = 1, serve: str = "both", **options: Any) -> None:
-        self.view = RobotView()
+        view = RobotView()
         if protocol is not None:
-            self.view.note(topics.STATUS, Status("established", protocol=protocol))
-        self.side = AlfHq(HqOptions(serve=serve, **options), self.view)  # type: ignore[arg-type]
-        self.clients: list[HqClient] = []
+            view.note(topics.STATUS, Status("established", protocol=protocol))
+        super().__init__(AlfHq(HqOptions(serve=serve, **options), view), view)  # type: ignore[arg-type]
         for _ in range(clients):
             self.connect()
-
-    def connect(self) -> HqClient:
-        client = self.side.session(len(self.clients) + 1, LIMITS)
-        client.open(0.0)
-        self.side.begin(client, 0.0)
-        self.clients.append(client)
-        return client
 
     def tell(self, topic: Topic, message: FleetMessage) -> None:
         """Let the robot publish something, which the listener follows or does not."""
         self.view.note(topic, message)
-        send = self.side.show(topic, message) if topic.path in self.side.follows else None
-        for client in self.clients:
-            if send is not None and not client.over:
-                send(client, 0.0)
+        if topic.path in self.side.follows:
+            self.send(self.side.show(topic, message))
 
     def told(self, client: int = 0) -> list[bytes]:
         """What leaves for a client now."""
         return drained(self.clients[client])
-
-    def says(self, data: bytes, client: int = 0) -> list[Telemetry]:
-        """What comes of bytes of a client."""
-        session = self.clients[client]
-        return [told for message in session.receive(data, 0.0) for told in self.side.take(session, message)]
-
-
-def drained(client: HqClient, now: float = 0.0) -> list[bytes]:
-    frames = []
-    while (frame := client.outgoing(now)) is not None:
-        frames.append(frame)
-        assert len(frames) < 1000
-    return frames
 
 
 def text_of(points: Iterable[int], *, seq: int = 0, stamp: int = 0, first: int, last: int) -> bytes:

@@ -9,6 +9,7 @@ import pytest
 
 from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from tests.gateways.rig import drained, exchange
 from zbridge.errors import Refused
 from zbridge.protocol.session import Role, State
 
@@ -40,15 +41,6 @@ def vehicle(dialect: Dialect = TEXT) -> VehicleRole:
     return session
 
 
-def waiting(session: AlfSession, now: float) -> list[bytes]:
-    """What may be written now."""
-    frames = []
-    while (frame := session.outgoing(now)) is not None:
-        frames.append(frame)
-        assert len(frames) < 1000
-    return frames
-
-
 def until(
     session: AlfSession, start: float, end: float, *driven: tuple[float, DriveCommand]
 ) -> list[tuple[float, bytes]]:
@@ -58,7 +50,7 @@ def until(
         while commands and commands[0][0] <= now:
             session.drive(commands.pop(0)[1], now)
             assert session.deadline() == pytest.approx(now), "a new command goes out at once"
-        sent += [(now, frame) for frame in waiting(session, now)]
+        sent += [(now, frame) for frame in drained(session, now)]
         due = min(session.deadline() or end, commands[0][0] if commands else end)
         assert due > now, "a timer that is due at once again"
         now = due
@@ -77,7 +69,7 @@ def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, 
     session.open(0.0)
     assert before is State.CONNECTING
     assert (session.role, session.state, session.reason) == (role, State.ESTABLISHED, None)
-    assert waiting(session, 0.0) == []
+    assert drained(session, 0.0) == []
     session.expire(3600.0)
     assert session.state is State.ESTABLISHED
     assert session.deadline() is None
@@ -129,19 +121,19 @@ def test_a_link_that_took_nothing_for_long_gets_the_newest_command_alone_and_no_
     until(session, 0.0, 0.1)
     for speed in range(100):
         session.drive(DriveCommand(speed, 0, 0, False), 0.1 + speed / 1e6)
-    assert waiting(session, 0.11) == [b"3|99|0|0|0;"]
-    assert waiting(session, 10.0) == [b"3|99|0|0|0;"]
+    assert drained(session, 0.11) == [b"3|99|0|0|0;"]
+    assert drained(session, 10.0) == [b"3|99|0|0|0;"]
     assert session.deadline() == pytest.approx(10.02)
 
 
 def test_two_messages_keep_the_gap_that_is_configured() -> None:
     session = HqRole(TEXT, drives=NEUTRAL, gap_s=0.005)
     session.open(0.0)
-    assert waiting(session, 0.0) == [NEUTRAL_TEXT]
+    assert drained(session, 0.0) == [NEUTRAL_TEXT]
     session.drive(AHEAD, 0.001)
-    assert waiting(session, 0.001) == []
+    assert drained(session, 0.001) == []
     assert session.deadline() == pytest.approx(0.005)
-    assert waiting(session, 0.005) == [AHEAD_TEXT]
+    assert drained(session, 0.005) == [AHEAD_TEXT]
 
 
 @pytest.mark.parametrize("dialect", Dialect)
@@ -149,18 +141,18 @@ def test_a_laser_link_is_told_nothing_but_end(dialect: Dialect) -> None:
     session = hq(dialect, None)
     assert session.receive(INFO[dialect], 0.1) == [INFO_MESSAGE[dialect]]
     assert session.deadline() is None
-    assert waiting(session, 3600.0) == []
+    assert drained(session, 3600.0) == []
     session.close("done", 3600.0)
-    assert waiting(session, 3600.0) == [END[dialect]]
+    assert drained(session, 3600.0) == [END[dialect]]
 
 
 @pytest.mark.parametrize("dialect", Dialect)
 def test_a_vehicle_says_what_it_is_told_to_and_repeats_nothing(dialect: Dialect) -> None:
     session = vehicle(dialect)
     session.send(INFO_MESSAGE[dialect])
-    assert waiting(session, 0.0) == [INFO[dialect]]
+    assert drained(session, 0.0) == [INFO[dialect]]
     assert session.deadline() is None
-    assert waiting(session, 3600.0) == []
+    assert drained(session, 3600.0) == []
 
 
 # END
@@ -180,10 +172,10 @@ def drives_of(dialect: Dialect) -> DriveCommand:
 @pytest.mark.parametrize("side", SIDES)
 def test_end_is_answered_once_and_nothing_follows(side, dialect: Dialect) -> None:  # type: ignore[no-untyped-def]
     session = side(dialect)
-    waiting(session, 0.0)
+    drained(session, 0.0)
     assert session.receive(END[dialect] * 3, 0.1) == []
     assert (session.state, session.reason) == (State.CLOSING, "ended")
-    assert waiting(session, 0.1) == [END[dialect]]
+    assert drained(session, 0.1) == [END[dialect]]
     assert (session.state, session.reason) == (State.CLOSED, "ended")
     assert session.receive(END[dialect], 0.2) == []
     assert until(session, 0.2, 3600.0) == []
@@ -199,11 +191,11 @@ def test_end_is_said_once_when_we_close_and_its_answer_is_not_answered(  # type:
     side, dialect: Dialect
 ) -> None:
     session = side(dialect)
-    waiting(session, 0.0)
+    drained(session, 0.0)
     session.close("gateway stopped", 0.1)
     session.close("and again", 0.1)
     assert session.receive(END[dialect], 0.1) == []
-    assert waiting(session, 0.1) == [END[dialect]]
+    assert drained(session, 0.1) == [END[dialect]]
     assert (session.state, session.reason) == (State.CLOSED, "gateway stopped")
     assert session.receive(END[dialect], 0.2) == []
     assert until(session, 0.2, 3600.0) == []
@@ -224,20 +216,20 @@ def test_a_stop_that_waits_goes_before_end_and_the_command_that_stood_does_not()
     session.drive(AHEAD, 0.0)
     session.drive(NEUTRAL, 0.0, urgent=True)
     session.close("gateway stopped", 0.0)
-    assert waiting(session, 0.0) == [NEUTRAL_TEXT, END[TEXT]]
+    assert drained(session, 0.0) == [NEUTRAL_TEXT, END[TEXT]]
 
 
 @pytest.mark.parametrize("written_first", [False, True])
 def test_no_command_goes_behind_end_neither_the_newest_nor_one_that_comes_while_the_session_ends(written_first) -> None:
     session = hq()
-    waiting(session, 0.0)
+    drained(session, 0.0)
     session.drive(AHEAD, 0.0)
     session.receive(END[TEXT], 0.1)
     sent = [session.outgoing(0.1)] if written_first else []
     for urgent in (False, True):
         with contextlib.suppress(Refused):
             session.drive(AHEAD, 0.1, urgent=urgent)
-    assert sent + waiting(session, 0.1) + waiting(session, 0.2) == [END[TEXT]]
+    assert sent + drained(session, 0.1) + drained(session, 0.2) == [END[TEXT]]
     assert session.state is State.CLOSED
 
 
@@ -247,7 +239,7 @@ def test_a_vehicle_sends_nothing_behind_end_whatever_it_still_measures() -> None
     session.close("vehicle stopped", 0.1)
     with contextlib.suppress(Refused):
         session.send(INFO_MESSAGE[TEXT])
-    assert waiting(session, 0.1) == [INFO[TEXT], END[TEXT]]
+    assert drained(session, 0.1) == [INFO[TEXT], END[TEXT]]
     assert session.state is State.CLOSED
 
 
@@ -264,11 +256,11 @@ def test_a_connection_that_breaks_is_lost_at_once_and_nothing_is_written_or_wait
     session = hq(dialect, drives_of(dialect))
     session.lost("closed by peer")
     assert (session.state, session.reason) == (State.CLOSED, "closed by peer")
-    assert (waiting(session, 0.0), session.deadline()) == ([], None)
+    assert (drained(session, 0.0), session.deadline()) == ([], None)
     session = HqRole(dialect, drives=NEUTRAL)
     session.close("gateway stopped", 0.0)  # before it was connected
     session.open(0.0)
-    assert waiting(session, 0.0) == []
+    assert drained(session, 0.0) == []
 
 
 # Malformed
@@ -307,7 +299,7 @@ def test_a_malformed_message_is_counted_shown_and_the_session_kept(bad: bytes) -
     assert session.last_malformed
     assert len(session.last_malformed) < 300
     assert session.state is State.ESTABLISHED
-    assert len(waiting(session, 0.1)) == 1
+    assert len(drained(session, 0.1)) == 1
 
 
 def test_a_measurement_with_another_number_of_points_says_so() -> None:
@@ -329,20 +321,10 @@ def test_a_flood_of_rubbish_ends_nothing_and_commands_go_on(dialect: Dialect) ->
         assert session.receive(rubbish[start : start + 65_536], 0.1) == []
     assert session.state is State.ESTABLISHED
     assert session.traffic.malformed > 0
-    assert len(waiting(session, 0.1)) == 1
+    assert len(drained(session, 0.1)) == 1
 
 
 # Both roles back to back
-
-
-def exchange(sender: AlfSession, receiver: AlfSession, now: float, rng: random.Random) -> list[AlfMessage]:
-    """Carry what may be written now, cut anywhere."""
-    data, messages = b"".join(waiting(sender, now)), []
-    while data:
-        size = rng.choice((1, 2, 7, 100, len(data)))
-        messages += receiver.receive(data[:size], now)
-        data = data[size:]
-    return messages
 
 
 @pytest.mark.parametrize("dialect", Dialect)

@@ -12,6 +12,7 @@ from gateways.alf import PROTOCOL
 from gateways.alf.messages import DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import HqRole
 from gateways.alf.translate import AlfRobot, Options, points_of, ranges_m
+from tests.gateways.rig import planned
 from zbridge.app import config
 from zbridge.app.templates import robot_template
 from zbridge.errors import ConfigError, ProtocolError, Refused
@@ -647,21 +648,12 @@ def test_a_vehicle_that_was_never_connected_takes_no_command() -> None:
 # Options
 
 
-def planned(connect: int = 1, **options: Any) -> config.DevicePlan:
-    addresses = [f"tcp://127.0.0.1:{6666 + number}" for number in range(connect)]
-    plan = config.plan(
-        {"robot": {"name": "r1"}, "device": {"protocol": "alf", "connect": addresses, "options": options}}
-    )
-    assert plan.device is not None
-    return plan.device
-
-
 def test_the_defaults_are_those_of_the_page_and_every_option_can_be_set() -> None:
-    assert planned().options == Options() == Options("text", 769, False, 100, None, None, 0.0)
+    assert planned("alf").options == Options() == Options("text", 769, False, 100, None, None, 0.0)
     options = Options("binary", 10_000, True, 255, 0.01, 0.001, 0.02)
-    assert planned(2, **{name: getattr(options, name) for name in options.__struct_fields__}).options == options
+    assert planned("alf", 2, **{name: getattr(options, name) for name in options.__struct_fields__}).options == options
     with pytest.raises(ConfigError, match="at most 2 links"):
-        planned(3)
+        planned("alf", 3)
 
 
 @pytest.mark.parametrize(
@@ -684,7 +676,7 @@ def test_the_defaults_are_those_of_the_page_and_every_option_can_be_set() -> Non
 )
 def test_an_option_that_cannot_be_is_an_error_that_names_it(key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=rf"device\.options\.{key} = "):
-        planned(**{key: value})
+        planned("alf", **{key: value})
 
 
 def test_the_template_is_a_configuration_with_the_defaults() -> None:

@@ -11,12 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateways.wc2ec.conformance.fragile_hq import Reader
-from gateways.wc2ec.hq import HqClient, HqOptions, Wc2EcHq, Wheels, device_table, display
+from gateways.wc2ec.hq import HqOptions, Wc2EcHq, Wheels, device_table, display
 from gateways.wc2ec.messages import Dialect as WireDialect
 from gateways.wc2ec.messages import Wc2EcMessage
 from gateways.wc2ec.settings import DeviceOption, Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import stream
+from tests.gateways.rig import HqScene, drained
 from tests.gateways.wc2ec.golden import (
     DISTANCE,
     LINEAR,
@@ -43,11 +44,10 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol.plugin import Send, Telemetry
-from zbridge.protocol.session import Limits, Role, State
+from zbridge.protocol.plugin import Telemetry
+from zbridge.protocol.session import Role, State
 
 NAN, INF = math.nan, math.inf
-LIMITS = Limits(frame_bytes=65536, handshake_s=5.0)
 CAPTURE, PORT = "wc2ec-deployed.hex", 27515
 LEFT_RIGHT = bytes.fromhex("00 35 00 04 6c656674") + bytes.fromhex("00 35 01 05 7269676874")
 """The two motors of a robot without any: devices 0 and 1."""
@@ -64,7 +64,7 @@ CAR_FAULT = bytes.fromhex("01 25 07 000000000000f0bf")
 LIGHTS = (DeviceOption("light0", 0), DeviceOption("light1", 9), DeviceOption("sector0", 3, "distance"))
 
 
-class Scene:
+class Scene(HqScene):
     """One listener, what is known of its robot, and its clients."""
 
     def __init__(
@@ -76,9 +76,8 @@ class Scene:
         options: HqOptions | None = None,
         **more: Any,
     ) -> None:
-        self.view = RobotView()
-        self.side = Wc2EcHq(options or HqOptions(**more), self.view)
-        self.clients: list[HqClient] = []
+        view = RobotView()
+        super().__init__(Wc2EcHq(options or HqOptions(**more), view), view)
         self.there = False
         if devices is not None:
             self.tell(topics.DEVICES, Devices(tuple(devices)))
@@ -86,13 +85,6 @@ class Scene:
             self.established(protocol)
         for _ in range(clients):
             self.connect()
-
-    def connect(self) -> HqClient:
-        client = self.side.session(len(self.clients) + 1, LIMITS)
-        client.open(0.0)
-        self.side.begin(client, 0.0)
-        self.clients.append(client)
-        return client
 
     def established(self, protocol: str) -> None:
         self.view.alive = True
@@ -113,21 +105,15 @@ class Scene:
         there = self.view.missing is None
         if there is not self.there:
             self.there = there
-            self._send(self.side.presence(there))
-
-    def _send(self, send: Send | None) -> None:
-        for client in self.clients:
-            if send is not None and not client.over:
-                send(client, 0.0)
+            self.send(self.side.presence(there))
 
     def tell(self, topic: Topic, message: FleetMessage) -> None:
         """Let the robot publish something, which the listener follows or does not."""
         self.view.note(topic, message)
         wanted = {topic.path for topic in self.side.wanted()} | {"status"}
         family = f"{topic.path.rpartition('/')[0]}/*"
-        if not self.clients or not {topic.path, family} & {*self.side.follows, *wanted}:
-            return
-        self._send(self.side.show(topic, message))
+        if self.clients and {topic.path, family} & {*self.side.follows, *wanted}:
+            self.send(self.side.show(topic, message))
 
     def reads(
         self, name: str, value: float, number: int | None = None, kind: str | None = "distance", *, fault: bool = False
@@ -138,22 +124,9 @@ class Scene:
         """What leaves for a client now."""
         return b"".join(drained(self.clients[client]))
 
-    def says(self, data: bytes, client: int = 0, now: float = 0.0) -> list[Telemetry]:
-        """What comes of bytes of a client at once."""
-        session = self.clients[client]
-        return [told for message in session.receive(data, now) for told in self.side.take(session, message)]
-
     def means(self, data: bytes, client: int = 0) -> list[Telemetry]:
         """What comes of bytes of a client when nothing follows."""
         return [*self.says(data, client), *self.side.expire(self.clients[client], 1.0)]
-
-
-def drained(client: HqClient, now: float = 0.0) -> list[bytes]:
-    frames = []
-    while (frame := client.outgoing(now)) is not None:
-        frames.append(frame)
-        assert len(frames) < 1000
-    return frames
 
 
 def set_value(number: int, value: float, kind: int = ROTATIONAL) -> bytes:

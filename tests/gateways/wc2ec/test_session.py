@@ -18,6 +18,7 @@ from gateways.wc2ec.messages import (
     Wc2EcMessage,
 )
 from gateways.wc2ec.session import ControllerRole, ExternalRole, Wc2EcSession
+from tests.gateways.rig import drained, exchange
 from zbridge.errors import EncodeError
 from zbridge.protocol.session import Role, State
 
@@ -45,15 +46,6 @@ def state(session: Wc2EcSession) -> State:
     return session.state
 
 
-def waiting(session: Wc2EcSession, now: float = 0.0) -> list[bytes]:
-    """What may be written now."""
-    frames = []
-    while (frame := session.outgoing(now)) is not None:
-        frames.append(frame)
-        assert len(frames) < 1000
-    return frames
-
-
 # Handshake
 
 
@@ -67,14 +59,14 @@ def test_a_controller_and_both_sides_of_the_draft_are_established_at_once_and_st
     assert (session.role, session.state, session.deadline()) == (role, State.ESTABLISHED, None)
     session.expire(3600.0)
     assert state(session) is State.ESTABLISHED
-    assert waiting(session) == []
+    assert drained(session) == []
 
 
 @pytest.mark.parametrize(("said", "heard"), [(b"", []), (bytes.fromhex("7f 25 09"), [Error(37, 9)])])
 def test_deployed_waits_for_the_registrations_and_leaves_a_controller_that_registers_nothing(said, heard) -> None:
     session = external()
     assert session.receive(said, 0.0) == heard
-    assert (state(session), waiting(session)) == (State.HANDSHAKING, [])
+    assert (state(session), drained(session)) == (State.HANDSHAKING, [])
     assert session.deadline() == pytest.approx(5.0)
     session.expire(4.99)
     assert state(session) is State.HANDSHAKING
@@ -117,7 +109,7 @@ def test_the_first_data_establishes_it_at_once_also_in_the_same_read_or_without_
     assert (state(session), session.deadline()) == (State.ESTABLISHED, None)
     assert session.receive(WHEEL, 60.0) == [WHEEL_MESSAGE], "a device that is registered later"
     session.close("gateway stopped", 61.0)
-    assert waiting(session, 61.0) == [], "there is no word for it"
+    assert drained(session, 61.0) == [], "there is no word for it"
     assert (session.state, session.reason) == (State.CLOSED, "gateway stopped")
 
 
@@ -163,7 +155,7 @@ def test_an_unknown_command_ends_the_session_with_its_bytes_in_the_reason(sessio
     assert f"command {wrong[0]}" in session.reason
     assert session.traffic.malformed == 1
     assert session.receive(WHEEL, 0.2) == []
-    assert (waiting(session, 0.2), session.deadline()) == ([], None)
+    assert (drained(session, 0.2), session.deadline()) == ([], None)
 
 
 def test_an_end_within_a_message_delivers_nothing_of_it() -> None:
@@ -173,7 +165,7 @@ def test_an_end_within_a_message_delivers_nothing_of_it() -> None:
     session.lost("closed by peer")
     assert state(session) is State.CLOSED
     assert (session.reason or "").startswith("closed by peer")
-    assert (waiting(session, 0.1), session.deadline()) == ([], None)
+    assert (drained(session, 0.1), session.deadline()) == ([], None)
 
 
 @pytest.mark.parametrize(
@@ -188,20 +180,10 @@ def test_an_end_within_a_message_delivers_nothing_of_it() -> None:
 def test_a_message_of_the_other_dialect_cannot_be_sent(session: Wc2EcSession, message: Wc2EcMessage) -> None:
     with pytest.raises(EncodeError, match=type(message).__name__):
         session.send(message)
-    assert waiting(session) == []
+    assert drained(session) == []
 
 
 # Both roles back to back
-
-
-def exchange(sender: Wc2EcSession, receiver: Wc2EcSession, now: float, rng: random.Random) -> list[Wc2EcMessage]:
-    """Carry what may be written now, cut anywhere."""
-    data, messages = b"".join(waiting(sender, now)), []
-    while data:
-        size = rng.choice((1, 1, 1, 2, 8, 30, len(data)))
-        messages += receiver.receive(data[:size], now)
-        data = data[size:]
-    return messages
 
 
 def test_both_roles_of_deployed_understand_each_other() -> None:

@@ -12,6 +12,7 @@ from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
+from tests.gateways.rig import planned
 from tests.gateways.wc2ec.golden import DISTANCE, LINEAR, ROTATIONAL, data, light, registration
 from zbridge.app import config
 from zbridge.app.templates import robot_template
@@ -53,17 +54,8 @@ FACTORS: dict[str, Any] = {
 NAN, INF = math.nan, math.inf
 
 
-def planned(connect: int = 1, **options: Any) -> config.DevicePlan:
-    addresses = [f"tcp://127.0.0.1:{27015 + number}" for number in range(connect)]
-    plan = config.plan(
-        {"robot": {"name": "r1"}, "device": {"protocol": "wc2ec", "connect": addresses, "options": options}}
-    )
-    assert plan.device is not None
-    return plan.device
-
-
 def options_of(**options: Any) -> Options:
-    made = planned(**options).options
+    made = planned("wc2ec", **options).options
     assert isinstance(made, Options)
     return made
 
@@ -800,7 +792,7 @@ def test_the_defaults_are_those_of_the_page_and_a_webots_robot_has_one_link() ->
     assert options.dialect == "deployed"
     assert (options.motor_types.rotational, options.motor_types.linear) == ((53,), (46,))
     with pytest.raises(ConfigError, match="link"):
-        planned(2)
+        planned("wc2ec", 2)
 
 
 TWO_NUMBERED_1 = [{"name": "a", "number": 1}, {"name": "b", "number": 1}]
@@ -847,7 +839,7 @@ LAMP_A = [{"name": "a", "number": 1}]
 )
 def test_options_that_cannot_be_or_contradict_each_other_are_an_error_that_names_them(options, names) -> None:
     with pytest.raises(ConfigError, match=names):
-        planned(**options)
+        planned("wc2ec", **options)
 
 
 def template() -> str:
@@ -876,4 +868,4 @@ def test_every_line_the_template_shows_as_left_out_can_be_put_in(dialect: str) -
 
 
 def test_the_options_of_the_simulated_robot_are_options() -> None:
-    assert planned(**PROTOCOL.simulated).options.differential is not None
+    assert planned("wc2ec", **PROTOCOL.simulated).options.differential is not None

@@ -8,7 +8,7 @@ from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from gateways.alf.translate import AlfRobot, Options
 from tests.captures import payloads, stream
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Motion, Scan, Scanner
+from zbridge.fleet.messages import FleetMessage, Motion, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.session import State
@@ -191,12 +191,3 @@ def test_the_recorded_drive_infos_are_motions_in_si_units() -> None:
         assert motion.gyro == pytest.approx((0.026179938779915, -0.047996554429844, 2.154713698795412))
         assert motion.temperature == 36.529999
         assert motion.stamp_ns == BEGAN_NS + arrived_us[number] * 1000
-
-
-def test_a_drive_of_the_fleet_gives_the_recorded_command() -> None:
-    robot = AlfRobot(Options(), 2)
-    session = robot.session("drive", "tcp://robot.test:1")
-    session.open(0.0)
-    assert session.outgoing(0.0) == payloads(DRIVE, destination=DRIVE_PORT)[0].payload
-    robot.command(topics.CMD_DRIVE, Drive(forward=0.8, turn=RIGHT_ANGLE_THIRD, light=True), 0.5)
-    assert session.outgoing(0.5) == payloads(DRIVE, destination=DRIVE_PORT)[30].payload == b"3|80|0|30|1;"

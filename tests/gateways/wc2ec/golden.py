@@ -22,7 +22,6 @@ from gateways.wc2ec.messages import (
     write,
 )
 from tests.conformance.side import Side, framed
-from zbridge.fleet.messages import Device
 
 DRAFT, DEPLOYED = Dialect.DRAFT, Dialect.DEPLOYED
 WC, EC = Sender.WC, Sender.EC
@@ -97,16 +96,3 @@ def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> b
 
 def light(number: int, value: float) -> bytes:
     return data(number, value, 0, 0)
-
-
-RECORDED = (
-    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
-    Device("slider_curb_lf", 4, "linear"),
-    Device("slider_curb_lf2", 5, "linear"),
-    *(
-        Device(name, 6 + at, "distance")
-        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
-    ),
-)
-"""The devices of the recorded controller, and the values of its sensors in every round."""
-RECORDED_VALUES = (1000.0, 750.5, 123.456, 0.0, -1.0, 0.001)

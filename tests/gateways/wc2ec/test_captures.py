@@ -8,17 +8,26 @@ from gateways.wc2ec.session import ControllerRole, ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
-from tests.gateways.wc2ec.golden import NODE_TYPES, RECORDED, RECORDED_VALUES
+from tests.gateways.wc2ec.golden import NODE_TYPES
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Devices, FleetMessage, Reading
+from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.session import State
 
 NAME, PORT = "wc2ec-deployed.hex", 27515
 BEGAN_NS = 1_700_000_000_000_000_000
+RECORDED = (
+    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
+    Device("slider_curb_lf", 4, "linear"),
+    Device("slider_curb_lf2", 5, "linear"),
+    *(
+        Device(name, 6 + at, "distance")
+        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
+    ),
+)
 REGISTRATIONS = [RegisterSensor(NODE_TYPES[each.kind], each.number, each.name.encode()) for each in RECORDED]
-VALUES = dict(enumerate(RECORDED_VALUES, 6))
+VALUES = {6: 1000.0, 7: 750.5, 8: 123.456, 9: 0.0, 10: -1.0, 11: 0.001}
 ROUND = [SensorData(37, number, value) for number, value in VALUES.items()]
 ROUNDS = 20
 READINGS = ROUND * ROUNDS + [SensorData(37, 6, 1000.0)]

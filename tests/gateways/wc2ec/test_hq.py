@@ -21,8 +21,6 @@ from tests.gateways.rig import HqScene, drained
 from tests.gateways.wc2ec.golden import (
     DISTANCE,
     LINEAR,
-    RECORDED,
-    RECORDED_VALUES,
     ROTATIONAL,
     data,
     light,
@@ -838,19 +836,6 @@ def test_whatever_is_on_the_bus_each_name_and_number_is_registered_once_and_befo
 
 
 # The recording
-
-
-def test_the_recorded_robot_is_shown_byte_for_byte_as_it_showed_itself() -> None:
-    scene = Scene(devices=RECORDED)
-    (written, *first) = drained(scene.clients[0])
-    assert written == stream(CAPTURE, source=PORT)[: len(written)]
-    assert len(written) == 4 * 10 + 108
-    assert first == [data(6 + at, -1.0) for at in range(6)]
-    names = [device.name for device in RECORDED[6:]]
-    for number in range(121):
-        scene.reads(names[number % 6], RECORDED_VALUES[number % 6], 6 + number % 6)
-        written += scene.told()
-    assert written == stream(CAPTURE, source=PORT)
 
 
 @pytest.mark.parametrize(

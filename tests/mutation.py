@@ -170,10 +170,12 @@ def mutated(source: str, where: dict[str, Any]) -> tuple[str, str, str]:
     return text, kind, ast.unparse(new or statement).splitlines()[0]
 
 
-def tests_of(path: str, tree: Path = ROOT) -> list[str]:
-    """List the tests of a tree that concern a source file: its own first, then its folder's, then those that import it."""
+def tests_for(path: str, tree: Path) -> list[str]:
+    """List the tests that concern a source file: its own first, then its folder's, then those that import it."""
     parts = Path(path).with_suffix("").parts
     folder = Path("tests", *(parts[1:-1] if parts[0] == "zbridge" else parts[:-1]))
+    while not (tree / folder).is_dir():  # a module that became a package is tested where it was
+        folder = folder.parent
     own = folder / f"test_{parts[-1]}.py"
     dotted = re.compile(
         rf"{re.escape('.'.join(parts))}\b|from {re.escape('.'.join(parts[:-1]))} import .*\b{parts[-1]}\b"
@@ -237,7 +239,7 @@ def main() -> None:
                 source = target.read_text()
                 text, kind, now = mutated(source, {**found, "choice": one["choice"]})
                 target.write_text(text)
-                outcome, by = run(tree, tests_of(found["path"], tree))
+                outcome, by = run(tree, tests_for(found["path"], tree))
                 target.write_text(source)
                 result |= {"now_in": found["path"], "kind": kind, "mutated": now, "result": outcome, "by": by}
             results.append(result | {"seconds": round(time.monotonic() - started, 1)})

@@ -119,7 +119,7 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown(rig: Rig) -> None:
     [(Raw(id=21, body=b""), True), (Mode("autonomous"), True), (Mode("manual"), False), (Text("hi"), False)],
     ids=lambda value: type(value).__name__,
 )
-def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, moves: bool) -> None:
+async def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, moves: bool) -> None:
     rig = Rig()
     rig.enforcer.commanded(command)
     assert rig.authority.moving is moves

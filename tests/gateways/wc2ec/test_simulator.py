@@ -166,18 +166,6 @@ def test_sensors_look_counter_clockwise() -> None:
     assert int(np.argmin(seen(machine(x=4.5, heading=math.pi / 2)))) == 6, "turned to the left, the wall is right of it"
 
 
-def test_distances_shrink_as_it_comes_near() -> None:
-    by = machine(x=3.5)
-    wheels(by, 5.0, 5.0)
-    values = []
-    for _ in range(10):
-        live(by, 0.4)
-        values.append(seen(by)[0])
-    assert values == sorted(values, reverse=True)
-    assert values[0] == 1000.0
-    assert 0 < values[-1] < 700
-
-
 # Lights
 
 

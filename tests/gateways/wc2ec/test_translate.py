@@ -205,21 +205,17 @@ def test_a_name_is_escaped_in_its_key_and_its_motor_is_found_by_it(name: bytes, 
     assert moved.frames() == [bytes.fromhex("82 35 08 000000000000f83f")]
 
 
-def test_names_that_differ_have_keys_that_differ() -> None:
-    names = [b"", b"%", b"%25", b"a/b", b"a%2Fb", b"\xff", b"%FF", b"A", b"a", b"a ", b"\xc3\xbf"]
-    wire = Wire(greeting=b"".join(registration(DISTANCE, number, name) for number, name in enumerate(names)))
-    assert len({wire.reading(data(number, 1.0))[0] for number in range(len(names))}) == len(names)
-
-
-@pytest.mark.parametrize("name", [b"", b"\xff\xfe", b"\x00", b"n" * 255, b"a/*#@%", "größe".encode()])
-def test_every_name_can_be_shown(name: bytes) -> None:
-    wire = Wire(greeting=registration(DISTANCE, 0, b"first"))
-    told = wire.told(registration(DISTANCE, 1, name) + registration(ROTATIONAL, 2, name))
-    for _, message in told:
-        assert payloads.decode(type(message), payloads.encode(message)) == message
-    with pytest.raises(Refused) as caught:
-        wire.robot.command(topics.CMD_MOTOR(name.decode("utf-8", "surrogateescape")), Motor(value=1.0), 0.0)
-    assert str(caught.value).encode()
+def test_names_that_differ_have_keys_that_differ_and_every_name_can_be_shown() -> None:
+    names = [b"", b"%", b"%25", b"a/b", b"a%2Fb", b"\xff", b"%FF", b"A", b"a", b"a ", b"\xc3\xbf", b"\x00", b"n" * 255]
+    wire, paths = Wire(greeting=registration(DISTANCE, 255, b"first")), set()
+    for number, name in enumerate(names):
+        for _, message in wire.told(registration(DISTANCE, number, name)):
+            assert payloads.decode(type(message), payloads.encode(message)) == message
+        paths.add(wire.reading(data(number, 1.0))[0])
+        with pytest.raises(Refused) as caught:
+            wire.robot.command(topics.CMD_MOTOR(name.decode("utf-8", "surrogateescape")), Motor(value=1.0), 0.0)
+        assert str(caught.value).encode()
+    assert len(paths) == len(names)
 
 
 def test_numbers_mean_nothing_but_where_they_are_told_to() -> None:
@@ -260,6 +256,13 @@ def test_an_error_of_a_device_is_a_text(wire: Wire) -> None:
     assert topic is topics.TEXT
     assert isinstance(text, Text)
     assert "5" in text.text
+
+
+def test_deployed_measures_without_being_asked_and_without_kinematics_a_drive_is_refused(wire: Wire) -> None:
+    assert wire.robot.on_demand == ()
+    with pytest.raises(Refused, match="kinematics"):
+        wire.drive(forward=0.5)
+    assert wire.frames() == []
 
 
 # The device table
@@ -570,12 +573,6 @@ def test_sideways_is_refused_by_two_sides_of_wheels_and_left_out_like_a_light_be
         assert car.values() == pytest.approx({0: 10.0, 2: 10.0, 1: 10.0, 3: 10.0})
 
 
-def test_without_kinematics_a_drive_is_refused(wire: Wire) -> None:
-    with pytest.raises(Refused, match="kinematics"):
-        wire.drive(forward=0.5)
-    assert wire.frames() == []
-
-
 @pytest.mark.parametrize(("kind", "name"), [(DISTANCE, b"fl"), (LINEAR, b"fl"), (ROTATIONAL, b"other")])
 def test_a_drive_is_refused_whole_where_one_of_its_motors_is_missing_or_none(kind: int, name: bytes) -> None:
     others = b"".join(registration(ROTATIONAL, n, wheel) for n, wheel in ((1, b"fr"), (2, b"rl"), (3, b"rr")))
@@ -701,10 +698,6 @@ def test_pinned_sensors_are_all_enabled_at_once_and_stay_so() -> None:
     assert wire.frames() == []
     wire.connect()
     assert len(wire.frames()) == 200
-
-
-def test_deployed_measures_without_being_asked(wire: Wire) -> None:
-    assert wire.robot.on_demand == ()
 
 
 @pytest.mark.parametrize(

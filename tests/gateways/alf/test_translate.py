@@ -566,6 +566,7 @@ def test_a_light_is_switched_on_its_own_the_drive_goes_on_and_nobody_is_moved(op
     for on in (True, False, True):
         wire.robot.command(topics.CMD_LIGHT, Switch(on=on), wire.now)
         assert wire.sent() == driving % on
+        assert wire.driven(0.8, 1 / 3) == driving % on, "and stays so with the next drive"
     wire.robot.stop(wire.now, wire.now + 1)
     wire.sent()
     for on in (False, True):

@@ -19,7 +19,6 @@ from gateways.tcpudp.messages import (
     ClientJoystickRotate,
     ClientJoystickStop,
     ClientSettings,
-    ClientSimulatedLidarData,
     ClientUDPConnectionStatus,
     DebugMessage,
     OpaquePacket,

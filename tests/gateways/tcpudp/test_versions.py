@@ -19,6 +19,7 @@ from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import (
     ALL,
     LISTED,
+    NO_UDP,
     SIZE_100_10,
     Timed,
     client_settings,
@@ -72,25 +73,18 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("listed", "block", "answer", "answered", "version", "features"), ROWS)
-def test_a_robot_is_answered_with_what_it_understands(listed, block, answer, answered, version, features) -> None:
-    timed = hq(listed, block)
-    assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-    assert timed.session.state is State.ESTABLISHED
-    assert timed.session.version == version
-    assert timed.session.features == tuple(features.split())
-    assert timed.session.traffic.malformed == 0
-
-
-@pytest.mark.parametrize(("listed", "block", "answer", "answered", "version", "features"), ROWS)
-def test_a_robot_that_announces_udp_is_answered_with_udp_unless_it_is_switched_off(
+def test_a_robot_is_answered_with_what_it_understands_and_with_udp_unless_either_switches_it_off(
     listed: bytes, block: str, answer: bytes, answered: str, version: str, features: str
 ) -> None:
-    block = "01" + block[2:]
-    assert hq(listed, block).frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex("01" + answered[2:]))]
-    without = hq(listed, block, udp=False)
-    assert without.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-    assert without.session.state is State.ESTABLISHED
-    assert without.session.features == ("udp", *features.split())
+    plain = framed(5, 3, counted(answer) + bytes.fromhex(answered))
+    with_udp = framed(5, 3, counted(answer) + bytes.fromhex("01" + answered[2:]))
+    neither, ours_off = hq(listed, block), hq(listed, "01" + block[2:], udp=False)
+    for timed, announced in ((neither, features.split()), (ours_off, ["udp", *features.split()])):
+        assert timed.frames("tcp") == [plain]
+        assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, version)
+        assert timed.session.features == tuple(announced)
+        assert timed.session.traffic.malformed == 0
+    assert hq(listed, "01" + block[2:]).frames("tcp") == [with_udp]
 
 
 @pytest.mark.parametrize("listed", [b"", b"2.0", b"1.0", b"1", b"1.10", b"1.1.0", b"v1.1", b"1,1", b"1.1;1.2", b",,"])
@@ -125,38 +119,32 @@ def test_a_settings_block_that_is_too_short_for_its_version_is_malformed(listed:
 
 
 @pytest.mark.parametrize(
-    ("announce", "listed", "answered"),
+    ("announce", "listed", "block", "answered"),
     [
-        ((), LISTED, "00000000000000"),
-        (("udp",), LISTED, "01000000000000"),
-        (("lidar_sim",), LISTED, "00000000000100"),
-        (("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"), LISTED, "01010101010101"),
-        (("cam", "slam_map"), LISTED_14, "00010000000001"),
-        (("cam", "lidar_sim", "slam_map"), b"1.2", "000100000001"),
-        (("chat", "lidar_sim", "slam_map"), b"1.1", "0000000100"),
+        ((), LISTED, ALL + SIZE_100_10, "00000000000000"),
+        (("udp",), LISTED, ALL + SIZE_100_10, "01000000000000"),
+        (("lidar_sim",), LISTED, ALL + SIZE_100_10, "00000000000100"),
+        (
+            ("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"),
+            LISTED,
+            ALL + SIZE_100_10,
+            "01010101010101",
+        ),
+        (("cam", "slam_map"), LISTED_14, ALL + SIZE_100_10, "00010000000001"),
+        (("cam", "lidar_sim", "slam_map"), b"1.2", ALL[:12], "000100000001"),
+        (("chat", "lidar_sim", "slam_map"), b"1.1", ALL[:10], "0000000100"),
+        (("udp", "chat"), LISTED, NO_UDP + SIZE_100_10, "00000001000000"),  # a robot without datagrams: none of ours
     ],
 )
-def test_the_gateway_announces_what_it_is_told(announce: tuple[str, ...], listed: bytes, answered: str) -> None:
-    session = TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", "")
-    timed = Timed(session)
-    block = {b"1.1": ALL[:10], b"1.2": ALL[:12]}.get(listed, ALL + SIZE_100_10)
+def test_the_gateway_announces_what_it_is_told(announce, listed, block, answered) -> None:
+    timed = Timed(TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", ""))
     timed.stream(server_settings(listed, block), 0.1)
     answer = LISTED if listed == LISTED_14 else listed
     assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-
-
-def test_a_gateway_that_does_not_announce_datagrams_neither_waits_for_them_nor_sends_any() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("lidar_sim",))).session("robot", ""))
-    timed.stream(server_settings(LISTED, ALL + SIZE_100_10), 0.1)
-    assert timed.session.state is State.ESTABLISHED
-    timed.until(10.0)
-    assert timed.frames("udp") == []
-
-
-def test_a_robot_without_datagrams_is_not_told_of_ours() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("udp", "chat"))).session("robot", ""))
-    timed.stream(server_settings(LISTED, "00" + ALL[2:] + SIZE_100_10), 0.1)
-    assert timed.frames("tcp") == [framed(5, 3, counted(LISTED) + bytes.fromhex("00000001000000"))]
+    if "udp" not in announce or block[:2] == "00":
+        assert timed.session.state is State.ESTABLISHED
+        timed.until(10.0)
+        assert timed.frames("udp") == [], "it neither waits for datagrams nor sends any"
 
 
 @pytest.mark.parametrize("announce", [["lidarsim"], [50], "udp"])

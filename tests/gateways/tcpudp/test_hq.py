@@ -328,26 +328,6 @@ def test_a_client_whose_datagram_is_lost_is_shown_the_robot_by_tcp_and_may_send_
     assert client.said("06000000 05 0c 0000003f", datagram=True) == [(topics.CMD_DRIVE, Drive(turn=-0.5))]
 
 
-def test_a_client_of_1_1_at_its_own_port_is_greeted_as_by_a_robot_of_1_1() -> None:
-    client = Client(side(robot("1.1", "lidar", "joystick"), versions=("1.1",), udp=False))
-    assert client.frames("tcp") == [bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000010001")]
-    client.stream(bytes.fromhex("0e000000 00 03 03000000 312e31 0100000000"), 0.1)
-    assert (client.session.state, client.session.version) == (State.ESTABLISHED, "1.1")
-    assert client.frames("tcp", 0.05) == []
-
-
-def test_a_client_without_a_common_version_is_told_why_and_let_go() -> None:
-    client = Client(side(versions=("1.3",)))
-    client.stream(client_settings(b"1.1", "0100000000"), 0.1)
-    client.until(1.0)
-    (told,) = client.frames("tcp", 0.05)
-    assert told[4:6] == b"\x01\x01"
-    assert b"1.1" in told
-    assert b"1.3" in told
-    assert client.session.state is State.CLOSED
-    assert "no common version" in str(client.session.reason)
-
-
 def test_a_client_that_does_not_answer_the_settings_is_let_go() -> None:
     client = Client(side())
     client.until(6.0)

@@ -110,20 +110,6 @@ def test_the_handshake_may_be_cut_anywhere_with_packets_behind_it(role, behind, 
         assert session.state is State.ESTABLISHED
 
 
-def test_settings_with_an_unknown_tail_are_read() -> None:
-    session = opened_hq()
-    session.receive(server_settings(block=NO_UDP + SIZE_100_10 + "010203"), 0.1)
-    assert session.state is State.ESTABLISHED
-
-
-def test_a_robot_without_a_common_version_is_told_so_whatever_its_settings_block() -> None:
-    session = opened_hq()
-    session.receive(server_settings(b"9.9", "0000000000"), 0.1)
-    assert str(session.reason).startswith("no common version: the peer speaks '9.9'")
-    assert session.traffic.malformed == 0
-    assert (session.outgoing(0.1) or b"")[4:6] == bytes([5, 1])
-
-
 @pytest.mark.parametrize(("role", "length"), [("hq", 81), ("hq", 5000), ("hq", 60_000), ("robot", 9000)])
 def test_a_long_version_list_is_quoted_shortly(role: str, length: int) -> None:
     session = OPENED[role]()
@@ -151,15 +137,6 @@ def test_a_silent_peer_is_given_up_with_the_reason_of_its_role(role: str, reason
     assert session.deadline() == 5.0
     session.expire(5.0)
     assert (session.state, session.reason) == (State.CLOSED, reason)
-
-
-def test_malformed_settings_leave_the_handshake_open_to_its_limit() -> None:
-    session = opened_hq()
-    session.receive(bytes.fromhex("04000000 01 02 05ff"), 0.1)
-    assert session.traffic.malformed == 1
-    assert session.outgoing(0.1) is None
-    session.expire(5.0)
-    assert session.state is State.CLOSED
 
 
 @pytest.mark.parametrize(

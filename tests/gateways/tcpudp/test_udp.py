@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 
+import numpy as np
 import pytest
 
 from gateways.tcpudp.messages import (
@@ -51,6 +52,7 @@ from zbridge.protocol.session import State
 
 POSE = ServerPosition(1.5, -2.25, 90.0)
 MOVES, ROTATES = ClientJoystickMove(0.0, 1.0, 0.5), ClientJoystickRotate(-0.75)
+SCAN = ClientSimulatedLidarData(np.ones(360, np.float32))
 PORT = 11000
 """What deployed HQ programs bind."""
 HQ_ANSWER = framed(5, 3, counted(LISTED) + bytes.fromhex("01000000000100"))
@@ -252,36 +254,26 @@ def test_a_robot_that_is_lost_during_the_silence_gets_nothing_more() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "channel"),
+    ("command", "channel", "frame"),
     [
-        (DebugMessage("hi"), "tcp"),
-        (ClientControllMode(2), "tcp"),
-        (MOVES, "udp"),
-        (ROTATES, "udp"),
-        (ClientJoystickStop(), "tcp"),
-        (ClientLidarMode(1), "tcp"),
-        (ClientGetSLAMMap(), "tcp"),
-        (ClientGetPosition(), "tcp"),
-        (ClientSimulatedLidarData([1.0] * 360), "udp"),  # type: ignore[arg-type]
+        (DebugMessage("hi"), "tcp", bytes.fromhex("08000000 05 01 02000000 6869")),
+        (ClientControllMode(2), "tcp", bytes.fromhex("06000000 05 0a 02000000")),
+        (MOVES, "udp", MOVE),
+        (ROTATES, "udp", ROTATE),
+        (ClientJoystickStop(), "tcp", STOP),
+        (ClientLidarMode(1), "tcp", bytes.fromhex("06000000 05 32 01000000")),
+        (ClientGetSLAMMap(), "tcp", bytes.fromhex("02000000 05 34")),
+        (ClientGetPosition(), "tcp", bytes.fromhex("02000000 05 36")),
+        (SCAN, "udp", bytes.fromhex("a6050000 05 3d 68010000" + "0000803f" * 360)),
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_a_command_goes_by_the_channel_of_the_table(command: Packet, channel: str) -> None:
+def test_a_command_goes_by_the_channel_of_the_table(command: Packet, channel: str, frame: bytes) -> None:
     """Before the probe there is only TCP; so there is after one that failed."""
     for timed, by in ((probed(None), "tcp"), (probed(ANSWER_TRUE), channel)):
         timed.session.send(command)
         timed.until(3.5)
-        (sent,) = [sent for sent in timed.sent if sent.at >= 3.0]
-        assert (sent.by, sent.frame[5]) == (by, command.spec.id)
-
-
-def test_motion_goes_by_udp_and_its_stop_by_tcp_byte_by_byte_as_the_page_says() -> None:
-    timed = probed(ANSWER_TRUE)
-    for command in (MOVES, ROTATES, ClientJoystickStop()):
-        timed.session.send(command)
-    timed.until(4.0)
-    assert timed.frames("udp", 3.0) == [MOVE, ROTATE]
-    assert timed.frames("tcp", 3.0) == [STOP]
+        assert [(sent.by, sent.frame) for sent in timed.sent if sent.at >= 3.0] == [(by, frame)]
 
 
 def test_the_gap_is_kept_between_datagrams_and_segments_too() -> None:

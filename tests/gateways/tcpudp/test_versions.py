@@ -3,6 +3,7 @@
 import contextlib
 
 import msgspec
+import numpy as np
 import pytest
 
 from gateways.tcpudp.messages import (
@@ -156,47 +157,36 @@ def test_a_feature_nobody_knows_cannot_be_announced(announce: object) -> None:
 # 52 and 54 go by SLAMMap where the version has the flag, else by Lidar; 61 by LidarSim, which 1.1 has not
 
 
-@pytest.mark.parametrize("question", [ClientGetSLAMMap(), ClientGetPosition()])
-@pytest.mark.parametrize(
-    ("listed", "block", "sent"),
-    [
-        (b"1.1", "0000000001", True),
-        (b"1.1", "0001010100", False),
-        (b"1.2", "000000000100", True),
-        (b"1.2", "000101010001", False),
-        (LISTED, "00000000000001" + SIZE_100_10, True),
-        (LISTED, "00010101010100" + SIZE_100_10, False),
-        (LISTED_14, "00000000000001" + SIZE_100_10, True),
-        (LISTED_14, "00010101010100" + SIZE_100_10, False),
-    ],
-)
-def test_map_and_position_are_asked_of_robots_that_know_the_question(listed, block, sent, question) -> None:
-    timed = hq(listed, block)
-    if sent:
-        timed.session.send(question)
-        timed.until(1.0)
-        assert timed.frames("tcp")[1:] == [framed(5, question.spec.id)]
-    else:
-        with pytest.raises(Refused, match="does not announce"):
-            timed.session.send(question)
+MAP, POSITION = ClientGetSLAMMap(), ClientGetPosition()
+SCAN = ClientSimulatedLidarData(np.zeros(360, np.float32))
 
 
 @pytest.mark.parametrize(
-    ("listed", "block", "reason"),
+    ("listed", "block", "messages", "reason"),
     [
-        (b"1.1", "0101010101", r"version 1\.1 has no lidar_sim"),
-        (b"1.2", "000101010100", "does not announce lidar_sim"),
-        (b"1.2", "000000000001", None),
+        (b"1.1", "0000000001", (MAP, POSITION), None),
+        (b"1.1", "0001010100", (MAP, POSITION), "does not announce"),
+        (b"1.2", "000000000100", (MAP, POSITION), None),
+        (b"1.2", "000101010001", (MAP, POSITION), "does not announce"),
+        (LISTED, "00000000000001" + SIZE_100_10, (MAP, POSITION), None),
+        (LISTED, "00010101010100" + SIZE_100_10, (MAP, POSITION), "does not announce"),
+        (LISTED_14, "00000000000001" + SIZE_100_10, (MAP, POSITION), None),
+        (LISTED_14, "00010101010100" + SIZE_100_10, (MAP, POSITION), "does not announce"),
+        (b"1.1", "0101010101", (SCAN,), r"version 1\.1 has no lidar_sim"),
+        (b"1.2", "000101010100", (SCAN,), "does not announce lidar_sim"),
+        (b"1.2", "000000000001", (SCAN,), None),
     ],
 )
-def test_simulated_lidar_data_go_to_robots_that_take_them(listed: bytes, block: str, reason: str | None) -> None:
-    session = hq(listed, block, udp=False).session
-    scan = ClientSimulatedLidarData([0.0] * 360)  # type: ignore[arg-type]
-    if reason is None:
-        session.send(scan)
-    else:
-        with pytest.raises(Refused, match=reason):
-            session.send(scan)
+def test_questions_and_simulated_lidar_data_go_to_robots_that_know_them(listed, block, messages, reason) -> None:
+    for message in messages:
+        timed = hq(listed, block, udp=False)
+        if reason is None:
+            timed.session.send(message)
+            timed.until(1.0)
+            assert [frame[5] for frame in timed.frames("tcp")] == [3, message.spec.id]
+        else:
+            with pytest.raises(Refused, match=reason):
+                timed.session.send(message)
 
 
 # The gateway as robot

@@ -283,11 +283,16 @@ async def test_when_a_sign_passes_the_robot_is_driven_after_a_neutral() -> None:
         assert rig.written()[-1] == MOVE_3
 
 
-async def test_a_healthy_second_hq_is_driven() -> None:
+async def test_a_healthy_second_hq_is_named_once_and_driven() -> None:
     async with serving() as rig:
-        await rig.establish(settings(3))
+        await rig.settle()
+        shown = len(rig.values("status"))
+        rig.sends(settings(3))
+        states = [(status["state"], status["reason"]) for status in rig.values("status")[shown:]]
+        assert states == [("established", LATER)]
         await asyncio.sleep(10.0)
         assert rig.last("status")["reason"] == LATER
+        rig.forget_written()
         rig.command("drive", DRIVE_LEFT)
         assert rig.written() == [MOVE_3]
         assert await rig.refusals() == []
@@ -302,13 +307,3 @@ async def test_a_lost_robot_shows_why_it_was_lost_and_no_doubts() -> None:
         await rig.settle()
         (lost,) = rig.values("status")[shown:]
         assert (lost["state"], lost["reason"]) == ("offline", "closed by peer")
-
-
-async def test_the_states_of_a_connection_are_shown_once_each_though_it_has_a_sign() -> None:
-    async with serving() as rig:
-        await rig.settle()
-        shown = len(rig.values("status"))
-        rig.sends(settings(3))
-        assert [(status["state"], status["reason"]) for status in rig.values("status")[shown:]] == [
-            ("established", LATER)
-        ]

@@ -56,6 +56,8 @@ SCAN = ClientSimulatedLidarData(np.ones(360, np.float32))
 PORT = 11000
 """What deployed HQ programs bind."""
 HQ_ANSWER = framed(5, 3, counted(LISTED) + bytes.fromhex("01000000000100"))
+FIVE, SIX, SEVEN = (0.2, "udp", PROBE), (0.3, "udp", ANSWER_TRUE), (0.3, "tcp", STATUS_TRUE)
+"""What comes in time, when and by which channel."""
 BY_TCP, BY_UDP = (State.ESTABLISHED, "tcp"), (State.ESTABLISHED, "udp")
 
 
@@ -131,7 +133,7 @@ def test_an_hq_probes_once_and_answers_success_at_once_and_is_silent_for_two_and
     ("coming", "status", "at", "outcome"),
     [
         pytest.param([], STATUS_FALSE, 2.2, BY_TCP, id="no answer within two seconds"),
-        pytest.param([(0.3, "udp", ANSWER_TRUE)], STATUS_TRUE, 0.3, BY_UDP, id="success"),
+        pytest.param([SIX], STATUS_TRUE, 0.3, BY_UDP, id="success"),
         pytest.param([(2.22, "udp", ANSWER_TRUE)], STATUS_FALSE, 2.2, BY_TCP, id="an answer after the report"),
         pytest.param([(2.22, "tcp", ANSWER_FALSE)], STATUS_FALSE, 2.2, BY_TCP, id="a refusal after the report"),
         # an answer by TCP says that the datagram did not arrive
@@ -139,19 +141,9 @@ def test_an_hq_probes_once_and_answers_success_at_once_and_is_silent_for_two_and
         pytest.param([(2.0, "tcp", ANSWER_TRUE)], STATUS_FALSE, 2.0, BY_TCP, id="an answer by TCP"),
         pytest.param([(0.3, "udp", ANSWER_FALSE)], STATUS_FALSE, 0.3, BY_TCP, id="a datagram that says no"),
         pytest.param(
-            [(0.3, "udp", ANSWER_TRUE), (0.4, "udp", ANSWER_TRUE), (0.5, "tcp", ANSWER_FALSE)],
-            STATUS_TRUE,
-            0.3,
-            BY_UDP,
-            id="more answers",
+            [SIX, (0.4, "udp", ANSWER_TRUE), (0.5, "tcp", ANSWER_FALSE)], STATUS_TRUE, 0.3, BY_UDP, id="more answers"
         ),
-        pytest.param(
-            [(0.25, "tcp", START), (0.3, "udp", ANSWER_TRUE), (0.35, "tcp", START)],
-            STATUS_TRUE,
-            0.3,
-            BY_UDP,
-            id="more starts",
-        ),
+        pytest.param([(0.25, "tcp", START), SIX, (0.35, "tcp", START)], STATUS_TRUE, 0.3, BY_UDP, id="more starts"),
     ],
 )
 def test_an_hq_reports_the_answer_to_its_probe_once_and_is_silent_whatever_follows(coming, status, at, outcome) -> None:
@@ -304,7 +296,7 @@ def waiting(*coming: tuple[float, str, bytes]) -> Timed:
 
 def served() -> Timed:
     """A robot whose probe succeeded."""
-    return waiting((0.2, "udp", PROBE), (0.3, "tcp", STATUS_TRUE))
+    return waiting(FIVE, SEVEN)
 
 
 def unheard(*, client_port: int = PORT) -> Timed:
@@ -345,26 +337,14 @@ def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once(announ
         pytest.param([(1.9, "tcp", STATUS_FALSE)], False, BY_TCP, 0, id="no 5, false before it could come"),
         pytest.param([(1.9, "tcp", STATUS_TRUE)], False, BY_TCP, 0, id="no 5, true before it could come"),
         pytest.param([], False, BY_TCP, 0, id="nothing"),
-        pytest.param([(0.2, "udp", PROBE), (0.3, "tcp", STATUS_TRUE)], True, BY_UDP, 0, id="success"),
+        pytest.param([FIVE, SEVEN], True, BY_UDP, 0, id="success"),
         # The 6 was lost, and the HQ would not hear what is sent it by UDP. It says so 2 s after its 5.
-        pytest.param([(0.2, "udp", PROBE), (2.15, "tcp", STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6"),
-        pytest.param([(0.2, "udp", PROBE), (2.35, "tcp", STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6, told late"),
-        pytest.param([(0.2, "udp", PROBE)], True, BY_TCP, 0, id="no report"),
-        pytest.param(
-            [(0.2, "udp", PROBE), (0.25, "udp", PROBE), (0.3, "tcp", STATUS_TRUE), (0.35, "udp", PROBE)],
-            True,
-            BY_UDP,
-            2,
-            id="more 5",
-        ),
+        pytest.param([FIVE, (2.15, "tcp", STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6"),
+        pytest.param([FIVE, (2.35, "tcp", STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6, told late"),
+        pytest.param([FIVE], True, BY_TCP, 0, id="no report"),
+        pytest.param([FIVE, (0.25, "udp", PROBE), SEVEN, (0.35, "udp", PROBE)], True, BY_UDP, 2, id="more 5"),
         pytest.param([(0.2, "tcp", PROBE)], False, BY_TCP, 1, id="a 5 by TCP"),
-        pytest.param(
-            [(0.2, "udp", PROBE), (0.3, "tcp", STATUS_TRUE), (0.5, "tcp", STATUS_FALSE)],
-            True,
-            BY_UDP,
-            1,
-            id="a report that was not due",
-        ),
+        pytest.param([FIVE, SEVEN, (0.5, "tcp", STATUS_FALSE)], True, BY_UDP, 1, id="a report that was not due"),
     ],
 )
 def test_a_robot_answers_the_datagram_once_and_believes_the_report_if_it_came(
@@ -478,7 +458,7 @@ def test_a_stray_datagram_is_told_to_who_has_a_source_too_but_to_nobody_during_t
 
 def test_a_probe_of_a_second_source_is_claimed_until_the_report() -> None:
     """So it is seen that there are two of them."""
-    timed = waiting((0.2, "udp", PROBE))
+    timed = waiting(FIVE)
     assert timed.session.claims(PROBE, PORT + 1)
     timed.stream(STATUS_TRUE, 0.3)
     assert not timed.session.claims(PROBE, PORT + 1)
@@ -518,7 +498,7 @@ def test_a_packet_from_the_port_of_deployed_programs_shows_that_the_source_may_b
     """A 5 of 1.3 was lost, somebody else's was answered, and the 7 is true whatever happened."""
     timed = waiting()
     assert timed.session.claims(PROBE, PORT + 1)
-    come(timed, (0.2, "udp", PROBE), (0.3, "tcp", STATUS_TRUE))
+    come(timed, FIVE, SEVEN)
     assert not timed.session.claims(MOVE, PORT + 2), "of no port but that one"
     assert timed.session.claims(MOVE, PORT)
     timed.session.rivalled(0.4)
@@ -529,7 +509,7 @@ def test_a_packet_from_the_port_of_deployed_programs_shows_that_the_source_may_b
 
 def test_motion_is_taken_by_either_channel_after_the_report_and_before_it_by_tcp_only() -> None:
     """Whose source it is only the 7 tells: until then nobody drives by it, in whoever's name."""
-    timed = waiting((0.2, "udp", PROBE))
+    timed = waiting(FIVE)
     assert timed.datagram(MOVE, 0.25) == []
     assert timed.datagram(STOP, 0.26) == []
     assert timed.session.traffic.malformed == 2

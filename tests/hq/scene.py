@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.hq.test_operator import Gateway
+from tests.hq.gateway import KEYS, Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import EncodeError, ProtocolError
@@ -31,7 +31,7 @@ from zbridge.fleet.messages import (
     Switch,
     Text,
 )
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
@@ -43,7 +43,6 @@ from zbridge.protocol.session_table import ClientIds, SessionTable
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import Receiver
 
-KEYS = KeySpace("fleet", "r1")
 STATUS = Status(state="established", protocol="toy")
 MAP = Map(rows=2, columns=3, cell=0.1, origin=(0.0, 0.0), cells=np.zeros((2, 3), np.uint8))
 

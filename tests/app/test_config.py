@@ -280,14 +280,8 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (device(connect="tcp://a:1"), "device.connect = 'tcp://a:1': expected `array`"),
     (device(connect=["tcp://a:1", 5]), "device.connect[1] = 5: expected `str`"),
     (device(connect=["udp://a:1"]), "device.connect = 'udp://a:1': expected tcp://host:port"),
-    (
-        device(connect=["serial:///dev/s"]),
-        "device.connect = 'serial:///dev/s': expected serial:///path?baud=N",
-    ),
-    (
-        serving(hq(listen="serial:///dev/s?baud=9600")),
-        "hq[0].listen = 'serial:///dev/s?baud=9600': expected tcp://",
-    ),
+    (device(connect=["serial:///dev/s"]), "device.connect = 'serial:///dev/s': expected serial:///path?baud=N"),
+    (serving(hq(listen="serial:///dev/s?baud=9600")), "hq[0].listen = 'serial:///dev/s?baud=9600': expected tcp://"),
     (
         minimal(metrics={"listen": "serial:///dev/s?baud=9600"}),
         "metrics.listen = 'serial:///dev/s?baud=9600': expected",

@@ -69,9 +69,7 @@ def test_a_key_expression_matches_as_zenoh_itself_says(key_expr: str, key: str) 
     assert matches(str(canonical), key) is canonical.includes(zenoh.KeyExpr(key))
 
 
-@given(
-    *2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)],
-)
+@given(*2 * [st.lists(CHUNK | st.sampled_from(["*", "**"]), min_size=1, max_size=5).map("/".join)])
 def test_two_key_expressions_meet_as_zenoh_itself_says(one: str, other: str) -> None:
     first, second = zenoh.KeyExpr.autocanonize(one), zenoh.KeyExpr.autocanonize(other)
     assert meet(str(first), str(second)) is first.intersects(second)

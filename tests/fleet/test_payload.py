@@ -296,16 +296,11 @@ def test_missing_optional_fields_take_their_defaults_and_unknown_ones_are_ignore
 @pytest.mark.parametrize(
     ("message", "moving"),
     [
-        (Drive(), False),
-        (Drive(light=True), False),
-        (Drive(forward=-0.0), False),
-        (Drive(forward=0.01), True),
-        (Drive(left=-0.01), True),
-        (Drive(turn=0.01), True),
-        (Motor(value=0.0), False),
-        (Motor(value=-0.1), True),
+        (Drive(), False), (Drive(light=True), False), (Drive(forward=-0.0), False),
+        (Drive(forward=0.01), True), (Drive(left=-0.01), True), (Drive(turn=0.01), True),
+        (Motor(value=0.0), False), (Motor(value=-0.1), True),
     ],
-)
+)  # fmt: skip
 def test_motion_is_told_from_neutral(message: Drive | Motor, moving: bool) -> None:
     assert message.moving is moving
 

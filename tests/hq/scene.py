@@ -19,18 +19,7 @@ from zbridge.bus.fake import FakeBus
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Drive,
-    FleetMessage,
-    Map,
-    Pose,
-    Query,
-    Scan,
-    Status,
-    Stop,
-    Switch,
-    Text,
-)
+from zbridge.fleet.messages import Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.listener import Listener

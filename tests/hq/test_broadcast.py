@@ -10,14 +10,7 @@ import pytest
 
 from tests.hq.scene import COMMANDS, STATUS, Scene, ToySession, ToySide, serving, soon
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Drive,
-    FleetMessage,
-    Pose,
-    Scan,
-    Status,
-    Text,
-)
+from zbridge.fleet.messages import Drive, FleetMessage, Pose, Scan, Status, Text
 from zbridge.fleet.topics import Topic
 from zbridge.hq.client import TELL_S
 from zbridge.protocol.plugin import Send, Telemetry

@@ -13,17 +13,7 @@ from tests.hq.scene import COMMANDS, KEYS, Program, Scene, ToySession, ToySide, 
 from zbridge.bus.interface import IncomingQuery
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Acquire,
-    Drive,
-    Pose,
-    Query,
-    Refusal,
-    Refusals,
-    Status,
-    Switch,
-    Text,
-)
+from zbridge.fleet.messages import Acquire, Drive, Pose, Query, Refusal, Refusals, Status, Switch, Text
 from zbridge.hq.client import STALL_S, SWEEP_S, TELL_S
 from zbridge.protocol.outbox import LIMIT
 from zbridge.protocol.plugin import Telemetry

@@ -13,10 +13,7 @@ import pytest
 from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, serving, soon
 from zbridge.address import Address
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Pose,
-    Text,
-)
+from zbridge.fleet.messages import Pose, Text
 from zbridge.protocol.session import Limits
 
 pytestmark = pytest.mark.jumping
@@ -196,17 +193,11 @@ async def test_the_table_says_why_a_client_went(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("host", "welcome"),
     [
-        ("10.1.2.3", True),
-        ("192.168.1.7", True),
-        ("192.168.1.8", False),
-        ("127.0.0.1", False),
-        ("[fd00::1]", True),
-        ("[fe80::1%eth0]", False),
-        ("[::1]", False),
-        ("[::ffff:10.1.2.3]", True),
+        ("10.1.2.3", True), ("192.168.1.7", True), ("192.168.1.8", False), ("127.0.0.1", False),
+        ("[fd00::1]", True), ("[fe80::1%eth0]", False), ("[::1]", False), ("[::ffff:10.1.2.3]", True),
         ("[::ffff:11.1.2.3]", False),
     ],
-)
+)  # fmt: skip
 @pytest.mark.scene(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8"))
 async def test_only_allowed_networks_are_let_in(scene: Scene, host: str, welcome: bool) -> None:
     program = scene.connect(host)

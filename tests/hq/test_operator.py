@@ -160,12 +160,7 @@ class Scene:
         return await self.bus.alive(KEYS.alive("*"))
 
     def program(
-        self,
-        who: str = "hq.toy.1",
-        *,
-        needs_mode: bool = False,
-        steers: bool = False,
-        hold: bool = False,
+        self, who: str = "hq.toy.1", *, needs_mode: bool = False, steers: bool = False, hold: bool = False
     ) -> Program:
         program = Program(
             Intent(DEADMAN_S),

@@ -201,9 +201,10 @@ class Program:
 class Scene:
     """A listener that runs, and the robot's gateway beside it."""
 
-    side_class = ToySide
-
-    def __init__(self, *, allow: tuple[str, ...] = (), robot: bool = True, **settings: Any) -> None:
+    def __init__(
+        self, *, allow: tuple[str, ...] = (), robot: bool = True, side: type[ToySide] = ToySide, **settings: Any
+    ) -> None:
+        self.side_class = side
         self.loop = asyncio.get_running_loop()
         self.skipped_s = 0.0
         self.bus = FakeBus("hq")
@@ -263,6 +264,13 @@ class Scene:
     def connect(self, host: str = "10.0.0.1") -> Program:
         self.hosts += 1
         return Program(self.accept(), f"tcp://{host}:{5000 + self.hosts}")
+
+    async def driver(self) -> Program:
+        """Connect a program that drives."""
+        program = self.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        return program
 
     def count(self, name: str) -> int:
         return self.metrics.total(name)

@@ -19,6 +19,10 @@ from zbridge.protocol.session import Limits
 pytestmark = pytest.mark.jumping
 
 
+class RestingSide(ToySide):
+    quiet_s = 2.0
+
+
 # Coming and going
 
 
@@ -116,35 +120,27 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
     assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
-async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving() as scene:
-        scene.connect().greeted().leave()
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [3]
-        await asyncio.sleep(2.0)
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2, 3]
+@pytest.mark.scene(side=RestingSide)
+async def test_a_number_rests_after_its_client_left(scene: Scene) -> None:
+    scene.connect().leave()
+    await soon()
+    scene.connect().greeted().leave()
+    await soon()
+    assert scene.count("hq_accepted") == 2, "the first was never used, and need not rest"
+    scene.connect()
+    assert sorted(scene.listener.clients) == [3]
+    await asyncio.sleep(2.0)
+    scene.connect()
+    assert sorted(scene.listener.clients) == [2, 3]
 
 
-async def test_a_number_that_was_never_used_need_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving() as scene:
-        scene.connect().leave()
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2]
-
-
-async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.scene(side=RestingSide, clients=1)
+async def test_numbers_that_rest_take_no_clients_place(scene: Scene) -> None:
     """``clients`` is the most at a time: a program that is restarted at once finds its place free."""
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving(clients=1) as scene:
-        scene.connect().leave()
-        await soon()
-        assert not scene.connect().link.closed
-        assert scene.connect().link.closed
+    scene.connect().leave()
+    await soon()
+    assert not scene.connect().link.closed
+    assert scene.connect().link.closed
 
 
 @pytest.mark.scene(accept_hz=1000)
@@ -224,14 +220,12 @@ class SessionlessSide(ToySide):
         raise KeyError(self.view.protocol)
 
 
-async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(Scene, "side_class", SessionlessSide)
-        async with serving() as scene:
-            for _ in range(5):
-                assert scene.connect().link.closed
-            assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
-            assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
+@pytest.mark.scene(side=SessionlessSide)
+async def test_a_client_for_which_there_is_no_session_is_turned_away(scene: Scene) -> None:
+    for _ in range(5):
+        assert scene.connect().link.closed
+    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
+    assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
 
 
 # The end

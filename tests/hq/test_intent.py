@@ -219,7 +219,8 @@ SCRIPTS: dict[str, tuple[Callable[[], Intent], str]] = {
     ),
     "a mode that motion has overtaken is no mode that came too late": (
         ready_to_choose,
-        "1.0 motion ! control mode is none; 1.05 mode manual -> nothing; 1.5 motion -> acquire",
+        "1.0 motion ! control mode is none; 1.05 mode manual -> nothing; is free to go; 1.5 motion -> acquire; "
+        "granted 3.0; is may steer",
     ),
     "a mode after motion that came twice is one that came too late": (
         ready_to_choose,

@@ -342,15 +342,9 @@ async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatc
 @pytest.mark.parametrize(
     ("key", "most"),
     [
-        ("fleet/r1/@cmd/drive", 256),
-        ("fleet/r1/@cmd/motor/left", 256),
-        ("fleet/*/@cmd/mode", 256),
-        ("fleet/**/@cmd/stop", 256),
+        *((f"fleet/{key}", 256) for key in ("r1/@cmd/drive", "r1/@cmd/motor/left", "*/@cmd/mode", "**/@cmd/stop")),
         ("fleet/r1/@cmd/sensor/front", 16_384),
-        ("fleet/r1/@cmd/scan", 65_536),
-        ("fleet/r1/@cmd/raw/tcpudp", 65_536),
-        ("fleet/r1/@cmd/*", 65_536),
-        ("fleet/r1/@cmd/none", 65_536),
+        *((f"fleet/r1/@cmd/{key}", 65_536) for key in ("scan", "raw/tcpudp", "*", "none")),
     ],
 )
 async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called(key: str, most: int) -> None:

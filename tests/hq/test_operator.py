@@ -348,12 +348,17 @@ def freed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
     return freed
 
 
+async def blocked_driver(scene: Scene, freed: asyncio.Event) -> Program:
+    """Make a program that drives, before the bus takes nothing any more."""
+    freed.set()
+    program = await scene.driving()
+    freed.clear()
+    return program
+
+
 @pytest.mark.parametrize("late", [True, False])
 async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(scene, freed, late) -> None:
-    program = scene.program()
-    freed.set()
-    await program.said(STAND, GO)
-    freed.clear()
+    program = await blocked_driver(scene, freed)
     program.say(Raw(id=40), Raw(id=41), Drive(forward=0.25))
     if late:
         scene.now += DEADMAN_S
@@ -366,10 +371,7 @@ async def test_motion_that_waited_for_the_bus_is_not_sent_when_its_time_is_over(
 
 
 async def test_neutral_that_waited_for_the_bus_is_sent_however_late(scene: Scene, freed: asyncio.Event) -> None:
-    program = scene.program()
-    freed.set()
-    await program.said(STAND, GO)
-    freed.clear()
+    program = await blocked_driver(scene, freed)
     program.say(Raw(id=40), GO, STAND)
     scene.now += 2.0
     freed.set()
@@ -388,11 +390,6 @@ async def test_the_light_is_told_only_when_it_changes(scene: Scene) -> None:
     assert scene.taken() == [on, GO, off, GO]
 
 
-async def test_a_light_switched_on_before_the_robot_was_had_is_told(scene: Scene) -> None:
-    lit = Drive(forward=0.5, light=True)
-    assert await scene.program().said(Drive(light=True), lit) == [lit]
-
-
 async def test_a_light_switched_on_by_a_refused_command_is_told_with_the_next(scene: Scene) -> None:
     program = await scene.driving()
     scene.now += DEADMAN_S
@@ -400,11 +397,11 @@ async def test_a_light_switched_on_by_a_refused_command_is_told_with_the_next(sc
     assert await program.said(Drive(light=True)) == [Drive(light=True)]
 
 
-async def test_the_light_of_a_new_lease_is_told_anew(scene: Scene) -> None:
-    program = await scene.driving()
+async def test_a_light_that_was_on_before_a_lease_is_told_with_every_new_one(scene: Scene) -> None:
+    program, lit = scene.program(), Drive(forward=0.5, light=True)
+    assert await program.said(Drive(light=True), lit) == [lit]
     program.say(Drive(light=True))
     await program.stopped()
-    lit = Drive(forward=0.5, light=True)
     assert await program.said(Drive(light=True), lit) == [lit]
 
 
@@ -701,19 +698,13 @@ async def test_a_lease_shorter_than_usual_is_given_back_sooner(scene: Scene) -> 
 # The end
 
 
-async def test_a_program_that_went_gives_the_robot_back_at_once(scene: Scene) -> None:
-    program = await scene.driving()
+@pytest.mark.parametrize("asking", [False, True])
+async def test_a_program_that_went_gives_the_robot_back_at_once_or_when_it_is_granted(scene: Scene, asking) -> None:
+    program = scene.program() if asking else await scene.driving()
+    program.say(*[STAND, GO] * asking)
     program.close()
     program.close()
-    await scene.done()
-    assert (scene.asked, scene.state, await scene.alive()) == (["acquire", "release"], "free", [])
-    assert not program.active
-
-
-async def test_a_program_that_went_while_it_asked_gives_back_what_was_granted(scene: Scene) -> None:
-    program = scene.program()
-    program.say(STAND, GO)
-    program.close()
+    assert program.active is asking
     assert await scene.done() == []
     assert (scene.asked, scene.state, await scene.alive()) == (["acquire", "release"], "free", [])
 

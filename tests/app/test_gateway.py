@@ -98,9 +98,7 @@ async def test_the_audit_log_is_a_file_where_the_configuration_names_one(monkeyp
 
 
 @jumping
-async def test_the_audit_log_is_rotated_and_keeps_what_is_young_as_configured(
-    monkeypatch, tmp_path
-) -> None:
+async def test_the_audit_log_is_rotated_and_keeps_what_is_young_as_configured(monkeypatch, tmp_path) -> None:
     for days in (0, 1):
         folder = tmp_path / str(days)
         audit = configured(audit=str(folder / "r1.jsonl"), audit_bytes=1000, audit_files=2, audit_days=days)

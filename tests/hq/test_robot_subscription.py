@@ -79,6 +79,13 @@ def test_a_follower_hears_its_paths_and_the_states_of_the_gateway(scene: Scene) 
     ]
 
 
+def test_the_view_is_noted_before_a_follower_is_told(scene: Scene) -> None:
+    seen: list[object] = []
+    scene.audience.follow(("pose",), lambda topic, message: seen.append(scene.audience.view.pose), lambda alive: None)
+    scene.say(topics.POSE, POSE)
+    assert seen == [POSE]
+
+
 def test_many_followers_share_one_subscription_and_one_decoding(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     followers = [scene.follower("pose") for _ in range(10)]
     assert sorted(scene.subscribed) == ["control", "pose", "status"]

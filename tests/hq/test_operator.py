@@ -277,6 +277,9 @@ async def test_a_robot_that_is_not_there_is_not_asked_for(scene: Scene, status: 
     program = scene.program()
     program.say(STAND)
     program.refused(f"^{reason}$", GO)
+    own = scene.program("hq.toy.2", needs_mode=True)
+    own.say(STAND)
+    own.refused(f"^{reason}$", Mode("autonomous"))
     scene.robot("toy")
     scene.view.alive = True
     program.refused(f"{reason}: release the stick first", GO)

@@ -18,7 +18,7 @@ import pytest
 from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp.hq import HqOptions
 from gateways.tcpudp.session import robot_role as sessions
-from tests.hq.test_operator import Gateway
+from tests.hq.gateway import Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.fleet import payload as payloads

@@ -29,7 +29,7 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.tcpudp.conformance.parser import Feature
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e.conftest import Bench
-from tests.e2e.fragile import fragile_robot
+from tests.e2e.fragile import charges, fragile_robot
 from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener, playing, ports, soon
 
 LEASE_S = 1.2
@@ -243,6 +243,8 @@ class Judgement:
     seconds: float = 0.0
     faults: list[str] = field(default_factory=list)
     excused: list[str] = field(default_factory=list)
+    late_s: float = 0.0
+    """The processor time that was withheld from the gateway and the programs."""
     received: dict[str, int] = field(default_factory=dict)
     """Messages that each program got."""
 
@@ -258,9 +260,10 @@ class Judgement:
         )
 
     def hold_against(self, who: str, violations: Iterable[str]) -> None:
-        """Take note of violations; of those by the judge's own lateness apart."""
+        """Take note of violations; of those by the judge's own lateness, or by the machine's, apart."""
         for text in violations:
-            (self.excused if "(this process" in text else self.faults).append(f"{who}: {text}")
+            charged = charges([text], self.late_s)
+            (self.faults if charged else self.excused).append(f"{who}: {text}")
 
 
 class Stage:
@@ -383,12 +386,14 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
     began = time.monotonic()
     with fragile_robot(ROBOTS[robot][0], **ROBOTS[robot][1]) as process:
         async with stage(robot, process) as on:
+            withheld_s = on.bench.withheld_s
             await on.all_see()
             for name in judgement.drove:
                 await on.drive(name, DRIVES[name])
             if seconds:
                 await on.drive_on(driver, seconds)
                 judgement.drove.append(f"{driver} for {seconds:g} s")
+            judgement.late_s = on.bench.withheld_s - withheld_s
         report = json.loads((await asyncio.to_thread(process.communicate, "end\n", 20))[0])
     judgement.seconds = time.monotonic() - began
     judgement.hold_against("robot", report["violations"])

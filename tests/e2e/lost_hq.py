@@ -47,7 +47,7 @@ from tests.e2e.loss import (
     stop_since,
     thaw_driver,
 )
-from tests.e2e.machine import contended_s
+from tests.machine import contended_s
 
 KEPT_S = 1.6
 """The longest time for which a listener believes in a controller that is gone and is sent nothing: keep-alive's second,

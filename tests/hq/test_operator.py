@@ -685,7 +685,7 @@ async def test_the_gateway_going_away_ends_the_drive() -> None:
         operator.command(topics.CMD_DRIVE, GO)
 
 
-async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_helm() -> None:
+async def test_an_idle_program_is_not_told_of_the_gateways_end_by_its_operator() -> None:
     scene = Scene()
     scene.operator().gateway_lost()
     assert scene.told == []

@@ -103,7 +103,7 @@ class Operator:
             self._bridge.put(topic, message)
 
     def tick(self) -> None:
-        """Keep the lease, or release it; to be called every ``ATTEND_S`` while active."""
+        """Renew or release the lease; must be called every ``ATTEND_S`` while active."""
         now, intent = self._clock(), self.intent
         intent.expire(now)
         if not intent.held:
@@ -211,7 +211,7 @@ class Operator:
             raise NotReady(missing)
 
     def _tell_mode(self, send: Callable[[Topic, FleetMessage], None]) -> None:
-        """Tell the robot its control mode, if it is of a protocol that has any."""
+        """Send the robot its control mode, if the client has chosen one and the robot is of the client's protocol."""
         if self.intent.held and self._chose_mode and self._bridge.view.protocol == self._protocol:
             send(topics.CMD_MODE, Mode(self.intent.mode))  # type: ignore[arg-type]
 

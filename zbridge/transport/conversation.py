@@ -146,10 +146,8 @@ class Conversation:
             session.drops_source = False
             link.drop_source()
         writing = link is not None and (session.over or self._takes(link))  # last words are written in any case
-        while writing and link is not None and link.ready:
-            now = (
-                self._clock()
-            )  # read before ``before`` runs: what becomes due while the process is frozen waits for the next turn
+        while writing and link is not None and link.ready and not (outbox.idle and session.state is _ESTABLISHED):
+            now = self._clock()  # before ``before``: what becomes due while the process is frozen waits for its turn
             self._before()
             frame = session.outgoing(now)
             if frame is None:

@@ -80,8 +80,7 @@ class Hq(Scene):
 
     async def silence_over(self, _: str) -> None:
         """Wait until more than the 7 may come by TCP."""
-        while time.monotonic() < self.judge._quiet_until:
-            await asyncio.sleep(0.01)
+        await until(lambda: time.monotonic() > self.judge._quiet_until, "the end of the silence")
 
     async def send_until_noted(self, text: str) -> None:
         """Send it again and again: nobody knows how late the robot's own time is."""

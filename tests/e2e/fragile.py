@@ -36,6 +36,9 @@ ROBOTS: dict[str, Callable[..., Any]] = {
 }
 
 
+DISTURBED = 5
+"""Most runs against one robot that is disturbed each time."""
+_HANDSHAKE = {3, 7}
 _RARE, _RARE_S = re.compile(r"no drive command for |\d+ drive commands in "), 0.08
 """What a vehicle says of commands that are too rare, and for how long nobody may be late: 0.1 s less one period."""
 
@@ -47,6 +50,11 @@ def charges(violations: Iterable[str], late_s: float = 0.0) -> list[str]:
     """
     mine = [text for text in violations if "(this process" not in text]
     return [text for text in mine if late_s < _RARE_S or not _RARE.search(text)]
+
+
+def disturbed(report: dict[str, Any]) -> bool:
+    """Tell whether a robot lost a packet of the handshake, being late itself: it understands nothing after that."""
+    return any(packet_id in _HANDSHAKE for _, _, packet_id, _ in report["piled"])
 
 
 @contextlib.contextmanager

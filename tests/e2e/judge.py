@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from tests.e2e.conftest import Bench, until
-from tests.e2e.fragile import ended, fragile_robot
+from tests.e2e.fragile import DISTURBED, disturbed, ended, fragile_robot
 
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 PACE_S = 0.03
@@ -35,10 +35,7 @@ DRIVES = {11, 12}
 LEASED = {*DRIVES, 10, 40}
 BEFORE_STOP = 4
 """How many of the last commands before a stop it may overtake where the machine was late: those of a burst."""
-HANDSHAKE = {3, 7}
 ASKED = {"no map": 52, "no pose": 54}
-DISTURBED = 5
-"""Most runs against one robot."""
 HAS_LIDAR_SIM = {"1.2", "1.3", "1.4"}
 
 
@@ -144,7 +141,7 @@ class _Run:
             (judgement.excused if "(this process" in text else judgement.violations).append(text)
         came = [row[1:] for row in report["received"] + report["piled"]]
         piled = Counter(packet_id for _, _, packet_id, _ in report["piled"])
-        judgement.disturbed = any(piled[packet_id] for packet_id in HANDSHAKE)
+        judgement.disturbed = disturbed(report)
         for what, packet_id in ASKED.items():  # what the robot itself lost it cannot answer
             judgement.answered[what] = max(0, judgement.answered[what] - piled[packet_id])
         arrived = Counter((packet_id, body) for _, packet_id, body in came)

@@ -17,7 +17,7 @@ from gateways.tcpudp.conformance.parser import Feature, Times
 from tests import captures
 from tests.conformance.scene import LONG_S, Peer, Scene, Script, scripts, serving, until
 
-QUICK = Times(read_s=0.002, probe_s=0.1, silence_s=0.1, part_s=0.08, flight_s=0.1, unasked_s=0)
+QUICK = Times(read_s=0.002, probe_s=0.3, silence_s=0.3, part_s=0.08, flight_s=0.1, unasked_s=0)
 GAP_S = 0.015
 CLIENT = 7
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
@@ -78,6 +78,10 @@ class Hq(Scene):
     async def established(self, _: str) -> None:
         await until(lambda: "ESTABLISHED" in repr(self.judge), repr(self.judge))
 
+    async def awake(self, _: str) -> None:
+        """Wait until it has slept after its 4."""
+        await until(lambda: "ASLEEP" not in repr(self.judge), repr(self.judge))
+
     async def silence_over(self, _: str) -> None:
         """Wait until more than the 7 may come by TCP."""
         await until(lambda: time.monotonic() > self.judge._quiet_until, "the end of the silence")
@@ -125,7 +129,7 @@ class Hq(Scene):
         await self.send(hello(version, udp))
         if udp:
             await self.play(["< START", "by_udp PROBE", "expect_udp RECEIVED", "> CONNECTED"])
-            await asyncio.sleep(QUICK.probe_s + GAP_S)
+            await self.established("")
 
     async def probing(self, _: str) -> None:
         """Answer the settings with UDP, and take the 4."""
@@ -170,7 +174,7 @@ PARTS: dict[str, Any] = {"version": "1.4", "parts": 4}
         ),
         "a lost answer ends with a late status": (
             {"udp": True, "loss": Loss.ANSWER},
-            ["probing", "by_udp PROBE", "wait 0.1", "> NOT_CONNECTED", "> FORWARD", "ok"],
+            ["probing", "by_udp PROBE", "awake", "> NOT_CONNECTED", "> FORWARD", "ok"],
         ),
         "the answers are those of the page": (
             {"version": "1.1", "misnamed": 0.0},
@@ -211,7 +215,7 @@ PARTS: dict[str, Any] = {"version": "1.4", "parts": 4}
         "a second connection hears nothing and does no harm": ({}, ["greet", "crowd 20", "> STOP", "ok", "took 3 13"]),
         "a 7 that denies the answer is an event, and all goes by TCP": (
             UDP,
-            ["probing", "by_udp PROBE", "> NOT_CONNECTED", "wait 0.1", "> FORWARD", "ok"]
+            ["probing", "by_udp PROBE", "> NOT_CONNECTED", "established", "> FORWARD", "ok"]
             + ["? 7(false) though 6(true) was sent by UDP", "told 1"],
         ),
         "a connection that breaks is an event": (
@@ -229,9 +233,9 @@ NOTED: dict[str, Script] = {
     "commands before the settings": ({}, ["connect", "> STOP", "! packet 13 while the robot waits for 1 or 3"]),
     "settings without a string": ({}, ["connect", "> 06000000 07 03 09000000", "! no version string"]),
     "two probes": (UDP, ["probing", "by_udp PROBE", "by_udp PROBE", "! 2 probes 5 by UDP instead of one"]),
-    "no probe": (UDP, ["probing", "< LOST", "! no 5 by UDP within 0.1 s of the 4"]),
-    "a late probe": (UDP, ["probing", "< LOST", "by_udp PROBE", "! the probe 5 came later than 0.1 s after the 4"]),
-    "a missing status": (UDP, ["probing", "by_udp PROBE", "! no 7 within 0.2 s of the 4"]),
+    "no probe": (UDP, ["probing", "< LOST", "! no 5 by UDP within 0.3 s of the 4"]),
+    "a late probe": (UDP, ["probing", "< LOST", "by_udp PROBE", "! the probe 5 came later than 0.3 s after the 4"]),
+    "a missing status": (UDP, ["probing", "by_udp PROBE", "! no 7 within 0.6 s of the 4"]),
     "a status without an answer": (
         {"udp": True, "loss": Loss.ANSWER},
         ["probing", "by_udp PROBE", "> CONNECTED", "! 7(true) though no 6(true) was received"],
@@ -248,7 +252,7 @@ NOTED: dict[str, Script] = {
     ),
     "a drive by UDP without agreement": (
         {"udp": True, "loss": Loss.ANSWER},
-        ["probing", "by_udp PROBE", "> NOT_CONNECTED", "wait 0.1", "by_udp FORWARD"]
+        ["probing", "by_udp PROBE", "> NOT_CONNECTED", "established", "by_udp FORWARD"]
         + ["! packet 11 by UDP instead of TCP"],
     ),
     "11 by TCP": (UDP, ["greet 1.3 udp", "> FORWARD", "! packet 11 by TCP instead of UDP"]),
@@ -256,7 +260,7 @@ NOTED: dict[str, Script] = {
     "13 by UDP": (UDP, ["greet 1.3 udp", "by_udp STOP", "! packet 13 by UDP instead of TCP"]),
     "5 by TCP": (UDP, ["greet 1.3 udp", "> PROBE", "! packet 5 by TCP instead of UDP"]),
     "TCP too soon after it slept": (
-        {"udp": True, "times": Times(read_s=0.002, probe_s=0.1, silence_s=1.0, unasked_s=0)},
+        {"udp": True, "times": Times(read_s=0.002, probe_s=0.3, silence_s=1.0, unasked_s=0)},
         ["probing", "by_udp PROBE", "> CONNECTED", "established", "> STOP"]
         + ["! packet 13 by TCP within 1 s of the 4", "silence_over", "> STOP", "took 3 5 7 13 13", "!! packet 13"],
     ),
@@ -277,7 +281,7 @@ NOTED: dict[str, Script] = {
     **{
         f"while it sleeps, {meanwhile}": (
             UDP,
-            ["probing", "by_udp PROBE", f"> {meanwhile}", "! TCP other than one 7 within 0.1 s of the 4: 0"],
+            ["probing", "by_udp PROBE", f"> {meanwhile}", "! TCP other than one 7 within 0.3 s of the 4: 0"],
         )
         for meanwhile in ("CONNECTED STOP", "STOP", "CONNECTED CONNECTED")
     },
@@ -383,7 +387,7 @@ async def test_it_dies_of(options: dict[str, Any], steps: list[str]) -> None:
 @pytest.mark.parametrize("udp", [False, True])
 @pytest.mark.parametrize("version", VERSIONS)
 async def test_an_hq_that_behaves_is_not_reproached(version: str, udp: bool) -> None:
-    robot = quick(version, udp, times=Times(probe_s=0.1, silence_s=0.1, part_s=0.02, unasked_s=0.02))
+    robot = quick(version, udp, times=Times(probe_s=0.3, silence_s=0.3, part_s=0.02, unasked_s=0.02))
     drive = "by_udp" if udp else ">"
     async with facing(robot) as hq:
         await hq.play([f"greet {version}{' udp' * udp}", "> JOYSTICK_MODE", f"{drive} FORWARD", f"{drive} TURN"])

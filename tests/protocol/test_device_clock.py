@@ -160,7 +160,6 @@ def test_the_error_in_milliseconds(delay: Delay, most_ms: float, drift: str) -> 
         assert worst_ms(DeviceClock(), packets) <= most_ms
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     spread_us=st.integers(0, 40_000),
     drift_ppm=st.floats(-400, 400),
@@ -184,7 +183,7 @@ def test_the_stated_error_holds_for_any_delays(spread_us, drift_ppm, good, gap, 
     assert max(errors_ns) <= 2.5 * spread_us * 1000 + 10
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=2 * settings().max_examples)
 @given(
     drift_ppm=st.floats(-400, 400),
     delays_s=st.lists(st.one_of(st.floats(0, 0.05), st.floats(0, 0.9)), min_size=1, max_size=200),
@@ -202,7 +201,7 @@ def test_early_stamps_are_as_good_as_the_best_packet_so_far(drift_ppm, delays_s,
         assert error_s <= best_s + 1e-6
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=2 * settings().max_examples)
 @given(
     delays_s=st.lists(st.floats(0, 0.9), max_size=100),
     steps_ms=st.lists(st.integers(0, 3000), min_size=100, max_size=100),
@@ -459,7 +458,7 @@ absurd = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=3 * settings().max_examples)
 @given(
     wrap_ms=st.sampled_from([None, U32, 1000, 3]),
     calls=st.lists(st.tuples(absurd, st.one_of(absurd, st.integers(EPOCH_NS, EPOCH_NS + 400 * S))), max_size=60),

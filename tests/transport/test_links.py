@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
+from tests.clock import jumping
 from tests.e2e.conftest import free_port
 from tests.transport.recorder import SOON_S, Recorder
 from zbridge.address import Address
@@ -567,6 +568,7 @@ def all_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "STRAY_S", 0.0)
 
 
+@jumping
 async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() -> None:
     """So a flood costs little, however many links its host has."""
     foreign = Count()

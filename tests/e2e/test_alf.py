@@ -407,9 +407,9 @@ def test_a_fragile_vehicle_finds_nothing_to_complain_of(bench: Bench, dialect: s
         f'options = {{ dialect = "{dialect}" }}\n[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
     )
     gateway = bench.zbridge("run", str(file))
+    until(lambda: bench.fleet.state("r1") == "established", what="established")
     withheld_s = bench.withheld_s
     with zbridge.blocking.connect(bench.endpoint) as fleet, fleet["r1"].control() as drive:
-        until(lambda: bench.fleet.state("r1") == "established", what="established")
         for number in range(60):
             drive(forward=(number % 21 - 10) / 10, turn=(number % 13 - 6) / 6, light=bool(number % 2))
             time.sleep(0.02)

@@ -52,7 +52,6 @@ def main(arguments: list[str]) -> int:
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    logging.disable(logging.CRITICAL)
     failed = held = 0
     for finding in check(protocol):
         failed, held = failed + (finding.problem is not None), held + (finding.problem is None)

@@ -248,3 +248,11 @@ def test_a_big_endian_message_of_variable_length_is_refused() -> None:
 
     with pytest.raises(TypeError, match="fixed width"):
         BinaryCodec(Mixed)
+
+
+def test_fields_that_cannot_be_given_by_position_are_refused() -> None:
+    class ByName(Message, frozen=True, kw_only=True):
+        value: U8
+
+    with pytest.raises(TypeError, match="ByName: fields are given by position"):
+        BinaryCodec(ByName)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import ProtocolError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
 
 STEPS = 12
@@ -60,7 +60,7 @@ def _at(
             for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield f"after {step} frames: {raised(error)}"
+        yield f"after {step} frames: {describe(error)}"
 
 
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -105,5 +105,5 @@ def _translated(protocol: Protocol, recording: Recording) -> list[str]:
         except ProtocolError:
             continue
         except Exception as error:
-            problems.append(f"{message}: {raised(error)}")
+            problems.append(f"{message}: {describe(error)}")
     return problems

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from fnmatch import fnmatch
 
 import pytest
+import uvloop
 from hypothesis import HealthCheck, settings
 
 from tests.clock import JumpingLoop
@@ -33,4 +34,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_asyncio_loop_factories(item: pytest.Item) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
     if item.get_closest_marker("jumping"):
         return {"jumping": JumpingLoop}
+    if item.get_closest_marker("both_loops"):
+        return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
     return {"real": asyncio.new_event_loop}

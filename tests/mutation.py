@@ -170,23 +170,25 @@ def mutated(source: str, where: dict[str, Any]) -> tuple[str, str, str]:
     return text, kind, ast.unparse(new or statement).splitlines()[0]
 
 
-def tests_of(path: str) -> list[str]:
+def tests_for(path: str, tree: Path) -> list[str]:
     """List the tests that concern a source file: its own first, then its folder's, then those that import it."""
     parts = Path(path).with_suffix("").parts
     folder = Path("tests", *(parts[1:-1] if parts[0] == "zbridge" else parts[:-1]))
+    while not (tree / folder).is_dir():  # a module that became a package is tested where it was
+        folder = folder.parent
     own = folder / f"test_{parts[-1]}.py"
     dotted = re.compile(
         rf"{re.escape('.'.join(parts))}\b|from {re.escape('.'.join(parts[:-1]))} import .*\b{parts[-1]}\b"
     )
     importers = [
-        test.relative_to(ROOT)
-        for test in sorted((ROOT / "tests").rglob("test_*.py"))
+        test.relative_to(tree)
+        for test in sorted((tree / "tests").rglob("test_*.py"))
         if not {"e2e", "benchmarks"} & set(test.parts) and dotted.search(test.read_text())
     ]
-    beside = sorted(test.relative_to(ROOT) for test in (ROOT / folder).rglob("test_*.py")) if len(parts) > 2 else []
+    beside = sorted(test.relative_to(tree) for test in (tree / folder).rglob("test_*.py")) if len(parts) > 2 else []
     shared = [Path("tests/conformance")] if parts[0] == "gateways" or parts[1] == "wire" else []
     ordered = dict.fromkeys(str(test) for test in [own, *shared, *beside, *importers])
-    return [test for test in ordered if (ROOT / test).exists()]
+    return [test for test in ordered if (tree / test).exists()]
 
 
 def run(tree: Path, tests: list[str]) -> tuple[str, str]:
@@ -205,6 +207,8 @@ def run(tree: Path, tests: list[str]) -> tuple[str, str]:
         return "caught", f"no end within {LIMIT_S:.0f} s"
     if process.returncode == 0:
         return "survived", ""
+    if process.returncode > 2:  # neither failed nor broken on import
+        raise RuntimeError(output)
     failing = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
     return "caught", failing[1] if failing else output[-300:]
 
@@ -235,7 +239,7 @@ def main() -> None:
                 source = target.read_text()
                 text, kind, now = mutated(source, {**found, "choice": one["choice"]})
                 target.write_text(text)
-                outcome, by = run(tree, tests_of(found["path"]))
+                outcome, by = run(tree, tests_for(found["path"], tree))
                 target.write_text(source)
                 result |= {"now_in": found["path"], "kind": kind, "mutated": now, "result": outcome, "by": by}
             results.append(result | {"seconds": round(time.monotonic() - started, 1)})

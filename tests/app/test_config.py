@@ -118,22 +118,11 @@ listen = "127.0.0.1:9100"
 
 
 def test_a_process_may_only_serve_hq_programs(tmp_path: Path) -> None:
-    made = loaded(
-        tmp_path,
-        """
-[robot]
-name = "r1"
-[[hq]]
-protocol = "alf"
-listen = "tcp://127.0.0.1:11002"
-""",
-    )
+    made = loaded(tmp_path, '[robot]\nname = "r1"\n[[hq]]\nprotocol = "alf"\nlisten = "tcp://127.0.0.1:11002"\n')
     assert made.device is None
     (listener,) = made.listeners
-    assert listener.protocol.name == "alf"
-    assert listener.address == Address("127.0.0.1", 11002)
-    assert listener.options == listener.protocol.hq_options()
-    assert listener.allow == ()
+    assert (listener.protocol.name, listener.address) == ("alf", Address("127.0.0.1", 11002))
+    assert (listener.options, listener.allow) == (listener.protocol.hq_options(), ())
     settings = listener.settings
     assert (settings.name, settings.clients, settings.rate_hz) == (None, 256, 1000.0)
     assert (settings.handshake_s, settings.idle_s) == (5.0, None)
@@ -272,6 +261,7 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (minimal(robot={"name": "r1", "realm": "*"}), "robot.realm = '*': expected letters"),
     (minimal(robot={"name": "r1", "colour": "red"}), "robot.colour = 'red': unknown key"),
     (minimal(robot=1), "robot = 1: expected `object`"),
+    (minimal(robot={"nam": "r1"}), "expected one of name, realm"),
     (minimal(colour="red"), "colour = 'red': unknown key"),
     (minimal(robot={"name": "${NONE}"}), "robot.name = '${NONE}': expected the environment variable NONE"),
     (device(connect=["${NONE}"]), "device.connect[0] = '${NONE}': expected the environment variable NONE"),
@@ -280,14 +270,8 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (device(connect="tcp://a:1"), "device.connect = 'tcp://a:1': expected `array`"),
     (device(connect=["tcp://a:1", 5]), "device.connect[1] = 5: expected `str`"),
     (device(connect=["udp://a:1"]), "device.connect = 'udp://a:1': expected tcp://host:port"),
-    (
-        device(connect=["serial:///dev/s"]),
-        "device.connect = 'serial:///dev/s': expected serial:///path?baud=N",
-    ),
-    (
-        serving(hq(listen="serial:///dev/s?baud=9600")),
-        "hq[0].listen = 'serial:///dev/s?baud=9600': expected tcp://",
-    ),
+    (device(connect=["serial:///dev/s"]), "device.connect = 'serial:///dev/s': expected serial:///path?baud=N"),
+    (serving(hq(listen="serial:///dev/s?baud=9600")), "hq[0].listen = 'serial:///dev/s?baud=9600': expected tcp://"),
     (
         minimal(metrics={"listen": "serial:///dev/s?baud=9600"}),
         "metrics.listen = 'serial:///dev/s?baud=9600': expected",
@@ -352,31 +336,22 @@ def test_a_protocol_without_an_hq_side_serves_no_hq_programs(monkeypatch: pytest
         plan(serving(hq(protocol="alf")), {})
 
 
-def test_an_unknown_key_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match="expected one of name, realm"):
-        plan(minimal(robot={"nam": "r1"}))
-
-
-def test_an_error_in_a_file_names_the_file(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"robot\.toml: robot\.name = 'a/b'"):
-        loaded(tmp_path, MINIMAL.replace('"r1"', '"a/b"'))
-
-
-def test_a_file_that_is_no_toml_is_an_error_that_names_it_and_the_place(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"robot\.toml: not TOML: .*line 2"):
-        loaded(tmp_path, "\nname = \n")
-
-
-def test_a_file_that_is_no_text_is_an_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (MINIMAL.replace('"r1"', '"a/b"').encode(), r"robot\.toml: robot\.name = 'a/b'"),
+        (b"\nname = \n", r"robot\.toml: not TOML: .*line 2"),
+        (b"\xff\xfe", "not TOML"),
+        (None, r"robot\.toml: No such file"),
+    ],
+    ids=["a wrong value", "no TOML", "no text", "no file"],
+)
+def test_an_error_in_a_file_names_the_file_and_the_place(tmp_path: Path, content: bytes | None, error: str) -> None:
     file = tmp_path / "robot.toml"
-    file.write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match="not TOML"):
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(ConfigError, match=error):
         load(file)
-
-
-def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
-        load(tmp_path / "none.toml")
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:

@@ -28,16 +28,19 @@ class Rig:
         return self.seen
 
 
-async def test_items_come_in_order_and_not_before_the_loop_runs() -> None:
-    rig = Rig()
+@pytest.fixture
+async def rig() -> Rig:
+    return Rig()
+
+
+async def test_items_come_in_order_and_not_before_the_loop_runs(rig: Rig) -> None:
     for number in range(5):
         rig.put(number)
     assert rig.seen == []
     assert await rig.drained() == [0, 1, 2, 3, 4]
 
 
-async def test_items_are_read_on_the_loops_thread_only() -> None:
-    rig = Rig()
+async def test_items_are_read_on_the_loops_thread_only(rig: Rig) -> None:
     reader: list[int] = []
     source = rig.inbox.source(rig.seen.append, lambda raw: reader.append(threading.get_ident()) or "read")
     source.put(b"raw", Lane.OTHER)
@@ -46,17 +49,7 @@ async def test_items_are_read_on_the_loops_thread_only() -> None:
     assert reader == [threading.get_ident()]
 
 
-async def test_first_items_go_before_all_others_that_wait() -> None:
-    rig = Rig()
-    for number in range(3):
-        rig.put(number)
-    rig.put("stop", first=True)
-    rig.put("stop again", first=True)
-    assert await rig.drained() == ["stop", "stop again", 0, 1, 2]
-
-
-async def test_a_first_item_that_comes_late_goes_before_the_rest_of_a_long_queue() -> None:
-    rig = Rig()
+async def test_a_first_item_that_comes_late_goes_before_the_rest_of_a_long_queue(rig: Rig) -> None:
     for number in range(1000):
         rig.put(number)
     await asyncio.sleep(0)
@@ -68,14 +61,12 @@ async def test_a_first_item_that_comes_late_goes_before_the_rest_of_a_long_queue
     assert [item for item in seen if item != "stop"] == list(range(1000))
 
 
-async def test_items_of_another_thread_arrive_all_and_in_order() -> None:
-    rig = Rig()
+async def test_items_of_another_thread_arrive_all_and_in_order(rig: Rig) -> None:
     await asyncio.to_thread(lambda: [rig.put(number) for number in range(3000)])
     assert await rig.drained() == list(range(3000))
 
 
-async def test_a_full_lane_forgets_its_oldest_item_and_counts_it() -> None:
-    rig = Rig()
+async def test_a_full_lane_forgets_its_oldest_item_counts_it_and_costs_no_first_item(rig: Rig) -> None:
     rig.put("stop", first=True)
     for number in range(QUEUE + 3):
         rig.put(number)
@@ -83,32 +74,20 @@ async def test_a_full_lane_forgets_its_oldest_item_and_counts_it() -> None:
     assert await rig.drained() == ["stop", *range(3, QUEUE + 3)]
 
 
-async def test_a_flood_of_other_items_costs_no_first_item() -> None:
-    rig = Rig()
-    for number in range(10):
-        rig.put(number, first=True)
-    for _ in range(2 * QUEUE):
-        rig.put("other")
-    assert (await rig.drained())[:10] == list(range(10))
-
-
-async def test_a_flood_of_commands_costs_no_stop() -> None:
-    rig = Rig()
+async def test_a_flood_of_commands_costs_no_stop(rig: Rig) -> None:
     rig.source.put("stop", Lane.STOP)
     for number in range(2 * QUEUE):
         rig.put(number, first=True)
     assert (await rig.drained())[0] == "stop"
 
 
-async def test_the_lanes_are_served_in_their_order_whatever_came_first() -> None:
-    rig = Rig()
+async def test_the_lanes_are_served_in_their_order_whatever_came_first(rig: Rig) -> None:
     for lane in (Lane.OTHER, Lane.COMMAND, Lane.STOP, Lane.COMMAND, Lane.STOP, Lane.OTHER):
         rig.source.put(lane, lane)
     assert await rig.drained() == [Lane.STOP, Lane.STOP, Lane.COMMAND, Lane.COMMAND, Lane.OTHER, Lane.OTHER]
 
 
-async def test_a_flood_of_commands_costs_no_other_item() -> None:
-    rig = Rig()
+async def test_a_flood_of_commands_costs_no_other_item(rig: Rig) -> None:
     rig.put("other")
     for number in range(QUEUE + 3):
         rig.put(number, first=True)
@@ -118,8 +97,9 @@ async def test_a_flood_of_commands_costs_no_other_item() -> None:
     assert [item for item in rig.seen if item != "other"] == list(range(3, QUEUE + 3))
 
 
-async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(caplog: pytest.LogCaptureFixture) -> None:
-    rig = Rig()
+async def test_a_handler_that_fails_is_logged_and_the_next_item_comes(
+    rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
 
     def fail(value: Any) -> None:
         raise RuntimeError("our bug")
@@ -140,8 +120,7 @@ def test_an_item_for_a_loop_that_has_ended_is_no_error() -> None:
     assert rig.seen == []
 
 
-async def test_attending_serves_stops_and_commands_at_once_and_nothing_else() -> None:
-    rig = Rig()
+async def test_attending_serves_stops_and_commands_at_once_and_nothing_else(rig: Rig) -> None:
     rig.put("other")
     rig.put("command", first=True)
     rig.source.put("stop", Lane.STOP)
@@ -151,8 +130,7 @@ async def test_attending_serves_stops_and_commands_at_once_and_nothing_else() ->
     assert await rig.drained() == ["stop", "command", "other"]
 
 
-async def test_a_flood_of_one_source_costs_no_item_of_another_and_no_more_than_its_turn() -> None:
-    rig = Rig()
+async def test_a_flood_of_one_source_costs_no_item_of_another_and_no_more_than_its_turn(rig: Rig) -> None:
     noise = rig.inbox.source(rig.seen.append, lambda value: value)
     for _ in range(2 * QUEUE):
         noise.put("noise", Lane.OTHER)
@@ -161,8 +139,7 @@ async def test_a_flood_of_one_source_costs_no_item_of_another_and_no_more_than_i
     assert "question" in rig.seen[:2]
 
 
-async def test_a_stop_that_waits_makes_the_next_ones_count_only() -> None:
-    rig = Rig()
+async def test_a_stop_that_waits_makes_the_next_ones_count_only(rig: Rig) -> None:
     for number in range(1000):
         rig.source.fold(number, Lane.STOP)
     assert await rig.drained() == [0]
@@ -171,8 +148,7 @@ async def test_a_stop_that_waits_makes_the_next_ones_count_only() -> None:
     assert await rig.drained() == [0, "next"]
 
 
-async def test_a_stop_that_comes_while_one_is_carried_out_is_carried_out_after_it() -> None:
-    rig = Rig()
+async def test_a_stop_that_comes_while_one_is_carried_out_is_carried_out_after_it(rig: Rig) -> None:
 
     def stop(number: int) -> None:
         rig.seen.append(number)
@@ -184,16 +160,14 @@ async def test_a_stop_that_comes_while_one_is_carried_out_is_carried_out_after_i
     assert await rig.drained() == [1, 2, 3]
 
 
-async def test_stops_of_two_robots_are_two_stops() -> None:
-    rig = Rig()
+async def test_stops_of_two_robots_are_two_stops(rig: Rig) -> None:
     other = rig.inbox.source(rig.seen.append, lambda value: value)
     rig.source.fold("one", Lane.STOP)
     other.fold("other", Lane.STOP)
     assert await rig.drained() == ["one", "other"]
 
 
-async def test_what_waits_has_a_bound_in_bytes_too() -> None:
-    rig = Rig()
+async def test_what_waits_has_a_bound_in_bytes_too(rig: Rig) -> None:
     for number in range(10):
         rig.source.put(number, Lane.OTHER, QUEUE_BYTES // 4)
     assert await rig.drained() == [6, 7, 8, 9]
@@ -203,8 +177,7 @@ async def test_what_waits_has_a_bound_in_bytes_too() -> None:
     assert (await rig.drained())[4:] == [0, 1, 2, 3], "what was served has made room"
 
 
-async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile() -> None:
-    rig = Rig()
+async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile(rig: Rig) -> None:
     sources = [rig.inbox.source(rig.seen.append, lambda value: value) for _ in range(4)]
 
     def bring(source: Any, first: int) -> None:
@@ -217,9 +190,8 @@ async def test_items_of_many_threads_arrive_all_whatever_the_loop_does_meanwhile
     assert sorted(rig.seen) == list(range(12_000))
 
 
-async def test_what_the_holder_says_keeps_its_order_whatever_it_comes_by() -> None:
+async def test_what_the_holder_says_keeps_its_order_whatever_it_comes_by(rig: Rig) -> None:
     """A release that overtook the neutral before it would have it refused."""
-    rig = Rig()
     questions = rig.inbox.source(rig.seen.append, lambda value: value)
     for number in range(3):
         rig.put(number, first=True)

@@ -69,9 +69,16 @@ def fail() -> None:
     raise OSError("closed")
 
 
+@pytest.fixture(params=["newest", "lossless"])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """A writer for which the newest wins, or one that writes everything."""
+    rig = Rig(lossless=request.param == "lossless")
+    yield rig
+    rig.go()
+
+
 @pytest.fixture
 def newest() -> Iterator[Rig]:
-    """A writer for which the newest wins."""
     rig = Rig(lossless=False)
     yield rig
     rig.go()
@@ -79,32 +86,21 @@ def newest() -> Iterator[Rig]:
 
 @pytest.fixture
 def lossless() -> Iterator[Rig]:
-    """A writer that writes everything."""
     rig = Rig(lossless=True)
     yield rig
     rig.go()
 
 
-@pytest.fixture(params=["newest", "lossless"])
-def rig(request: pytest.FixtureRequest) -> Rig:
-    made: Rig = request.getfixturevalue(request.param)
-    return made
-
-
-def test_calls_are_carried_out_in_order(rig: Rig) -> None:
-    for number in range(100):
-        assert rig.put(number)
-    rig.go()
-    assert rig.written == list(range(100))
-    assert (rig.dropped, rig.replaced) == (0, 0)
-
-
-def test_calls_are_carried_out_on_a_thread_of_their_own(rig: Rig) -> None:
+def test_calls_are_carried_out_in_order_on_a_thread_of_their_own(rig: Rig) -> None:
     threads: list[str] = []
     rig.writer.put(lambda: threads.append(threading.current_thread().name))
+    for number in range(100):
+        assert rig.put(number)
     rig.writer.replace("status", lambda: threads.append(threading.current_thread().name))
     rig.go()
+    assert rig.written == list(range(100))
     assert threads == ["zbridge-test", "zbridge-test"]
+    assert (rig.dropped, rig.replaced) == (0, 0)
 
 
 def test_the_caller_does_not_wait_for_a_call(rig: Rig) -> None:
@@ -136,16 +132,7 @@ def test_a_call_that_came_after_its_elder_was_carried_out_replaces_nothing(newes
     assert newest.replaced == 0
 
 
-def test_calls_with_a_key_go_before_those_that_wait_in_line(newest: Rig) -> None:
-    newest.hold()
-    newest.put("first")
-    newest.put("second")
-    newest.replace("status", "status")
-    newest.go()
-    assert newest.written == ["status", "first", "second"]
-
-
-def test_a_call_with_a_key_that_comes_meanwhile_goes_before_the_rest_of_the_line(newest: Rig) -> None:
+def test_a_call_with_a_key_goes_before_what_waits_in_line_one_that_comes_meanwhile_too(newest: Rig) -> None:
     def first() -> None:
         newest.written.append("first")
         newest.replace("status", "status")
@@ -153,8 +140,9 @@ def test_a_call_with_a_key_that_comes_meanwhile_goes_before_the_rest_of_the_line
     newest.hold()
     newest.writer.put(first)
     newest.put("second")
+    newest.replace("map", "map")
     newest.go()
-    assert newest.written == ["first", "status", "second"]
+    assert newest.written == ["map", "first", "status", "second"]
 
 
 def test_beyond_the_backlog_the_oldest_are_forgotten_and_counted(newest: Rig) -> None:
@@ -168,24 +156,18 @@ def test_beyond_the_backlog_the_oldest_are_forgotten_and_counted(newest: Rig) ->
     assert not newest.relieved.is_set()
 
 
-def test_what_is_forgotten_counts_by_its_size(newest: Rig) -> None:
+@pytest.mark.parametrize(
+    ("sizes", "written"),
+    [({"old": 7, "middle": BACKLOG - 7, "new": 1}, ["middle", "new"]), ({"old": 7, "large": BACKLOG + 1}, ["large"])],
+)
+def test_what_is_forgotten_counts_by_its_size_and_a_large_call_stays_alone(newest: Rig, sizes, written) -> None:
     newest.hold()
-    newest.put("old", 7)
-    newest.put("middle", BACKLOG - 7)
-    assert newest.dropped == 0
-    newest.put("new", 1)
+    for what, size in sizes.items():
+        assert newest.dropped == 0
+        newest.put(what, size)
     assert newest.dropped == 7
     newest.go()
-    assert newest.written == ["middle", "new"]
-
-
-def test_a_call_larger_than_the_backlog_is_carried_out_alone(newest: Rig) -> None:
-    newest.hold()
-    newest.put("old", 2)
-    newest.put("large", BACKLOG + 1)
-    newest.go()
-    assert newest.written == ["large"]
-    assert newest.dropped == 2
+    assert newest.written == written
 
 
 def test_what_was_written_or_forgotten_makes_room(newest: Rig) -> None:
@@ -294,12 +276,12 @@ def test_a_call_that_fails_does_not_stay_in_the_backlog(lossless: Rig) -> None:
     assert lossless.relieved.is_set()
 
 
-def test_stopping_finishes_what_waits(rig: Rig) -> None:
+def test_stopping_finishes_what_waits_and_stopping_twice_does_no_harm(rig: Rig) -> None:
     rig.hold()
     rig.put("first")
     rig.replace("status", "second")
-    rig.release()
-    rig.writer.stop(SOON_S)
+    rig.go()
+    rig.go()
     assert sorted(map(str, rig.written)) == ["first", "second"]
 
 
@@ -307,6 +289,7 @@ def test_calls_after_the_stop_are_counted_and_not_carried_out(rig: Rig) -> None:
     rig.go()
     assert rig.put("late", 2), "nobody is paused"
     assert rig.dropped == 2
+    assert rig.replace("status", "late")
     assert rig.written == []
 
 
@@ -321,10 +304,3 @@ def test_stopping_waits_for_a_thread_that_is_held_for_a_bounded_time_only(rig: R
     rig.put("late")
     rig.writer.stop(0.01)
     assert rig.written == []
-
-
-def test_stopping_twice_does_no_harm(rig: Rig) -> None:
-    rig.put("first")
-    rig.go()
-    rig.go()
-    assert rig.written == ["first"]

@@ -58,11 +58,7 @@ async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_th
     elsewhere.close()
     first.close()
     await seen.until(lambda: len(seen) == 3)
-    assert seen == [
-        ("fleet/r1/@alive/first", True),
-        ("fleet/r1/@alive/second", True),
-        ("fleet/r1/@alive/first", False),
-    ]
+    assert seen == [("fleet/r1/@alive/first", True), ("fleet/r1/@alive/second", True), ("fleet/r1/@alive/first", False)]
     handle.close()
     handle.close()
     again = Seen()
@@ -108,10 +104,7 @@ async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key
     bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
     await bus.ask("fleet/r1/@rpc/control/renew", b"proof")
     await bus.ask("fleet/*/@rpc/control/renew", b"proof")
-    assert chosen == [
-        (b"proof", "fleet/r1/@rpc/control/renew", b""),
-        (b"proof", "fleet/*/@rpc/control/renew", b""),
-    ]
+    assert chosen == [(b"proof", "fleet/r1/@rpc/control/renew", b""), (b"proof", "fleet/*/@rpc/control/renew", b"")]
 
 
 async def test_a_question_knows_what_was_asked_and_is_answered_on_a_concrete_key(bus: ZenohBus) -> None:
@@ -349,15 +342,9 @@ async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatc
 @pytest.mark.parametrize(
     ("key", "most"),
     [
-        ("fleet/r1/@cmd/drive", 256),
-        ("fleet/r1/@cmd/motor/left", 256),
-        ("fleet/*/@cmd/mode", 256),
-        ("fleet/**/@cmd/stop", 256),
+        *((f"fleet/{key}", 256) for key in ("r1/@cmd/drive", "r1/@cmd/motor/left", "*/@cmd/mode", "**/@cmd/stop")),
         ("fleet/r1/@cmd/sensor/front", 16_384),
-        ("fleet/r1/@cmd/scan", 65_536),
-        ("fleet/r1/@cmd/raw/tcpudp", 65_536),
-        ("fleet/r1/@cmd/*", 65_536),
-        ("fleet/r1/@cmd/none", 65_536),
+        *((f"fleet/r1/@cmd/{key}", 65_536) for key in ("scan", "raw/tcpudp", "*", "none")),
     ],
 )
 async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called(key: str, most: int) -> None:

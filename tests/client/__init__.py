@@ -175,6 +175,11 @@ def subscriptions(bus: FakeBus, key: str) -> int:
 
 
 def tokens(bus: FakeBus, name: str = "r1") -> list[str]:
+    """List the liveliness tokens of programs that drive, without the numbers of their wishes."""
+    return [token.rpartition(".")[0] for token in numbered_tokens(bus, name)]
+
+
+def numbered_tokens(bus: FakeBus, name: str = "r1") -> list[str]:
     """List the liveliness tokens of programs that drive."""
     prefix = f"fleet/{name}/@alive/"
     return [token.removeprefix(prefix) for token in bus._shared.tokens if token.startswith(prefix + "operator.")]

@@ -16,7 +16,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from tests.client import LEASE_S, Gateway, settle, subscriptions, tokens
+from tests.client import LEASE_S, Gateway, numbered_tokens, settle, subscriptions, tokens
 from tests.proofs import lease, proof
 from zbridge.bus import Answer, Handle, IncomingQuery, Publisher, Sample
 from zbridge.bus.fake import FakeBus
@@ -138,7 +138,8 @@ async def test_a_liveliness_token_tells_while_the_program_lives() -> None:
     world = World()
     async with world.robot.control(ME):
         assert tokens(world.bus) == [MINE]
-        world.mine._shared.tell(f"fleet/r1/@alive/{MINE}", False)
+        (token,) = numbered_tokens(world.bus)
+        world.mine._shared.tell(f"fleet/r1/@alive/{token}", False)
         assert world.gateway.control.state == "stopped", "the lease names the token"
     assert tokens(world.bus) == []
 
@@ -150,6 +151,17 @@ async def test_the_token_is_there_before_the_lease_is_asked_for() -> None:
     world.gateway.serve()
     async with world.robot.control(ME):
         assert there == [[MINE]]
+
+
+async def test_the_end_of_an_earlier_token_that_is_heard_of_late_does_not_end_the_lease() -> None:
+    world = World()
+    async with world.robot.control(ME):
+        (earlier,) = numbered_tokens(world.bus)
+    async with world.robot.control(ME) as drive:
+        world.mine._shared.tell(f"fleet/r1/@alive/{earlier}", False)
+        assert world.gateway.control.state == "held"
+        await drive(forward=0.1)
+        assert drive.loss is None
 
 
 async def test_the_lease_is_asked_for_in_the_programs_own_name() -> None:

@@ -8,11 +8,12 @@ import asyncio
 import contextlib
 import socket
 import struct
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any, ClassVar
 
 import pytest
+
+from tests.machine import Patience
 
 LONG_S = 5.0
 VERBS = {">": "send", "<": "expect", "!": "violated", "!!": "violated_once", "?": "happened"}
@@ -98,9 +99,9 @@ class Listening(Peer):
 
 
 async def until(holds: Callable[[], Any], what: object = "") -> None:
-    deadline = time.monotonic() + LONG_S
+    patience = Patience(LONG_S)
     while not holds():
-        assert time.monotonic() < deadline, what() if callable(what) else what
+        assert not patience.over, what() if callable(what) else what
         await asyncio.sleep(0.003)
 
 

@@ -18,7 +18,7 @@ from zbridge.control.enforcer import Enforcer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
-from zbridge.fleet.messages import Acquire, Drive, FleetMessage
+from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Raw, Text
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 
@@ -112,3 +112,14 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown(rig: Rig) -> None:
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
     assert rig.metrics.count("control", what="stopped").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("command", "moves"),
+    [(Raw(id=21, body=b""), True), (Mode("autonomous"), True), (Mode("manual"), False), (Text("hi"), False)],
+    ids=lambda value: type(value).__name__,
+)
+async def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, moves: bool) -> None:
+    rig = Rig()
+    rig.enforcer.commanded(command)
+    assert rig.authority.moving is moves

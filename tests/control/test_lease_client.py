@@ -423,4 +423,6 @@ class Holding(RuleBasedStateMachine):
 
 
 def test_over_any_course_of_events_a_lease_is_held_only_while_it_is_wanted() -> None:
-    run_state_machine_as_test(Holding, settings=settings(max_examples=200, stateful_step_count=40, deadline=None))
+    run_state_machine_as_test(
+        Holding, settings=settings(max_examples=2 * settings().max_examples, stateful_step_count=40)
+    )

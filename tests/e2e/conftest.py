@@ -19,7 +19,7 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.e2e.machine import Withheld
+from tests.machine import Patience, Withheld, contended_s
 from tests.proofs import Holder, packed
 
 T = TypeVar("T")
@@ -52,14 +52,16 @@ def free_port() -> int:
 
 
 def until(condition: Callable[[], T], timeout_s: float = WAIT_S, what: str = "condition") -> T:
-    """Wait until ``condition()`` is true and give its value."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
+    """Wait until ``condition()`` is true and give its value. A busy machine puts the timeout off."""
+    patience = Patience(timeout_s)
+    while True:
+        over = patience.over
         value = condition()
         if value:
             return value
+        if over:
+            raise AssertionError(f"{what} not within {timeout_s} s")
         time.sleep(0.01)
-    raise AssertionError(f"{what} not within {timeout_s} s")
 
 
 def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
@@ -74,15 +76,16 @@ def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
 
 
 def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
-    """End a process by its id; give what it printed."""
+    """End a process by its id, within 5 s unless the machine is busy; give what it printed."""
     if process.poll() is None:
         process.send_signal(number)
-    try:
-        output, _ = process.communicate(timeout=5)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        output, _ = process.communicate()
-    return output
+    patience = Patience(5.0)
+    while True:
+        try:
+            return process.communicate(timeout=0.2)[0]
+        except subprocess.TimeoutExpired:
+            if patience.over:
+                process.kill()
 
 
 class Lease:
@@ -203,9 +206,23 @@ class Bench:
 
     def zbridge(self, *arguments: str, **popen: Any) -> subprocess.Popen[str]:
         process = start(*arguments, **popen)
-        self._processes.append(process.pid)
+        self.count(process.pid)
         self._stack.callback(end, process, signal.SIGKILL)
         return process
+
+    def count(self, pid: int) -> None:
+        """Count what is withheld from this process too."""
+        self._processes.append(pid)
+
+    def ended_within(self, process: subprocess.Popen[str], seconds: float) -> None:
+        """Wait for the end of a process.
+
+        A busy machine excuses as long as anything waited for a processor: a process that has ended cannot be asked.
+        """
+        contended, began = contended_s(), time.monotonic()
+        until(lambda: process.poll() is not None, what="the end of the process")
+        took_s = time.monotonic() - began
+        assert took_s < seconds + contended_s() - contended, f"it took {took_s:.2f} s"
 
     @property
     def withheld_s(self) -> float:

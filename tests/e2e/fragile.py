@@ -8,9 +8,10 @@ other ends it, and it prints what it received and what was violated as one JSON 
 import asyncio
 import contextlib
 import json
+import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from gateways.alf.conformance import parser as alf_wire
@@ -33,6 +34,27 @@ ROBOTS: dict[str, Callable[..., Any]] = {
     "wc2ec-deployed": lambda **options: FragileController("deployed", **options),
     "wc2ec-draft": lambda **options: FragileController("draft", **options),
 }
+
+
+DISTURBED = 5
+"""Most runs against one robot that is disturbed each time."""
+_HANDSHAKE = {3, 7}
+_RARE, _RARE_S = re.compile(r"no drive command for |\d+ drive commands in "), 0.08
+"""What a vehicle says of commands that are too rare, and for how long nobody may be late: 0.1 s less one period."""
+
+
+def charges(violations: Iterable[str], late_s: float = 0.0) -> list[str]:
+    """Give the violations that are not put down to the judge's own lateness.
+
+    ``late_s``: the time that the machine withheld from the gateway, which excuses commands that are too rare.
+    """
+    mine = [text for text in violations if "(this process" not in text]
+    return [text for text in mine if late_s < _RARE_S or not _RARE.search(text)]
+
+
+def disturbed(report: dict[str, Any]) -> bool:
+    """Tell whether a robot lost a packet of the handshake, being late itself: it understands nothing after that."""
+    return any(packet_id in _HANDSHAKE for _, _, packet_id, _ in report["piled"])
 
 
 @contextlib.contextmanager

@@ -10,12 +10,12 @@ import socket
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tests.e2e.conftest import Bench, end, free_port
+from tests.machine import Patience
 
 T = TypeVar("T")
 HOST = "127.0.0.1"
@@ -36,13 +36,18 @@ NEUTRAL = bytes.fromhex("02000000 00 0d")
 
 
 async def soon(condition: Callable[[], T], what: str, timeout_s: float = 10.0) -> T:
-    """Wait until ``condition()`` is true and give its value, while HQ programs run on the same loop."""
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
+    """Wait until ``condition()`` is true and give its value, while HQ programs run on the same loop.
+
+    A busy machine puts the timeout off.
+    """
+    patience = Patience(timeout_s)
+    while True:
+        over = patience.over
         if value := condition():
             return value
+        if over:
+            raise AssertionError(f"{what} not within {timeout_s} s")
         await asyncio.sleep(0.01)
-    raise AssertionError(f"{what} not within {timeout_s} s")
 
 
 class Gateway:
@@ -99,6 +104,7 @@ def gateway(bench: Bench, stack: contextlib.ExitStack, *parts: str, name: str = 
         f'[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
     )
     process = Gateway(file)
+    bench.count(process.process.pid)
     stack.callback(process.kill)
     return process
 

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from tests.e2e.conftest import Bench, until
-from tests.e2e.fragile import ended, fragile_robot
+from tests.e2e.fragile import DISTURBED, disturbed, ended, fragile_robot
 
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 PACE_S = 0.03
@@ -32,6 +32,10 @@ PACE_S = 0.03
 GAP_S = 0.01
 """Seconds between two packets: of two drives that the gateway is given within it, the newer wins."""
 DRIVES = {11, 12}
+LEASED = {*DRIVES, 10, 40}
+BEFORE_STOP = 4
+"""How many of the last commands before a stop it may overtake where the machine was late: those of a burst."""
+ASKED = {"no map": 52, "no pose": 54}
 HAS_LIDAR_SIM = {"1.2", "1.3", "1.4"}
 
 
@@ -46,10 +50,13 @@ class Judgement:
     excused: list[str] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
     overtaken: list[str] = field(default_factory=list)
-    """Drives that did not arrive, as far as the machine was late enough to have a newer one replace them."""
+    """Commands that did not arrive, as far as the machine was late enough: a newer drive replaced them, or a stop that
+    came after them went before them and ended their lease."""
     late_s: float = 0.0
     answered: Counter[str] = field(default_factory=Counter)
     alive: bool = False
+    disturbed: bool = False
+    """The robot lost a packet of the handshake because its own process was late: it understands nothing after that."""
     seconds: float = 0.0
 
     @property
@@ -62,12 +69,20 @@ class Judgement:
         return (
             f"{self.version} {'udp' if self.udp else 'tcp'}: {commands} commands in {self.seconds:.0f} s, "
             f"{len(self.violations)} violations, {len(self.excused)} excused (the robot's process was late), "
-            f"{len(self.missing)} missing, {len(self.overtaken)} drives overtaken, answered {dict(self.answered)}"
+            f"{len(self.missing)} missing, {len(self.overtaken)} overtaken, answered {dict(self.answered)}"
         )
 
 
 def judge(version: str, *, udp: bool, commands: int, seed: int = 1) -> Judgement:
-    """Run one gateway against one fragile robot."""
+    """Run one gateway against one fragile robot; run it again where the robot's own lateness spoilt the handshake."""
+    for _ in range(DISTURBED):
+        judgement = _judged(version, udp=udp, commands=commands, seed=seed)
+        if not judgement.disturbed:
+            break
+    return judgement
+
+
+def _judged(version: str, *, udp: bool, commands: int, seed: int) -> Judgement:
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
         robot = stack.enter_context(fragile_robot(f"tcpudp-{version}{'-udp' * udp}", seed=seed))
@@ -97,6 +112,8 @@ class _Run:
         self._rng = rng
         self._expected: list[tuple[int, str]] = []
         self._forbidden: list[tuple[int, str]] = []
+        self._before_stop: set[int] = set()
+        """The places of the last commands before each stop among those expected."""
         self._kinds = [
             *(self.drive,) * 6,
             *(self.turn, self.neutral, self.text, self.mode, self.lidar, self.scan, self.chat, self.stop),
@@ -123,11 +140,16 @@ class _Run:
         for text in report["violations"]:
             (judgement.excused if "(this process" in text else judgement.violations).append(text)
         came = [row[1:] for row in report["received"] + report["piled"]]
+        piled = Counter(packet_id for _, _, packet_id, _ in report["piled"])
+        judgement.disturbed = disturbed(report)
+        for what, packet_id in ASKED.items():  # what the robot itself lost it cannot answer
+            judgement.answered[what] = max(0, judgement.answered[what] - piled[packet_id])
         arrived = Counter((packet_id, body) for _, packet_id, body in came)
-        for packet_id, body in self._expected:
+        for place, (packet_id, body) in enumerate(self._expected):
+            replaced = packet_id in DRIVES or (packet_id in LEASED and place in self._before_stop)
             if arrived[packet_id, body]:
                 arrived[packet_id, body] -= 1
-            elif packet_id in DRIVES and (len(judgement.overtaken) + 1) * (PACE_S - GAP_S) < judgement.late_s:
+            elif replaced and (len(judgement.overtaken) + 1) * (PACE_S - GAP_S) < judgement.late_s:
                 judgement.overtaken.append(f"packet {packet_id} {body[:40]}")
             else:
                 judgement.missing.append(f"packet {packet_id} {body[:40]}")
@@ -156,6 +178,7 @@ class _Run:
 
     def stop(self, number: int) -> None:
         """Stop, as anybody may; whoever wants to go on acquires anew."""
+        self._before_stop |= set(range(len(self._expected))[-BEFORE_STOP:])
         self._put("stop")
         time.sleep(PACE_S)
         self._bench.fleet.hold("r1", "judge")

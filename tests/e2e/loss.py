@@ -30,8 +30,8 @@ import msgpack
 import zenoh
 
 from tests.e2e.conftest import free_port, until
-from tests.e2e.machine import contended_s
 from tests.e2e.robots import SETTINGS
+from tests.machine import contended_s
 
 LATE_S = 0.05
 """Seconds after the deadman in which the stop must be at the robot."""
@@ -182,7 +182,7 @@ class Watch:
             self._late.append(late)
             reader = threading.Thread(target=self._read, args=(process, late), daemon=True)
             reader.start()
-            stack.callback(reader.join, 5)
+            stack.callback(reader.join)  # the end of the process ends it, however late; only then the pipe is closed
             stack.callback(process.kill)
 
     @property
@@ -198,8 +198,9 @@ class Watch:
     def _read(process: subprocess.Popen[str], late: list[tuple[float, float]]) -> None:
         assert process.stdout is not None
         for line in process.stdout:
-            due, woke = map(float, line.split())
-            late.append((due, woke))
+            if line.endswith("\n"):  # a process that is killed may leave a part of one
+                due, woke = map(float, line.split())
+                late.append((due, woke))
 
 
 def be_watch(processor: int) -> None:

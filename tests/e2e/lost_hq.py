@@ -47,7 +47,7 @@ from tests.e2e.loss import (
     stop_since,
     thaw_driver,
 )
-from tests.e2e.machine import contended_s
+from tests.machine import Patience, contended_s
 
 KEPT_S = 1.6
 """The longest time for which a listener believes in a controller that is gone and is sent nothing: keep-alive's second,
@@ -104,8 +104,10 @@ class HqScene(Scene):
     def drive(self, rng: random.Random) -> int:
         until(lambda: query(self.session, "control").get("state") in ("free", "stopped"), what="the robot is free")
         self.start_driver(sys.executable, "-m", "tests.e2e.hq_programs", self._program, *map(str, self._address))
-        if not select.select([self.driving.stdout], [], [], WAIT_S)[0]:
-            raise AssertionError(f"{self._program} is not connected after {WAIT_S:g} s\n{self.end_of_log}")
+        patience = Patience(WAIT_S)
+        while not select.select([self.driving.stdout], [], [], 0.05)[0]:
+            if patience.over:
+                raise AssertionError(f"{self._program} is not connected after {WAIT_S:g} s\n{self.end_of_log}")
         for _ in range(PUSHES):  # a listener that has only just started may not know the robot yet
             first = self.push(0.5)
             if first is not None:

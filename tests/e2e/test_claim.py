@@ -35,6 +35,7 @@ def robot() -> Iterator[ScriptedRobot]:
 def joined(*endpoints: str, mode: str = "client") -> zenoh.Session:
     config = zenoh.Config()
     config.insert_json5("mode", f'"{mode}"')
+    config.insert_json5("listen/endpoints", "[]")  # a router listens at one port for all, if it is told nothing
     config.insert_json5("connect/endpoints", str(list(endpoints)).replace("'", '"'))
     config.insert_json5("scouting/multicast/enabled", "false")
     return zenoh.open(config)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.conftest import Bench, until
-from tests.e2e.fragile import ended, fragile_robot
+from tests.e2e.fragile import charges, ended, fragile_robot
 from tests.e2e.judge import VERSIONS, judge
 
 
@@ -71,8 +71,11 @@ def test_a_lidar_mode_that_a_robot_misread_arrives_all_the_same(bench: Bench, ve
             until(lambda on=on: fleet.last("r1/lidar").get("on") is on, what=f"lidar {on}")
             time.sleep(0.4)
         report = ended(robot)
-    assert len([1 for _, _, packet_id, _ in report["misread"] if packet_id == 50]) == 6
-    assert report["violations"] == []
+    misread = len([1 for _, _, packet_id, _ in report["misread"] if packet_id == 50])
+    assert misread >= 6, "of the first 14; who repeats because the answer was late sends more"
+    if misread + len([1 for _, _, packet_id, _ in report["received"] if packet_id == 50]) == 14:
+        assert misread == 6
+    assert charges(report["violations"]) == []
 
 
 @pytest.mark.parametrize("mode", ["manual", "autonomous"])
@@ -92,4 +95,4 @@ def test_a_robot_that_moves_when_it_is_stopped_is_at_rest(bench: Bench, version:
     assert not report["moving"]
     modes = [body for _, _, packet_id, body in report["received"] if packet_id == 10]
     assert ("01000000" in modes) is (mode == "autonomous")
-    assert report["violations"] == []
+    assert charges(report["violations"]) == []

@@ -24,7 +24,7 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.captures import Record, payloads
 from tests.e2e.conftest import Bench
-from tests.e2e.fragile import fragile_robot
+from tests.e2e.fragile import charges, fragile_robot
 from tests.e2e.hq_churn import CLIENTS, Churn, churn, crowd
 from tests.e2e.hq_judge import RANGES, judge, stage
 from tests.e2e.hq_scene import HOST, NEUTRAL, ByHand, device, gateway, listener, playing, ports, sessions, soon
@@ -115,7 +115,7 @@ async def test_a_process_without_a_robot_tells_its_programs_when_the_robot_comes
         hq.end()
     for one in (program, vehicle, controller):
         assert one.alive
-        assert not _charges(one.violations)
+        assert not charges(one.violations)
 
 
 async def test_what_a_listener_refuses_shows_on_control_of_the_robot_whose_process_is_another(bench, stack) -> None:
@@ -166,11 +166,6 @@ def _newer(bench: Bench, than: dict[str, Any]) -> dict[str, Any]:
     return pose if pose["at"] > than["at"] + 0.5 else {}
 
 
-def _charges(violations: list[str]) -> list[str]:
-    """Those that are not put down to the judge's own lateness."""
-    return [text for text in violations if "(this process" not in text]
-
-
 # Programs that behave badly
 
 
@@ -213,18 +208,20 @@ async def test_programs_that_behave_badly_cost_a_good_one_nothing_and_are_closed
     good = TcpHq(udp=False)
     async with playing(good.run(HOST, port)):
         await soon(lambda: good.position, "position")
-        began = time.monotonic()
+        began, withheld_s = time.monotonic(), bench.withheld_s
         bad = _Bad(port)
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             await bad.misbehave()
-        ended = time.monotonic()
+        ended, late_s = time.monotonic(), bench.withheld_s - withheld_s
         table = {entry["name"]: entry for entry in sessions(bench)}
     sent = sum(began < at < ended for at in feed.sent)
     got = sum(began < at < ended for at, _, kind, _ in good.received if kind == 55)
-    assert got >= 0.9 * sent, f"{got} of {sent} positions in {ended - began:.1f} s"
-    assert sent >= 0.5 * 50 * (ended - began), "the robot itself was late"
+    told = f"{got} of {sent} positions in {ended - began:.1f} s, in which the machine was late for {late_s:.1f} s"
+    assert got >= 0.9 * (sent - 50 * late_s), told
+    assert got > 0, told
+    assert sent >= 0.5 * 50 * (ended - began - late_s), "the robot itself was late"
     assert good.alive
-    assert not _charges(good.violations)
+    assert not charges(good.violations)
     reasons = {way: table[f"hq.{number}"]["reason"] for way, number in bad.numbers.items()}
     assert reasons == {
         "stops reading": "took nothing for 5 s",

@@ -14,6 +14,8 @@ from msgspec import UNSET
 
 from zbridge.errors import PayloadError
 from zbridge.fleet import messages
+
+# fmt: off
 from zbridge.fleet.messages import (
     Acquire,
     Authorization,
@@ -45,6 +47,8 @@ from zbridge.fleet.messages import (
     Switch,
     Text,
 )
+
+# fmt: on
 from zbridge.fleet.payload import decode, encode, pack, schema, unpack
 
 KINDS = [
@@ -55,32 +59,36 @@ KINDS = [
 
 LEASE, TOKEN, PROOF = b"\x01" * 8, b"\x02" * 32, b"\x03" * 16
 
+OFFLINE = Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2)
+OFFLINE_FIELDS = {"who": None, "command": "drive", "code": "not_ready", "reason": "offline", "count": 2, "by": None}
+SCANNER = {
+    "angle_min": 0.0,
+    "angle_max": 1.0,
+    "angle_increment": 0.5,
+    "time_increment_s": 0.1,
+    "range_min": 0.2,
+    "range_max": 9.0,
+    "points": 3,
+}
+ACQUIRE = {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"}
+HELD = {"ok": False, "expires_in_s": 1.5, "holder": "hq 1", "reason": "held by hq 1", "code": "held"}
+SESSION = {
+    "name": "ground.2",
+    "peer": "tcp://10.0.0.7:50000",
+    "role": "robot",
+    "state": "established",
+    "version": "1.1",
+    "counters": {"frames_in": 3},
+    "left_out": {"servertSLAMMapPart (56)": 7},
+}
+
 PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
     (Pose(x=1.0, y=2.0, heading=3.0, stamp_ns=5), {"stamp_ns": 5, "x": 1.0, "y": 2.0, "heading": 3.0}),
     (
         Motion(speed=0.5, gyro=(1.0, 2.0, 3.0)),
         {"speed": 0.5, "acceleration": None, "gyro": [1.0, 2.0, 3.0], "temperature": None},
     ),
-    (
-        Scanner(
-            angle_min=0.0,
-            angle_max=1.0,
-            angle_increment=0.5,
-            time_increment_s=0.1,
-            range_min=0.2,
-            range_max=9.0,
-            points=3,
-        ),
-        {
-            "angle_min": 0.0,
-            "angle_max": 1.0,
-            "angle_increment": 0.5,
-            "time_increment_s": 0.1,
-            "range_min": 0.2,
-            "range_max": 9.0,
-            "points": 3,
-        },
-    ),
+    (Scanner(**SCANNER), SCANNER),  # type: ignore[arg-type]
     (Reading(value=1.5), {"value": 1.5, "kind": None, "device": None, "fault": False}),
     (
         Devices(devices=(Device(name="left", number=1, kind="motor"),)),
@@ -102,18 +110,14 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
         },
     ),
     (
-        Control(
-            state="stopped", refusals=(Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2),)
-        ),
+        Control(state="stopped", refusals=(OFFLINE,)),
         {
             "state": "stopped",
             "holder": None,
             "lease": None,
             "priority": None,
             "expires_in_s": None,
-            "refusals": [
-                {"who": None, "command": "drive", "code": "not_ready", "reason": "offline", "count": 2, "by": None}
-            ],
+            "refusals": [OFFLINE_FIELDS],
         },
     ),
     (
@@ -128,10 +132,7 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
         SensorSetting(index=1, value=2.0, values=(1.0, 2.0)),
         {"enable": None, "index": 1, "value": 2.0, "values": [1.0, 2.0]},
     ),
-    (
-        Acquire(who="hq 1", priority=3, lease_s=2.0, deadman_s=0.5, alive="operator.1"),
-        {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"},
-    ),
+    (Acquire(**ACQUIRE), ACQUIRE),  # type: ignore[arg-type]
     (Authorization(lease=LEASE, seq=7, proof=PROOF), {"seq": 7, "lease": LEASE, "proof": PROOF}),
     (
         Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="hq 1"),
@@ -145,65 +146,12 @@ PAYLOADS: list[tuple[FleetMessage, dict[str, Any]]] = [
             "code": None,
         },
     ),
-    (
-        Lease(ok=False, expires_in_s=1.5, holder="hq 1", reason="held by hq 1", code="held"),
-        {
-            "ok": False,
-            "lease": None,
-            "token": None,
-            "expires_in_s": 1.5,
-            "holder": "hq 1",
-            "reason": "held by hq 1",
-            "code": "held",
-        },
-    ),
-    (
-        Refusals(refusals=(Refusal(who="hq.desk.3", command="drive", code="not_ready", reason="offline", count=2),)),
-        {
-            "refusals": [
-                {
-                    "who": "hq.desk.3",
-                    "command": "drive",
-                    "code": "not_ready",
-                    "reason": "offline",
-                    "count": 2,
-                    "by": None,
-                }
-            ]
-        },
-    ),
+    (Lease(**HELD), {**HELD, "lease": None, "token": None}),  # type: ignore[arg-type]
+    (Refusals(refusals=(OFFLINE,)), {"refusals": [OFFLINE_FIELDS]}),
     (Denied(code="closing", reason="gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
     (
-        Sessions(
-            sessions=(
-                SessionEntry(
-                    name="ground.2",
-                    peer="tcp://10.0.0.7:50000",
-                    role="robot",
-                    state="established",
-                    version="1.1",
-                    features=("udp",),
-                    counters={"frames_in": 3},
-                    left_out={"servertSLAMMapPart (56)": 7},
-                ),
-            )
-        ),
-        {
-            "sessions": [
-                {
-                    "name": "ground.2",
-                    "peer": "tcp://10.0.0.7:50000",
-                    "role": "robot",
-                    "state": "established",
-                    "reason": None,
-                    "version": "1.1",
-                    "features": ["udp"],
-                    "transport": "tcp",
-                    "counters": {"frames_in": 3},
-                    "left_out": {"servertSLAMMapPart (56)": 7},
-                }
-            ]
-        },
+        Sessions(sessions=(SessionEntry(**SESSION, features=("udp",)),)),  # type: ignore[arg-type]
+        {"sessions": [{**SESSION, "reason": None, "features": ["udp"], "transport": "tcp"}]},
     ),
 ]
 
@@ -226,16 +174,11 @@ EVERY = [*(message for message, _ in PAYLOADS), SCAN_SENT, MAP_SENT]
 
 
 @pytest.mark.parametrize("message", EVERY, ids=lambda message: type(message).__name__)
-def test_plain_msgpack_reads_every_message_and_finds_all_its_fields(message: FleetMessage) -> None:
+def test_plain_msgpack_finds_all_fields_and_what_it_packs_is_decoded_to_the_same_message(message: FleetMessage) -> None:
     read = msgpack.unpackb(encode(message))
     fields = {name for name in message.__struct_fields__ if getattr(message, name) is not UNSET}
     assert set(read) == fields
     assert set(message.__struct_fields__) - fields <= {"stamp_ns", "seq", "device_ms"}
-
-
-@pytest.mark.parametrize("message", EVERY, ids=lambda message: type(message).__name__)
-def test_what_plain_msgpack_packs_is_decoded_to_the_message_it_was_read_from(message: FleetMessage) -> None:
-    read = msgpack.unpackb(encode(message))
     again = decode(type(message), msgpack.packb(read))
     assert encode(again) == encode(message)
     assert type(again) is type(message)
@@ -303,92 +246,63 @@ def test_cells_travel_row_by_row_even_of_a_transposed_array() -> None:
     assert not again.cells.flags.writeable
 
 
-def test_an_empty_map_travels() -> None:
+def test_an_empty_map_and_an_empty_scan_travel() -> None:
     empty = Map(rows=0, columns=0, cell=0.1, origin=(0.0, 0.0), cells=np.zeros((0, 0), np.uint8))
     assert decode(Map, encode(empty)).cells.shape == (0, 0)
-
-
-def test_an_empty_scan_travels() -> None:
+    assert len(decode(Scan, msgpack.packb({**SCAN, "ranges": b""})).ranges) == 0
     scan = Scan(angle_min=0.0, angle_increment=0.1, range_min=0.2, range_max=5.0, ranges=np.zeros(0, np.float32))
-    assert len(decode(Scan, encode(scan)).ranges) == 0
-
-
-def test_a_map_of_no_rows_and_absurdly_many_columns_is_a_payload_error() -> None:
-    with pytest.raises(PayloadError):
-        decode(Map, msgpack.packb({**MAP, "rows": 0, "columns": 2**64 - 1, "cells": b""}))
+    assert msgpack.unpackb(encode(scan))["ranges"] == b""
 
 
 MAP = {"rows": 2, "columns": 3, "cell": 0.1, "origin": [0.0, 0.0], "cells": bytes(6)}
 SCAN = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.2, "range_max": 5.0, "ranges": bytes(8)}
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"rows": 3},
-        {"rows": -2, "columns": -3},
-        {"rows": None},
-        {"rows": "2"},
-        {"rows": 2.0},
-        {"rows": 0},
-        {"cells": "text"},
-        {"cells": [0] * 6},
-        {"cells": None},
-        {"cells": bytes(5)},
-        {"cell": "wide"},
-        {"origin": [0.0]},
-    ],
-)
-def test_a_map_whose_fields_do_not_go_together_is_a_payload_error(wrong: dict[str, Any]) -> None:
-    with pytest.raises(PayloadError, match="Map"):
-        decode(Map, msgpack.packb({**MAP, **wrong}))
+WRONG: list[tuple[type[FleetMessage], dict[str, Any]]] = [
+    *(
+        (Map, {"rows": rows, "columns": columns})
+        for rows, columns in [(3, 3), (-2, -3), (None, 3), ("2", 3), (2.0, 3), (0, 3)]
+    ),
+    (Map, {"rows": 0, "columns": 2**64 - 1, "cells": b""}),
+    *((Map, {"cells": cells}) for cells in ("text", [0] * 6, None, bytes(5))),
+    (Map, {"cell": "wide"}),
+    (Map, {"origin": [0.0]}),
+    *((Scan, {"ranges": ranges}) for ranges in (bytes(7), [1.0], None)),
+    (Scan, {"angle_min": None}),
+]
 
 
-@pytest.mark.parametrize("wrong", [{"ranges": bytes(7)}, {"ranges": [1.0]}, {"ranges": None}, {"angle_min": None}])
-def test_a_scan_of_wrong_fields_is_a_payload_error(wrong: dict[str, Any]) -> None:
-    with pytest.raises(PayloadError, match="Scan"):
-        decode(Scan, msgpack.packb({**SCAN, **wrong}))
+@pytest.mark.parametrize(("kind", "wrong"), WRONG)
+def test_an_array_and_fields_that_do_not_go_with_it_are_a_payload_error(kind: type[FleetMessage], wrong) -> None:
+    with pytest.raises(PayloadError, match=kind.__name__):
+        decode(kind, msgpack.packb({**(MAP if kind is Map else SCAN), **wrong}))
 
 
-def test_a_missing_array_is_a_payload_error() -> None:
+def test_of_missing_fields_one_is_named_an_array_too() -> None:
     without = {name: value for name, value in SCAN.items() if name != "ranges"}
     with pytest.raises(PayloadError, match=r"Scan: .*`ranges`"):
         decode(Scan, msgpack.packb(without))
-
-
-def test_of_several_missing_fields_one_is_named() -> None:
     with pytest.raises(PayloadError, match=r"Scan: .*required field `angle_min`"):
         decode(Scan, b"")
 
 
-def test_missing_optional_fields_take_their_defaults() -> None:
+def test_missing_optional_fields_take_their_defaults_and_unknown_ones_are_ignored() -> None:
     assert decode(Drive, b"") == Drive()
     assert decode(Drive, msgpack.packb({"forward": 1})) == Drive(forward=1.0)
-
-
-def test_whoever_acquires_need_not_say_more_than_its_name() -> None:
     assert decode(Acquire, msgpack.packb({"who": "hq"})) == Acquire("hq", 0, None, None, None)
+    assert decode(Switch, msgpack.packb({"on": True, "colour": "red"})) == Switch(on=True)
 
 
 @pytest.mark.parametrize(
     ("message", "moving"),
     [
-        (Drive(), False),
-        (Drive(light=True), False),
-        (Drive(forward=-0.0), False),
-        (Drive(forward=0.01), True),
-        (Drive(left=-0.01), True),
-        (Drive(turn=0.01), True),
-        (Motor(value=0.0), False),
-        (Motor(value=-0.1), True),
+        (Drive(), False), (Drive(light=True), False), (Drive(forward=-0.0), False),
+        (Drive(forward=0.01), True), (Drive(left=-0.01), True), (Drive(turn=0.01), True),
+        (Motor(value=0.0), False), (Motor(value=-0.1), True),
     ],
-)
+)  # fmt: skip
 def test_motion_is_told_from_neutral(message: Drive | Motor, moving: bool) -> None:
     assert message.moving is moving
-
-
-def test_unknown_fields_are_ignored() -> None:
-    assert decode(Switch, msgpack.packb({"on": True, "colour": "red"})) == Switch(on=True)
 
 
 @pytest.mark.parametrize(
@@ -426,43 +340,19 @@ def test_a_wrong_field_is_a_payload_error_that_names_it(kind, fields, named) -> 
         decode(kind, msgpack.packb(fields))
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"\xc1",
-        b"\x81",
-        b"\x80\x80",
-        b"\x01",
-        b"\x90",
-        b"\xc0",
-        b"\xa1a",
-        b"\x81\x01\x02",
-        b"\x81\xa1\xff\x01",
-        b"\x91" * 100_000,
-        b"\xdf\xff\xff\xff\xff",
-        b"hello",
-    ],
-)
+NO_MAPS = [
+    *(b"\xc1", b"\x81", b"\x80\x80", b"\x01", b"\x90", b"\xc0", b"\xa1a", b"\x81\x01\x02", b"\xdf\xff\xff\xff\xff"),
+    b"hello",
+]
+
+
+@pytest.mark.parametrize("payload", [*NO_MAPS, b"\x81\xa1\xff\x01", b"\x91" * 100_000])
 def test_what_is_no_map_is_a_payload_error(payload: bytes) -> None:
     with pytest.raises(PayloadError):
         unpack(payload)
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"\xc1",
-        b"\x81",
-        b"\x80\x80",
-        b"\x01",
-        b"\x90",
-        b"\xc0",
-        b"\xa1a",
-        b"\x81\x01\x02",
-        b"\xdf\xff\xff\xff\xff",
-        b"hello",
-    ],
-)
+@pytest.mark.parametrize("payload", NO_MAPS)
 @pytest.mark.parametrize("kind", [Drive, Stop, Scan, Map])
 def test_what_is_no_map_is_no_message_and_the_error_names_the_message(kind: type[FleetMessage], payload: bytes) -> None:
     with pytest.raises(PayloadError, match=f"^{kind.__name__}: ."):
@@ -475,12 +365,9 @@ def test_a_payload_nested_too_deeply_is_a_payload_error(kind: type[FleetMessage]
         decode(kind, b"\x81\xa1x" + b"\x91" * 100_000 + b"\xc0")
 
 
-def test_an_empty_payload_is_an_empty_map() -> None:
+def test_plain_maps_are_packed_and_unpacked_and_an_empty_payload_is_an_empty_one() -> None:
     assert unpack(b"") == {}
     assert decode(Stop, b"") == Stop()
-
-
-def test_a_plain_map_is_packed_and_unpacked() -> None:
     assert unpack(pack({"zid": "1", "held": True})) == {"zid": "1", "held": True}
 
 

@@ -39,7 +39,9 @@ KEPT: list[tuple[Topic, str, FleetMessage]] = [
 ]
 
 
-def established() -> RobotView:
+@pytest.fixture
+def view() -> RobotView:
+    """A view of a robot that is established."""
     view = RobotView()
     view.alive = True
     view.note(topics.STATUS, ESTABLISHED)
@@ -54,16 +56,14 @@ def test_a_new_view_knows_nothing() -> None:
 
 
 @pytest.mark.parametrize(("topic", "name", "message"), KEPT, ids=[name for _, name, _ in KEPT])
-def test_the_last_value_is_kept(topic: Topic, name: str, message: FleetMessage) -> None:
-    view = established()
+def test_the_last_value_is_kept(view: RobotView, topic: Topic, name: str, message: FleetMessage) -> None:
     others = {other: getattr(view, other) for _, other, _ in KEPT if other != name}
     view.note(topic, message)
     assert getattr(view, name) is message
     assert {other: getattr(view, other) for other in others} == others
 
 
-def test_what_is_no_state_of_the_robot_is_not_kept() -> None:
-    view = established()
+def test_what_is_no_state_of_the_robot_is_not_kept(view: RobotView) -> None:
     before = {name: value for name, value in vars(view).items() if name != "readings"}
     view.note(topics.TEXT, Text(text="hi"))
     view.note(topics.CMD_DRIVE, Drive(forward=1.0))
@@ -71,21 +71,15 @@ def test_what_is_no_state_of_the_robot_is_not_kept() -> None:
     assert {name: value for name, value in vars(view).items() if name != "readings"} == before
 
 
-def test_readings_are_kept_by_the_names_of_their_sensors() -> None:
-    view = established()
+def test_readings_are_kept_by_the_names_of_their_sensors(view: RobotView) -> None:
     for name in ("front", "front left", "", "ü/*"):
         view.note(topics.SENSOR(name), Reading(value=1.0))
     view.note(topics.SENSOR("front"), Reading(value=2.0))
-    assert {name: reading.value for name, reading in view.readings.items()} == {
-        "front": 2.0,
-        "front left": 1.0,
-        "": 1.0,
-        "ü/*": 1.0,
-    }
+    values = {name: reading.value for name, reading in view.readings.items()}
+    assert values == {"front": 2.0, "front left": 1.0, "": 1.0, "ü/*": 1.0}
 
 
-def test_readings_of_so_many_sensors_are_kept_and_no_more() -> None:
-    view = established()
+def test_readings_of_so_many_sensors_are_kept_and_no_more(view: RobotView) -> None:
     for number in range(READINGS + 10):
         view.note(topics.SENSOR(f"s{number}"), Reading(value=1.0))
     view.note(topics.SENSOR("s0"), Reading(value=2.0))
@@ -113,8 +107,7 @@ def test_it_says_why_the_robot_cannot_be_used(status: Status, missing: str | Non
     assert view.missing == "no gateway serves the robot"
 
 
-def test_a_robot_that_is_away_for_a_moment_keeps_what_was_agreed() -> None:
-    view = established()
+def test_a_robot_that_is_away_for_a_moment_keeps_what_was_agreed(view: RobotView) -> None:
     view.note(topics.POSE, POSE)
     view.note(topics.STATUS, Status(state="offline", protocol="toy"))
     assert (view.protocol, view.version, view.features) == ("toy", "1.3", ("udp", "lidar"))
@@ -124,8 +117,7 @@ def test_a_robot_that_is_away_for_a_moment_keeps_what_was_agreed() -> None:
     assert view.pose is POSE
 
 
-def test_a_robot_of_another_protocol_is_another_robot() -> None:
-    view = established()
+def test_a_robot_of_another_protocol_is_another_robot(view: RobotView) -> None:
     for topic, _, message in KEPT:
         view.note(topic, message)
     view.note(topics.SENSOR("front"), Reading(value=1.0))
@@ -148,16 +140,14 @@ def test_what_came_before_the_first_status_belongs_to_the_robot() -> None:
     assert view.pose is POSE
 
 
-def test_a_view_prints_the_robots_protocol_and_what_is_missing() -> None:
-    view = established()
+def test_a_view_prints_the_robots_protocol_and_what_is_missing(view: RobotView) -> None:
     assert repr(view) == "<RobotView toy established>"
     view.alive = False
     assert repr(view) == "<RobotView toy no gateway serves the robot>"
 
 
 @pytest.mark.parametrize("state", ["offline", "connecting", "handshaking", "closing"])
-def test_readings_of_a_connection_that_is_gone_make_room_for_those_of_the_next(state: str) -> None:
-    view = established()
+def test_readings_of_a_connection_that_is_gone_make_room_for_those_of_the_next(view: RobotView, state: str) -> None:
     for number in range(READINGS + 10):
         view.note(topics.SENSOR(f"old {number}"), Reading(1.0))
     view.note(topics.STATUS, Status(state=state, protocol="toy"))  # type: ignore[arg-type]

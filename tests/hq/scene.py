@@ -13,25 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from tests.hq.test_operator import Gateway
+from tests.hq.gateway import KEYS, Gateway
 from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Drive,
-    FleetMessage,
-    Map,
-    Pose,
-    Query,
-    Scan,
-    Status,
-    Stop,
-    Switch,
-    Text,
-)
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.messages import Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
+from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
@@ -43,7 +32,6 @@ from zbridge.protocol.session_table import ClientIds, SessionTable
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import Receiver
 
-KEYS = KeySpace("fleet", "r1")
 STATUS = Status(state="established", protocol="toy")
 MAP = Map(rows=2, columns=3, cell=0.1, origin=(0.0, 0.0), cells=np.zeros((2, 3), np.uint8))
 
@@ -213,9 +201,10 @@ class Program:
 class Scene:
     """A listener that runs, and the robot's gateway beside it."""
 
-    side_class = ToySide
-
-    def __init__(self, *, allow: tuple[str, ...] = (), robot: bool = True, **settings: Any) -> None:
+    def __init__(
+        self, *, allow: tuple[str, ...] = (), robot: bool = True, side: type[ToySide] = ToySide, **settings: Any
+    ) -> None:
+        self.side_class = side
         self.loop = asyncio.get_running_loop()
         self.skipped_s = 0.0
         self.bus = FakeBus("hq")
@@ -275,6 +264,13 @@ class Scene:
     def connect(self, host: str = "10.0.0.1") -> Program:
         self.hosts += 1
         return Program(self.accept(), f"tcp://{host}:{5000 + self.hosts}")
+
+    async def driver(self) -> Program:
+        """Connect a program that drives."""
+        program = self.connect().greeted()
+        program.say(b"stand", b"go")
+        await soon()
+        return program
 
     def count(self, name: str) -> int:
         return self.metrics.total(name)

@@ -8,16 +8,9 @@ import logging
 import numpy as np
 import pytest
 
-from tests.hq.scene import COMMANDS, STATUS, Scene, ToySession, ToySide, serving, soon
+from tests.hq.scene import COMMANDS, STATUS, Scene, ToySession, ToySide, soon
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Drive,
-    FleetMessage,
-    Pose,
-    Scan,
-    Status,
-    Text,
-)
+from zbridge.fleet.messages import Drive, FleetMessage, Pose, Scan, Status, Text
 from zbridge.fleet.topics import Topic
 from zbridge.hq.client import TELL_S
 from zbridge.protocol.plugin import Send, Telemetry
@@ -59,9 +52,7 @@ async def test_a_client_that_comes_while_the_robot_is_away_is_told_so(scene: Sce
 
 
 async def test_a_driver_whose_gateway_went_must_let_go_first(scene: Scene) -> None:
-    program = scene.connect().greeted()
-    program.say(b"stand", b"go")
-    await soon()
+    program = await scene.driver()
     scene.go()
     assert b"! not driving: the robot's gateway is gone" in program.heard()
     scene.come()
@@ -106,23 +97,21 @@ class ToldSide(ToySide):
         return lambda session, now: session.send(b"there" if there else b"lost")
 
 
-async def test_every_client_is_shown_once_that_the_robot_is_lost_and_that_it_is_there_again() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(Scene, "side_class", ToldSide)
-        async with serving() as scene:
-            programs = [scene.connect().greeted() for _ in range(3)]
-            silent = scene.connect()
-            silent.heard()
-            scene.say(topics.STATUS, Status(state="connecting", protocol="toy"))
-            scene.say(topics.STATUS, Status(state="handshaking", protocol="toy"))
-            scene.go()
-            assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
-            scene.come()
-            scene.say(topics.STATUS, STATUS)
-            assert [program.heard().count(b"there") for program in programs] == [1, 1, 1]
-            scene.go()
-            assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
-            assert silent.heard() == [], "nothing before the handshake"
+@pytest.mark.scene(side=ToldSide)
+async def test_every_client_is_shown_once_that_the_robot_is_lost_and_that_it_is_there_again(scene: Scene) -> None:
+    programs = [scene.connect().greeted() for _ in range(3)]
+    silent = scene.connect()
+    silent.heard()
+    scene.say(topics.STATUS, Status(state="connecting", protocol="toy"))
+    scene.say(topics.STATUS, Status(state="handshaking", protocol="toy"))
+    scene.go()
+    assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
+    scene.come()
+    scene.say(topics.STATUS, STATUS)
+    assert [program.heard().count(b"there") for program in programs] == [1, 1, 1]
+    scene.go()
+    assert [program.heard().count(b"lost") for program in programs] == [1, 1, 1]
+    assert silent.heard() == [], "nothing before the handshake"
 
 
 # A protocol that fails at what it does not know
@@ -144,28 +133,30 @@ class LostSide(ToySide):
         raise KeyError(there)
 
 
-async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(caplog) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(Scene, "side_class", LostSide)
-        async with serving() as scene:
-            scene.say(topics.STATUS, Status(state="established", protocol="unheard of"))
-            program = scene.connect()
-            program.say(b"hi")
-            assert program.heard() == [b"who are you"], "and no welcome"
-            for x in range(50):
-                scene.say(topics.POSE, Pose(x=float(x), y=0.0, heading=0.0))
-                program.say(b"what is this")
-            scene.say(topics.TEXT, Text("hello"))
-            assert program.heard() == [b"hello"]
-            program.say(b"stand", b"go")
-            await soon()
-            assert [message for _, message in scene.gateway.taken()] == [Drive(forward=0.5)]
-            scene.go()
-            scene.come()
-            assert scene.reason("toy.2") is None
-            assert scene.count("hq_left_out") >= 1 + 50 + 50 + 2
-            assert scene.count("hq_malformed") == 50
-    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+@pytest.mark.scene(side=LostSide)
+async def test_a_listener_goes_on_without_what_its_protocol_fails_at_and_says_so_once(scene: Scene, caplog) -> None:
+    scene.say(topics.STATUS, Status(state="established", protocol="unheard of"))
+    program = scene.connect()
+    program.say(b"hi")
+    assert program.heard() == [b"who are you"], "and no welcome"
+    for x in range(50):
+        scene.say(topics.POSE, Pose(x=float(x), y=0.0, heading=0.0))
+        program.say(b"what is this")
+    scene.say(topics.TEXT, Text("hello"))
+    assert program.heard() == [b"hello"]
+    program.say(b"stand", b"go")
+    await soon()
+    assert [message for _, message in scene.gateway.taken()] == [Drive(forward=0.5)]
+    scene.go()
+    scene.come()
+    assert scene.reason("toy.2") is None
+    assert scene.count("hq_left_out") >= 1 + 50 + 50 + 2
+    assert scene.count("hq_malformed") == 50
+    errors = [
+        record.getMessage()
+        for record in [*caplog.get_records("setup"), *caplog.records]
+        if record.levelno == logging.ERROR
+    ]
     assert sorted(errors) == [
         "toy: a client not sent: KeyError('unheard of'); going on without",
         "toy: a message of a client not understood: KeyError(b'what is this'); going on without",

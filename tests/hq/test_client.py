@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import math
-from collections.abc import AsyncIterator
 
 import pytest
 
@@ -13,17 +11,7 @@ from tests.hq.scene import COMMANDS, KEYS, Program, Scene, ToySession, ToySide, 
 from zbridge.bus.interface import IncomingQuery
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Acquire,
-    Drive,
-    Pose,
-    Query,
-    Refusal,
-    Refusals,
-    Status,
-    Switch,
-    Text,
-)
+from zbridge.fleet.messages import Acquire, Drive, Pose, Query, Refusal, Refusals, Status, Switch, Text
 from zbridge.hq.client import STALL_S, SWEEP_S, TELL_S
 from zbridge.protocol.outbox import LIMIT
 from zbridge.protocol.plugin import Telemetry
@@ -92,24 +80,19 @@ async def test_a_client_that_takes_nothing_is_cut_and_costs_the_others_nothing(s
     assert sorted(scene.listener.clients) == [3]
 
 
-async def test_a_client_that_stalls_now_and_then_stays(scene: Scene) -> None:
+@pytest.mark.parametrize(
+    ("stalls_s", "takes_s", "times", "cut"), [(STALL_S - 2 * SWEEP_S, STALL_S, 20, False), (0.95, 0.05, 12, True)]
+)
+async def test_a_client_may_stall_now_and_then_but_not_take_a_byte_now_and_then(
+    scene: Scene, stalls_s: float, takes_s: float, times: int, cut: bool
+) -> None:
     program = scene.connect().greeted()
-    for _ in range(20):
+    for _ in range(times):
         program.take_nothing()
-        await asyncio.sleep(STALL_S - 2 * SWEEP_S)
+        await asyncio.sleep(stalls_s)
         program.take_all()
-        await asyncio.sleep(STALL_S)
-    assert not program.link.closed
-
-
-async def test_a_client_that_takes_a_byte_now_and_then_is_cut(scene: Scene) -> None:
-    program = scene.connect().greeted()
-    for _ in range(12):
-        program.take_nothing()
-        await asyncio.sleep(0.95)
-        program.take_all()
-        await asyncio.sleep(0.05)
-    assert program.link.closed
+        await asyncio.sleep(takes_s)
+    assert program.link.closed is cut
 
 
 @pytest.mark.scene(idle_s=5.0)
@@ -188,17 +171,14 @@ async def test_of_a_stream_a_slow_client_gets_the_newest(scene: Scene) -> None:
     assert scene.count("hq_dropped") == 0
 
 
-async def test_what_cannot_be_shown_is_counted_and_hurts_nobody(scene: Scene) -> None:
+async def test_what_cannot_be_shown_is_counted_and_nothing_is_encoded_for_nobody(scene: Scene) -> None:
+    scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
+    assert scene.side.encoded == 0
     program = scene.connect().greeted()
     scene.say(topics.LIDAR, Switch(on=True))
     assert scene.count("hq_left_out") == 1
     scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
     assert program.heard() == [b"at 1"]
-
-
-async def test_nothing_is_encoded_for_nobody(scene: Scene) -> None:
-    scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
-    assert scene.side.encoded == 0
 
 
 # What is refused
@@ -274,9 +254,7 @@ async def test_a_listener_that_ends_does_not_wait_to_tell() -> None:
 
 
 async def test_a_client_drives_and_its_name_is_shown(scene: Scene) -> None:
-    program = scene.connect().greeted()
-    program.say(b"stand", b"go")
-    await soon()
+    await scene.driver()
     assert scene.gateway.taken() == [("drive", Drive(forward=0.5))]
     assert scene.gateway.report().holder == "hq.toy.2"
     assert KEYS.alive("hq.toy.2") in scene.bus._shared.tokens
@@ -336,33 +314,22 @@ async def test_a_refused_client_is_told_why_and_not_all_the_time(scene: Scene) -
     assert program.heard() == [b"! connected: release the stick first"]
 
 
-async def test_one_drives_and_another_is_told_who(scene: Scene) -> None:
-    first, second = scene.connect().greeted(), scene.connect().greeted()
-    first.say(b"stand", b"go")
-    await soon()
-    second.say(b"stand", b"go")
-    await soon()
+async def test_one_drives_another_is_told_who_and_only_the_first_is_told_of_the_loss(
+    scene: Scene,
+) -> None:
+    first, second, idle = await scene.driver(), await scene.driver(), scene.connect().greeted()
     assert second.heard() == [b"! not driving: held by hq.toy.2 (priority 0)"]
-    assert first.heard() == []
-
-
-async def test_a_client_that_lost_the_robot_is_told_and_the_idle_ones_are_not(scene: Scene) -> None:
-    first, second = scene.connect().greeted(), scene.connect().greeted()
-    first.say(b"stand", b"go")
-    await soon()
     scene.gateway.authority.takeover(Acquire(who="operator"), scene.now)
     scene.report()
     await soon()
     assert first.heard() == [b"! not driving: the lease has ended (taken over by operator)"]
-    assert second.heard() == []
+    assert (second.heard(), idle.heard()) == ([], [])
 
 
 @pytest.mark.parametrize("end", ["leaves", "floods", "rubbish", "stalls"])
 @pytest.mark.scene(rate_hz=100.0)
 async def test_a_driver_that_is_lost_in_any_way_gives_the_robot_back(scene: Scene, end: str) -> None:
-    program = scene.connect().greeted()
-    program.say(b"stand", b"go")
-    await soon()
+    program = await scene.driver()
     assert scene.gateway.report().holder == "hq.toy.2"
     if end == "leaves":
         program.leave()
@@ -383,9 +350,7 @@ async def test_a_driver_that_is_lost_in_any_way_gives_the_robot_back(scene: Scen
 
 @pytest.mark.scene(idle_s=1.0)
 async def test_a_driver_that_is_closed_gives_the_robot_back_before_its_last_words_are_out(scene: Scene) -> None:
-    program = scene.connect().greeted()
-    program.say(b"stand", b"go")
-    await soon()
+    program = await scene.driver()
     program.take_nothing()
     scene.say(topics.TEXT, Text(text="last words"))
     for _ in range(40):
@@ -408,9 +373,7 @@ async def test_motion_that_is_not_repeated_ends_with_the_deadman_and_the_lease_f
 
 
 async def test_what_a_robot_refuses_is_told_to_whom_it_was_refused(scene: Scene) -> None:
-    first, second = scene.connect().greeted(), scene.connect().greeted()
-    first.say(b"stand", b"go")
-    await soon()
+    first, second = await scene.driver(), scene.connect().greeted()
     scene.gateway.authority.hold_back("busy: map")
     first.say(b"go")
     scene.report()
@@ -451,14 +414,11 @@ class HalfSide(ToySide):
         return ((topics.CMD_DRIVE, Drive(forward=0.25)),)
 
 
-@contextlib.asynccontextmanager
-async def halves(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[tuple[Scene, Program]]:
-    """A client of such a protocol that may drive."""
-    monkeypatch.setattr(Scene, "side_class", HalfSide)
-    async with serving() as scene:
-        program = scene.connect().greeted()
-        program.say(b"stand")
-        yield scene, program
+def neutral(scene: Scene) -> Program:
+    """A client that may drive."""
+    program = scene.connect().greeted()
+    program.say(b"stand")
+    return program
 
 
 def driven(scene: Scene) -> list[float]:
@@ -466,48 +426,48 @@ def driven(scene: Scene) -> list[float]:
     return [message.forward for _, message in scene.gateway.taken() if isinstance(message, Drive)]
 
 
-async def test_what_waits_for_more_is_carried_out_when_it_has_waited_long_enough() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        async with halves(monkeypatch) as (scene, program):
-            program.say(b"half")
-            await asyncio.sleep(0.029)
-            assert driven(scene) == []
-            await asyncio.sleep(0.0015)
-            assert driven(scene) == [0.25]
-            assert scene.count("hq_commands") == 2
-            await asyncio.sleep(1.0)
-            assert driven(scene) == []
+@pytest.mark.scene(side=HalfSide)
+async def test_what_waits_for_more_is_carried_out_when_it_has_waited_long_enough(scene: Scene) -> None:
+    program = neutral(scene)
+    program.say(b"half")
+    await asyncio.sleep(0.029)
+    assert driven(scene) == []
+    await asyncio.sleep(0.0015)
+    assert driven(scene) == [0.25]
+    assert scene.count("hq_commands") == 2
+    await asyncio.sleep(1.0)
+    assert driven(scene) == []
 
 
-async def test_what_comes_in_time_is_carried_out_with_it_at_once_and_the_next_has_its_own_time() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        async with halves(monkeypatch) as (scene, program):
-            program.say(b"half")
-            await asyncio.sleep(0.02)
-            program.say(b"half", b"half")
-            await asyncio.sleep(0.001)
-            assert driven(scene) == [0.5]
-            await asyncio.sleep(0.02)
-            assert driven(scene) == [], "the second has waited 21 ms"
-            await asyncio.sleep(0.0095)
-            assert driven(scene) == [0.25]
+@pytest.mark.scene(side=HalfSide)
+async def test_what_comes_in_time_is_carried_out_with_it_at_once_and_the_next_has_its_own_time(scene: Scene) -> None:
+    program = neutral(scene)
+    program.say(b"half")
+    await asyncio.sleep(0.02)
+    program.say(b"half", b"half")
+    await asyncio.sleep(0.001)
+    assert driven(scene) == [0.5]
+    await asyncio.sleep(0.02)
+    assert driven(scene) == [], "the second has waited 21 ms"
+    await asyncio.sleep(0.0095)
+    assert driven(scene) == [0.25]
 
 
-async def test_what_waits_of_a_client_that_is_gone_is_nothing() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        async with halves(monkeypatch) as (scene, program):
-            program.say(b"half")
-            program.leave()
-            await asyncio.sleep(1.0)
-            assert driven(scene) == []
-            assert scene.count("hq_commands") == 1
+@pytest.mark.scene(side=HalfSide)
+async def test_what_waits_of_a_client_that_is_gone_is_nothing(scene: Scene) -> None:
+    program = neutral(scene)
+    program.say(b"half")
+    program.leave()
+    await asyncio.sleep(1.0)
+    assert driven(scene) == []
+    assert scene.count("hq_commands") == 1
 
 
-async def test_what_waited_while_the_process_stood_still_moves_nothing() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        async with halves(monkeypatch) as (scene, program):
-            program.say(b"half")
-            scene.skipped_s += 5.0
-            await asyncio.sleep(0.05)
-            assert driven(scene) == []
-            assert program.heard() == [b"! the gateway was frozen: release the stick first"]
+@pytest.mark.scene(side=HalfSide)
+async def test_what_waited_while_the_process_stood_still_moves_nothing(scene: Scene) -> None:
+    program = neutral(scene)
+    program.say(b"half")
+    scene.skipped_s += 5.0
+    await asyncio.sleep(0.05)
+    assert driven(scene) == []
+    assert program.heard() == [b"! the gateway was frozen: release the stick first"]

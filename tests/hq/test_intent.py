@@ -1,6 +1,7 @@
 """What old HQ programs mean: neutral first, standing control modes, deadman, giving back. Times are made up."""
 
 import math
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given, settings
@@ -22,11 +23,21 @@ def connected(*, modes: bool = False) -> Intent:
     return intent
 
 
+def choosing() -> Intent:
+    """A program that has just connected and must choose a control mode."""
+    return connected(modes=True)
+
+
 def ready(*, modes: bool = False) -> Intent:
     """A program that has said neutral."""
     intent = connected(modes=modes)
     assert intent.neutral(0.0) is Action.NOTHING
     return intent
+
+
+def ready_to_choose() -> Intent:
+    """A program that has said neutral and must choose a control mode."""
+    return ready(modes=True)
 
 
 def driving(*, lease_s: float = LEASE_S) -> Intent:
@@ -37,6 +48,11 @@ def driving(*, lease_s: float = LEASE_S) -> Intent:
     return intent
 
 
+def driving_for_2_s() -> Intent:
+    """The same with a lease of 2 s."""
+    return driving(lease_s=2.0)
+
+
 def on_its_own() -> Intent:
     """A program whose robot drives itself since second 0."""
     intent = ready(modes=True)
@@ -45,143 +61,213 @@ def on_its_own() -> Intent:
     return intent
 
 
-# A robot that drives itself
+SAID: dict[str, Callable[[Intent, float], Action]] = {
+    "motion": lambda intent, now: intent.motion(now),
+    "neutral": lambda intent, now: intent.neutral(now),
+    "neutral of a part": lambda intent, now: intent.neutral(now, whole=False),
+    **{f"mode {mode}": lambda intent, now, m=mode: intent.choose(m, now) for mode in ("none", "manual", "autonomous")},
+}
+HAPPENED: dict[str, Callable[[Intent, str], object]] = {
+    "granted": lambda intent, seconds: intent.granted(float(seconds)),
+    "lost": lambda intent, reason: intent.lost(reason),
+    "refused": lambda intent, reason: intent.refused(reason),
+    "released": lambda intent, _: intent.released(),
+    "expire": lambda intent, now: intent.expire(float(now)),
+    "heard": lambda intent, now: intent.heard(float(now)),
+}
+SHOWN: dict[str, Callable[[Intent, str], object]] = {
+    "held": lambda intent, _: intent.held,
+    "asking": lambda intent, _: intent.asking,
+    "may steer": lambda intent, _: intent.may_steer,
+    "mode is": lambda intent, mode: intent.mode == mode,
+    "held back": lambda intent, reason: intent.held_back == reason,
+    "free to go": lambda intent, _: intent.held_back is None,
+    "wants release": lambda intent, now: intent.wants_release(float(now)),
+}
+
+
+def play(intent: Intent, script: str) -> None:
+    """Play the steps of a script, one after the other, separated by semicolons:
+
+    ``0.5 motion -> send``: at second 0.5 the program says so, and that is to be done; ``0.5 motion ! deadman``: that is
+    refused, and the reason begins so; ``granted 3.0``: that happened; ``is held``, ``not asking``: so things stand.
+    """
+    for step in script.split("; "):
+        first, _, rest = step.partition(" ")
+        if first in HAPPENED:
+            HAPPENED[first](intent, rest)
+        elif first in ("is", "not"):
+            what = next(name for name in SHOWN if rest.startswith(name))
+            assert bool(SHOWN[what](intent, rest.removeprefix(what).strip())) is (first == "is"), step
+        elif " -> " in rest:
+            said, action = rest.split(" -> ")
+            assert SAID[said](intent, float(first)).name.lower() == action, step
+        else:
+            said, reason = rest.split(" ! ")
+            with pytest.raises(Refused) as caught:
+                SAID[said](intent, float(first))
+            assert str(caught.value).startswith(reason), step
+
+
+SCRIPTS: dict[str, tuple[Callable[[], Intent], str]] = {
+    # A robot that drives itself
+    "neutral while a robot that will drive itself is asked for does not stop it": (
+        ready_to_choose,
+        "0.0 mode autonomous -> acquire; 0.1 neutral -> nothing; granted 3.0; 0.5 neutral -> nothing",
+    ),
+    "neutral after motion by the stick stops a robot that drives itself": (
+        on_its_own,
+        "1.0 motion -> send; 1.5 neutral -> send; 2.0 neutral -> nothing",
+    ),
+    "a neutral that is owed is sent in mode 3 too": (
+        on_its_own,
+        "refused robot lost; 1.0 neutral -> send; 1.5 neutral -> nothing",
+    ),
+    # Neutral first
+    "a new program must say neutral before motion": (
+        connected,
+        "0.0 motion ! connected: release the stick first; 0.5 motion ! connected: release the stick first; "
+        "100.0 motion ! connected: release the stick first; not asking; "
+        "101.0 neutral -> nothing; 101.5 motion -> acquire",
+    ),
+    "motion asks once, waits for the answer and is then sent": (
+        ready,
+        "0.0 motion -> acquire; 0.1 motion -> wait; 0.2 neutral -> wait; granted 3.0; "
+        "0.3 motion -> send; 0.4 neutral -> send",
+    ),
+    "neutral of a program that holds nothing is nothing": (
+        ready,
+        "1.0 neutral -> nothing; 2.0 neutral -> nothing; not asking",
+    ),
+    **{
+        f"whoever lost the robot or was refused it must say neutral: {why}": (
+            driving,
+            f"lost {why}; not held; 0.5 motion ! {why}: release the stick first; "
+            "0.6 neutral -> nothing; 0.7 motion -> acquire",
+        )
+        for why in ("held by operator (priority 0)", "stop", "lease expired")
+    },
+    "whoever is refused while asking may ask again after neutral": (
+        ready,
+        "0.0 motion -> acquire; lost held by operator (priority 0); not asking; 0.1 motion ! held by operator; "
+        "0.2 neutral -> nothing; 0.3 motion -> acquire",
+    ),
+    "a refused motion holds back and leaves the lease": (
+        driving,
+        "refused busy: map; is held; not may steer; 0.5 motion ! busy: map: release the stick first; "
+        "0.6 neutral -> send; 0.7 motion -> send",
+    ),
+    "a program that gave the robot back need not say neutral anew": (
+        driving,
+        "0.5 neutral -> send; released; 5.0 motion -> acquire",
+    ),
+    "steering needs the robot and neutral": (
+        connected,
+        "not may steer; 0.0 neutral -> nothing; not may steer; 0.1 motion -> acquire; not may steer; granted 3.0; "
+        "is may steer; refused busy; not may steer",
+    ),
+    "neutral of one part of several does not end the wait for neutral": (
+        driving,
+        "lost stop; 0.1 neutral of a part -> nothing; 0.2 motion ! stop; 0.3 neutral -> nothing; 0.4 motion -> acquire",
+    ),
+    # Deadman
+    "motion that is not repeated within the deadman has ended": (
+        driving,
+        "1.25 motion ! deadman: release the stick first; 1.35 neutral -> send; 1.45 motion -> send",
+    ),
+    "silence after neutral is no deadman": (driving, "0.1 neutral -> send; 2.9 motion -> send"),
+    "the deadman needs no message to be noticed": (
+        driving,
+        "expire 1.249; is may steer; expire 1.25; not may steer; is held",
+    ),
+    "the deadman counts from the motion and not from the grant": (
+        ready,
+        "0.0 motion -> acquire; granted 3.0; expire 1.25; is held back deadman",
+    ),
+    "neutral of one part does not end the deadman of the others": (
+        driving,
+        "0.1 neutral of a part -> send; expire 1.25; is held back deadman",
+    ),
+    "choosing a mode does not put the deadman of the stick off": (
+        driving,
+        "1.0 mode autonomous -> send; 1.1 mode manual -> send; expire 1.25; is held back deadman",
+    ),
+    "a robot on its own has no deadman": (on_its_own, "expire 1000000; is free to go"),
+    # Control modes
+    "without modes motion suffices": (connected, "is mode is manual"),
+    "motion before a control mode is refused": (ready_to_choose, "0.5 motion ! control mode is none; not asking"),
+    "a stick that was pushed while the mode was none moves nothing when the mode is chosen": (
+        ready_to_choose,
+        "0.5 motion ! control mode is none; 0.61 mode manual -> nothing; "
+        "0.7 motion ! control mode is none: release the stick first; 0.8 neutral -> nothing; 0.9 motion -> acquire",
+    ),
+    "a mode stands through release, loss and neutral, and alone moves nothing": (
+        ready_to_choose,
+        "0.1 mode manual -> nothing; 0.2 motion -> acquire; granted 3.0; lost stop; 0.3 neutral -> nothing; "
+        "0.4 motion -> acquire; granted 3.0; 0.5 neutral -> send; released; 0.6 motion -> acquire; is mode is manual",
+    ),
+    "mode none gives the robot back, had or only asked for, and ends motion": (
+        ready_to_choose,
+        "0.0 mode manual -> nothing; 0.1 motion -> acquire; 0.2 mode none -> release; released; "
+        "0.3 mode manual -> nothing; 0.4 motion -> acquire; granted 3.0; 0.5 mode none -> release; released; "
+        "0.6 mode none -> nothing",
+    ),
+    "a mode while the robot is held is sent and while it is asked for waits": (
+        ready_to_choose,
+        "0.0 mode manual -> nothing; 0.1 motion -> acquire; 0.2 mode autonomous -> wait; 0.3 mode manual -> wait; "
+        "granted 3.0; 0.4 mode autonomous -> send; 0.5 mode manual -> send",
+    ),
+    "a mode that motion has overtaken is no mode that came too late": (
+        ready_to_choose,
+        "1.0 motion ! control mode is none; 1.05 mode manual -> nothing; is free to go; 1.5 motion -> acquire; "
+        "granted 3.0; is may steer",
+    ),
+    "a mode after motion that came twice is one that came too late": (
+        ready_to_choose,
+        "1.0 motion ! control mode is none; 1.5 motion ! control mode is none; 1.55 mode manual -> nothing; "
+        "2.0 motion ! control mode is none: release the stick",
+    ),
+    "mode autonomous is motion, and stands although it was refused: programs say it once": (
+        choosing,
+        "0.0 mode autonomous ! connected: release the stick first; is mode is autonomous; not asking; "
+        "0.1 neutral -> nothing; 0.2 mode autonomous -> acquire",
+    ),
+    # Giving back
+    "neutral for the time of the lease gives the robot back": (
+        driving_for_2_s,
+        "1.0 motion -> send; 1.1 neutral -> send; not wants release 1.1; 2.0 neutral -> send; not wants release 2.0; "
+        "2.6 neutral -> send; not wants release 2.6; is wants release 3.0",
+    ),
+    "silence for the time of the lease gives the robot back": (
+        driving_for_2_s,
+        f"not wants release {2.0 - EARLY_S - 0.001}; is wants release {2.0 - EARLY_S + 0.001}",
+    ),
+    "who holds nothing has nothing to give back": (
+        ready,
+        "not wants release 1e9; 0.0 motion -> acquire; not wants release 1e9",
+    ),
+    "what is heard does not keep a robot that is driven by hand": (driving, f"heard 2.9; is wants release {LEASE_S}"),
+}
+
+
+@pytest.mark.parametrize(("begin", "script"), SCRIPTS.values(), ids=SCRIPTS)
+def test_what_a_program_says_has_its_meaning(begin: Callable[[], Intent], script: str) -> None:
+    play(begin(), script)
 
 
 def test_neutral_does_not_stop_a_robot_that_drives_itself() -> None:
     """Deployed programs say it every half second while nobody touches the stick, in mode 3 too."""
-    intent = ready(modes=True)
-    assert intent.choose("autonomous", 0.0) is Action.ACQUIRE
-    assert intent.neutral(0.1) is Action.NOTHING
-    intent.granted(LEASE_S)
+    intent = on_its_own()
     for step in range(1, 100):
         assert intent.neutral(0.5 * step) is Action.NOTHING
 
 
-def test_neutral_after_motion_by_the_stick_stops_a_robot_that_drives_itself() -> None:
-    intent = on_its_own()
-    assert intent.motion(1.0) is Action.SEND
-    assert intent.neutral(1.5) is Action.SEND
-    assert intent.neutral(2.0) is Action.NOTHING
-
-
-def test_a_neutral_that_is_owed_is_sent_in_mode_3_too() -> None:
-    intent = on_its_own()
-    intent.refused("robot lost")
-    assert intent.neutral(1.0) is Action.SEND
-    assert intent.neutral(1.5) is Action.NOTHING
-
-
-# Neutral first
-
-
-def test_a_new_program_must_say_neutral_before_motion() -> None:
-    intent = Intent(DEADMAN_S)
-    for now in (0.0, 0.5, 100.0):
-        with pytest.raises(Refused, match="connected: release the stick first"):
-            intent.motion(now)
-    assert not intent.asking
-    assert intent.neutral(101.0) is Action.NOTHING
-    assert intent.motion(101.5) is Action.ACQUIRE
-
-
-def test_motion_asks_once_waits_for_the_answer_and_is_then_sent() -> None:
-    intent = ready()
-    assert intent.motion(0.0) is Action.ACQUIRE
-    assert intent.motion(0.1) is Action.WAIT
-    assert intent.neutral(0.2) is Action.WAIT
-    intent.granted(3.0)
-    assert intent.motion(0.3) is Action.SEND
-    assert intent.neutral(0.4) is Action.SEND
-
-
-def test_neutral_of_a_program_that_holds_nothing_is_nothing() -> None:
-    intent = ready()
-    for now in (1.0, 2.0):
-        assert intent.neutral(now) is Action.NOTHING
-    assert not intent.asking
-
-
-@pytest.mark.parametrize("why", ["held by operator (priority 0)", "stop", "lease expired"])
-def test_whoever_lost_the_robot_or_was_refused_it_must_say_neutral(why: str) -> None:
-    intent = driving()
-    intent.lost(why)
-    assert not intent.held
-    with pytest.raises(Refused, match="release the stick first") as caught:
-        intent.motion(0.5)
-    assert str(caught.value).startswith(why)
-    assert intent.neutral(0.6) is Action.NOTHING
-    assert intent.motion(0.7) is Action.ACQUIRE
-
-
-def test_whoever_is_refused_while_asking_may_ask_again_after_neutral() -> None:
-    intent = ready()
-    intent.motion(0.0)
-    intent.lost("held by operator (priority 0)")
-    assert not intent.asking
-    with pytest.raises(Refused):
-        intent.motion(0.1)
-    intent.neutral(0.2)
-    assert intent.motion(0.3) is Action.ACQUIRE
-
-
-def test_a_refused_motion_holds_back_and_leaves_the_lease() -> None:
-    intent = driving()
-    intent.refused("busy: map")
-    assert intent.held
-    assert not intent.may_steer
-    with pytest.raises(Refused, match="busy: map: release the stick first"):
-        intent.motion(0.5)
-    assert intent.neutral(0.6) is Action.SEND
-    assert intent.motion(0.7) is Action.SEND
-
-
-def test_a_program_that_gave_the_robot_back_need_not_say_neutral_anew() -> None:
-    intent = driving()
-    intent.neutral(0.5)
-    intent.released()
-    assert intent.motion(5.0) is Action.ACQUIRE
-
-
-# Deadman
-
-
-def test_motion_that_is_not_repeated_within_the_deadman_has_ended() -> None:
-    intent = driving()
-    with pytest.raises(Refused, match="deadman: release the stick first"):
-        intent.motion(DEADMAN_S)
-    assert intent.neutral(DEADMAN_S + 0.1) is Action.SEND
-    assert intent.motion(DEADMAN_S + 0.2) is Action.SEND
-
-
-def test_motion_that_is_repeated_just_in_time_goes_on() -> None:
-    intent, now = driving(), 0.0
+def test_motion_that_is_repeated_just_in_time_goes_on_and_keeps_the_robot() -> None:
+    intent, now = driving(lease_s=2.0), 0.0
     for _ in range(100):
         now += DEADMAN_S - 0.001
         assert intent.motion(now) is Action.SEND
-
-
-def test_silence_after_neutral_is_no_deadman() -> None:
-    intent = driving()
-    intent.neutral(0.1)
-    assert intent.motion(2.9) is Action.SEND
-
-
-def test_the_deadman_needs_no_message_to_be_noticed() -> None:
-    intent = driving()
-    intent.expire(DEADMAN_S - 0.001)
-    assert intent.may_steer
-    intent.expire(DEADMAN_S)
-    assert not intent.may_steer
-    assert intent.held
-
-
-def test_the_deadman_counts_from_the_motion_and_not_from_the_grant() -> None:
-    intent = ready()
-    intent.motion(0.0)
-    intent.granted(3.0)
-    intent.expire(DEADMAN_S)
-    assert intent.held_back == "deadman"
+        assert not intent.wants_release(now)
 
 
 def test_motion_refused_is_no_sign_of_life() -> None:
@@ -193,130 +279,6 @@ def test_motion_refused_is_no_sign_of_life() -> None:
     assert intent.wants_release(3.0)
 
 
-# Control modes
-
-
-def test_without_modes_motion_suffices() -> None:
-    assert Intent(DEADMAN_S).mode == "manual"
-
-
-def test_motion_before_a_control_mode_is_refused() -> None:
-    intent = ready(modes=True)
-    with pytest.raises(Refused, match="control mode is none"):
-        intent.motion(0.5)
-    assert not intent.asking
-
-
-def test_after_motion_in_mode_none_neutral_must_come_although_the_mode_has() -> None:
-    """A stick that was pushed while the mode was none moves nothing when the mode is chosen."""
-    intent = ready(modes=True)
-    with pytest.raises(Refused):
-        intent.motion(0.5)
-    assert intent.choose("manual", 0.61) is Action.NOTHING
-    with pytest.raises(Refused, match="release the stick first"):
-        intent.motion(0.7)
-    intent.neutral(0.8)
-    assert intent.motion(0.9) is Action.ACQUIRE
-
-
-def test_a_mode_stands_through_release_loss_and_neutral() -> None:
-    intent = ready(modes=True)
-    assert intent.choose("manual", 0.1) is Action.NOTHING, "a mode alone moves nothing"
-    assert intent.motion(0.2) is Action.ACQUIRE
-    intent.granted(3.0)
-    intent.lost("stop")
-    intent.neutral(0.3)
-    assert intent.motion(0.4) is Action.ACQUIRE
-    intent.granted(3.0)
-    intent.neutral(0.5)
-    intent.released()
-    assert intent.motion(0.6) is Action.ACQUIRE
-    assert intent.mode == "manual"
-
-
-def test_mode_none_gives_the_robot_back_and_ends_motion() -> None:
-    intent = ready(modes=True)
-    intent.choose("manual", 0.0)
-    intent.motion(0.1)
-    assert intent.choose("none", 0.2) is Action.RELEASE, "asked for, though not had yet"
-    intent.released()
-    intent.choose("manual", 0.3)
-    intent.motion(0.4)
-    intent.granted(3.0)
-    assert intent.choose("none", 0.5) is Action.RELEASE
-    intent.released()
-    assert intent.choose("none", 0.6) is Action.NOTHING
-
-
-def test_a_mode_while_the_robot_is_held_is_sent_and_while_it_is_asked_for_waits() -> None:
-    intent = ready(modes=True)
-    intent.choose("manual", 0.0)
-    intent.motion(0.1)
-    assert intent.choose("autonomous", 0.2) is Action.WAIT
-    assert intent.choose("manual", 0.3) is Action.WAIT
-    intent.granted(3.0)
-    assert intent.choose("autonomous", 0.4) is Action.SEND
-    assert intent.choose("manual", 0.5) is Action.SEND
-
-
-def test_a_mode_that_motion_has_overtaken_is_no_mode_that_came_too_late() -> None:
-    intent = connected(modes=True)
-    intent.neutral(0.0)
-    with pytest.raises(Refused, match="control mode is none"):
-        intent.motion(1.0)
-    intent.choose("manual", 1.05)
-    assert intent.motion(1.5) is Action.ACQUIRE
-    late = connected(modes=True)
-    late.neutral(0.0)
-    for now in (1.0, 1.5):
-        with pytest.raises(Refused, match="control mode is none"):
-            late.motion(now)
-    late.choose("manual", 1.55)
-    with pytest.raises(Refused, match="control mode is none: release the stick"):
-        late.motion(2.0)
-
-
-def test_mode_autonomous_is_motion() -> None:
-    intent = connected(modes=True)
-    with pytest.raises(Refused, match="connected: release the stick first"):
-        intent.choose("autonomous", 0.0)
-    assert (intent.mode, intent.asking) == ("autonomous", False), "it stands: programs say it once"
-    intent.neutral(0.1)
-    assert intent.choose("autonomous", 0.2) is Action.ACQUIRE
-
-
-# Giving back
-
-
-def test_neutral_for_the_time_of_the_lease_gives_the_robot_back() -> None:
-    intent = driving(lease_s=2.0)
-    intent.motion(1.0)
-    for now in (1.1, 2.0, 2.6):
-        intent.neutral(now)
-        assert not intent.wants_release(now)
-    assert intent.wants_release(3.0)
-
-
-def test_silence_for_the_time_of_the_lease_gives_the_robot_back() -> None:
-    intent = driving(lease_s=2.0)
-    assert not intent.wants_release(2.0 - EARLY_S - 0.001)
-    assert intent.wants_release(2.0 - EARLY_S + 0.001)
-
-
-def test_motion_keeps_the_robot() -> None:
-    intent = driving(lease_s=2.0)
-    for step in range(100):
-        intent.motion(step * 1.0)
-        assert not intent.wants_release(step * 1.0)
-
-
-def test_who_holds_nothing_has_nothing_to_give_back() -> None:
-    intent = ready()
-    assert not intent.wants_release(1e9)
-    intent.motion(0.0)
-    assert not intent.wants_release(1e9)
-
-
 def test_a_robot_on_its_own_is_used_as_long_as_anything_is_heard() -> None:
     intent = on_its_own()
     for step in range(100):
@@ -326,20 +288,6 @@ def test_a_robot_on_its_own_is_used_as_long_as_anything_is_heard() -> None:
     assert intent.wants_release(198.0 + LEASE_S - EARLY_S + 0.001)
 
 
-def test_choosing_a_mode_does_not_put_the_deadman_of_the_stick_off() -> None:
-    intent = driving()
-    intent.choose("autonomous", 1.0)
-    intent.choose("manual", 1.1)
-    intent.expire(DEADMAN_S)
-    assert intent.held_back == "deadman"
-
-
-def test_a_robot_on_its_own_has_no_deadman() -> None:
-    intent = on_its_own()
-    intent.expire(1e6)
-    assert intent.held_back is None
-
-
 def test_a_robot_taken_back_from_driving_itself_is_not_given_away_at_once() -> None:
     intent = on_its_own()
     for step in range(20):
@@ -347,42 +295,6 @@ def test_a_robot_taken_back_from_driving_itself_is_not_given_away_at_once() -> N
     assert intent.choose("manual", 10.0) is Action.SEND
     assert not intent.wants_release(10.0 + LEASE_S - EARLY_S - 0.001)
     assert intent.wants_release(10.0 + LEASE_S - EARLY_S + 0.001)
-
-
-def test_what_is_heard_does_not_keep_a_robot_that_is_driven_by_hand() -> None:
-    intent = driving()
-    intent.heard(2.9)
-    assert intent.wants_release(LEASE_S)
-
-
-def test_steering_needs_the_robot_and_neutral() -> None:
-    intent = Intent(DEADMAN_S)
-    assert not intent.may_steer
-    intent.neutral(0.0)
-    assert not intent.may_steer
-    intent.motion(0.1)
-    assert not intent.may_steer
-    intent.granted(3.0)
-    assert intent.may_steer
-    intent.refused("busy")
-    assert not intent.may_steer
-
-
-def test_neutral_of_one_part_of_several_does_not_end_the_wait_for_neutral() -> None:
-    intent = driving()
-    intent.lost("stop")
-    assert intent.neutral(0.1, whole=False) is Action.NOTHING
-    with pytest.raises(Refused):
-        intent.motion(0.2)
-    assert intent.neutral(0.3) is Action.NOTHING
-    assert intent.motion(0.4) is Action.ACQUIRE
-
-
-def test_neutral_of_one_part_does_not_end_the_deadman_of_the_others() -> None:
-    intent = driving()
-    assert intent.neutral(0.1, whole=False) is Action.SEND
-    intent.expire(DEADMAN_S)
-    assert intent.held_back == "deadman"
 
 
 def test_an_intent_prints_itself() -> None:

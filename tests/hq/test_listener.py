@@ -13,13 +13,14 @@ import pytest
 from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, serving, soon
 from zbridge.address import Address
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Pose,
-    Text,
-)
+from zbridge.fleet.messages import Pose, Text
 from zbridge.protocol.session import Limits
 
 pytestmark = pytest.mark.jumping
+
+
+class RestingSide(ToySide):
+    quiet_s = 2.0
 
 
 # Coming and going
@@ -119,35 +120,27 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
     assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
 
 
-async def test_a_number_rests_after_its_client_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving() as scene:
-        scene.connect().greeted().leave()
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [3]
-        await asyncio.sleep(2.0)
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2, 3]
+@pytest.mark.scene(side=RestingSide)
+async def test_a_number_rests_after_its_client_left(scene: Scene) -> None:
+    scene.connect().leave()
+    await soon()
+    scene.connect().greeted().leave()
+    await soon()
+    assert scene.count("hq_accepted") == 2, "the first was never used, and need not rest"
+    scene.connect()
+    assert sorted(scene.listener.clients) == [3]
+    await asyncio.sleep(2.0)
+    scene.connect()
+    assert sorted(scene.listener.clients) == [2, 3]
 
 
-async def test_a_number_that_was_never_used_need_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving() as scene:
-        scene.connect().leave()
-        await soon()
-        scene.connect()
-        assert sorted(scene.listener.clients) == [2]
-
-
-async def test_numbers_that_rest_take_no_clients_place(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.scene(side=RestingSide, clients=1)
+async def test_numbers_that_rest_take_no_clients_place(scene: Scene) -> None:
     """``clients`` is the most at a time: a program that is restarted at once finds its place free."""
-    monkeypatch.setattr(ToySide, "quiet_s", 2.0)
-    async with serving(clients=1) as scene:
-        scene.connect().leave()
-        await soon()
-        assert not scene.connect().link.closed
-        assert scene.connect().link.closed
+    scene.connect().leave()
+    await soon()
+    assert not scene.connect().link.closed
+    assert scene.connect().link.closed
 
 
 @pytest.mark.scene(accept_hz=1000)
@@ -196,17 +189,11 @@ async def test_the_table_says_why_a_client_went(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("host", "welcome"),
     [
-        ("10.1.2.3", True),
-        ("192.168.1.7", True),
-        ("192.168.1.8", False),
-        ("127.0.0.1", False),
-        ("[fd00::1]", True),
-        ("[fe80::1%eth0]", False),
-        ("[::1]", False),
-        ("[::ffff:10.1.2.3]", True),
+        ("10.1.2.3", True), ("192.168.1.7", True), ("192.168.1.8", False), ("127.0.0.1", False),
+        ("[fd00::1]", True), ("[fe80::1%eth0]", False), ("[::1]", False), ("[::ffff:10.1.2.3]", True),
         ("[::ffff:11.1.2.3]", False),
     ],
-)
+)  # fmt: skip
 @pytest.mark.scene(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8"))
 async def test_only_allowed_networks_are_let_in(scene: Scene, host: str, welcome: bool) -> None:
     program = scene.connect(host)
@@ -233,14 +220,12 @@ class SessionlessSide(ToySide):
         raise KeyError(self.view.protocol)
 
 
-async def test_a_client_for_which_there_is_no_session_is_turned_away() -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(Scene, "side_class", SessionlessSide)
-        async with serving() as scene:
-            for _ in range(5):
-                assert scene.connect().link.closed
-            assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
-            assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
+@pytest.mark.scene(side=SessionlessSide)
+async def test_a_client_for_which_there_is_no_session_is_turned_away(scene: Scene) -> None:
+    for _ in range(5):
+        assert scene.connect().link.closed
+    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
+    assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
 
 
 # The end

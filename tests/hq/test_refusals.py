@@ -47,27 +47,23 @@ class Scene:
         self.bus.answer("fleet/r1/@rpc/control/refused/*", hear)
 
 
-async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reason() -> None:
-    scene = Scene()
+@pytest.fixture
+async def scene() -> Scene:
+    return Scene()
+
+
+async def test_the_first_refusal_is_told_at_once_with_who_command_code_and_reason(scene: Scene) -> None:
     scene.serve()
     scene.reports.note("hq.desk.3", "drive", NeutralFirst("connected: release the stick first"))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     ((_, told),) = scene.told
-    assert told == [
-        {
-            "who": "hq.desk.3",
-            "command": "drive",
-            "code": "neutral_first",
-            "reason": "connected: release the stick first",
-            "count": 1,
-            "by": None,
-        }
-    ]
+    reason = "connected: release the stick first"
+    first = {"who": "hq.desk.3", "command": "drive", "code": "neutral_first", "reason": reason, "count": 1, "by": None}
+    assert told == [first]
 
 
-async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> None:
-    scene = Scene()
+async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second(scene: Scene) -> None:
     scene.serve()
     began = scene.loop.time()
     for _ in range(100):  # two seconds of a stick that is held down
@@ -86,8 +82,7 @@ async def test_what_repeats_itself_is_folded_and_told_a_few_times_a_second() -> 
     assert counts == {"hq.desk.3": 100, "hq.desk.4": 100}
 
 
-async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> None:
-    scene = Scene()
+async def test_refusals_of_another_command_code_or_reason_are_told_apart(scene: Scene) -> None:
     scene.reports.note("hq.desk.3", "drive", OFFLINE)
     scene.serve()
     for command, refusal in (
@@ -108,8 +103,7 @@ async def test_refusals_of_another_command_code_or_reason_are_told_apart() -> No
     ]
 
 
-async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted() -> None:
-    scene = Scene()
+async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted(scene: Scene) -> None:
     scene.serve()
     for number in range(200):
         scene.reports.note(f"hq.desk.{number}", "drive", OFFLINE)
@@ -118,8 +112,7 @@ async def test_so_many_different_ones_are_told_at_a_time_and_the_others_counted(
     assert scene.metrics.total("untold") == 200 - 1 - TOLD
 
 
-async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_again() -> None:
-    scene = Scene()
+async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_again(scene: Scene) -> None:
     scene.reports.note("hq.desk.3", "drive", OFFLINE)
     await asyncio.sleep(2 * EVERY_S)
     scene.serve(NotReady("later"))
@@ -129,8 +122,7 @@ async def test_a_gateway_that_is_not_there_or_will_not_hear_is_not_bothered_agai
     assert not scene.tasks.running
 
 
-async def test_a_teller_that_is_closed_tells_nothing_more() -> None:
-    scene = Scene()
+async def test_a_teller_that_is_closed_tells_nothing_more(scene: Scene) -> None:
     scene.serve()
     scene.reports.note("hq.desk.3", "drive", OFFLINE)
     scene.reports.note("hq.desk.3", "drive", OFFLINE)

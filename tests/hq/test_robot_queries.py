@@ -12,9 +12,7 @@ from zbridge.bus.interface import Answer, IncomingQuery
 from zbridge.errors import BusError, NotReady
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Query,
-)
+from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import Topic
 
 pytestmark = pytest.mark.jumping

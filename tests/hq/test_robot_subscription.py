@@ -48,6 +48,12 @@ class Scene:
     def raw(self, topic: Topic, payload: bytes) -> None:
         self.robot.publisher(KEYS.key(topic.path), topic).put(payload)
 
+    def follower(self, *paths: str) -> Follower:
+        """Make somebody who follows these."""
+        follower = Follower()
+        self.audience.follow(paths, follower.message, follower.gateway)
+        return follower
+
     @property
     def subscribers(self) -> int:
         return len(self.bus._shared.subscribers)
@@ -59,8 +65,7 @@ def scene() -> Scene:
 
 
 def test_a_follower_hears_its_paths_and_the_states_of_the_gateway(scene: Scene) -> None:
-    follower = Follower()
-    scene.audience.follow(("pose", "sensor/*"), follower.message, follower.gateway)
+    follower = scene.follower("pose", "sensor/*")
     scene.say(topics.POSE, POSE)
     scene.say(topics.SENSOR("front left"), Reading(value=1.0))
     scene.say(topics.STATUS, STATUS)
@@ -82,9 +87,7 @@ def test_the_view_is_noted_before_a_follower_is_told(scene: Scene) -> None:
 
 
 def test_many_followers_share_one_subscription_and_one_decoding(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    followers = [Follower() for _ in range(10)]
-    for follower in followers:
-        scene.audience.follow(("pose",), follower.message, follower.gateway)
+    followers = [scene.follower("pose") for _ in range(10)]
     assert sorted(scene.subscribed) == ["control", "pose", "status"]
     decoded: list[object] = []
     decode = payloads.decode
@@ -104,8 +107,7 @@ def test_a_late_follower_finds_the_last_values(scene: Scene) -> None:
     scene.say(topics.STATUS, STATUS)
     scene.say(topics.LIDAR, Switch(on=True))
     scene.say(topics.POSE, POSE)
-    follower = Follower()
-    scene.audience.follow(("lidar", "pose"), follower.message, follower.gateway)
+    follower = scene.follower("lidar", "pose")
     assert ("status", STATUS) in follower.heard
     assert ("lidar", Switch(on=True)) in follower.heard
     assert ("pose", POSE) not in follower.heard, "a stream keeps nothing"
@@ -153,8 +155,7 @@ def test_a_follower_may_leave_while_it_is_told(scene: Scene) -> None:
 
 
 def test_malformed_telemetry_is_counted_and_told_to_nobody(scene: Scene) -> None:
-    follower = Follower()
-    scene.audience.follow(("pose",), follower.message, follower.gateway)
+    follower = scene.follower("pose")
     for payload in (b"\xc1", b"", payloads.pack({"x": "far"}), payloads.pack({"x": 1.0})):
         scene.raw(topics.POSE, payload)
     assert follower.heard == []
@@ -173,11 +174,10 @@ def test_a_key_that_the_design_does_not_know_is_ignored(scene: Scene) -> None:
 
 
 def test_whether_the_gateway_lives_is_told_to_all_and_noted(scene: Scene) -> None:
-    early, late = Follower(), Follower()
-    scene.audience.follow((), early.message, early.gateway)
+    early = scene.follower()
     token = scene.robot.announce(KEYS.alive("gateway"))
     scene.audience.open()
-    scene.audience.follow((), late.message, late.gateway)
+    late = scene.follower()
     assert (early.alive, late.alive) == ([False, True], [True])
     assert scene.audience.view.alive
     scene.robot.announce(KEYS.alive("hq.toy.1")).close()
@@ -187,9 +187,8 @@ def test_whether_the_gateway_lives_is_told_to_all_and_noted(scene: Scene) -> Non
 
 
 def test_a_closed_audience_leaves_nothing_on_the_bus(scene: Scene) -> None:
-    follower = Follower()
     scene.audience.open()
-    scene.audience.follow(("pose", "scan"), follower.message, follower.gateway)
+    follower = scene.follower("pose", "scan")
     scene.audience.close()
     scene.say(topics.POSE, POSE)
     scene.robot.announce(KEYS.alive("gateway"))
@@ -203,8 +202,7 @@ def test_an_audience_that_was_never_opened_can_be_closed(scene: Scene) -> None:
 
 
 def test_names_that_a_robot_makes_up_for_ever_are_not_all_remembered(scene: Scene) -> None:
-    follower = Follower()
-    scene.audience.follow(("sensor/*",), follower.message, follower.gateway)
+    follower = scene.follower("sensor/*")
     for number in range(3000):
         scene.say(topics.SENSOR(f"s{number}"), Reading(value=1.0))
     assert len(follower.heard) == 3000

@@ -38,8 +38,13 @@ def test_a_range_outside_is_no_range_but_a_reading(range_m: float) -> None:
     assert math.isnan(scan.ranges[0])
 
 
-def test_a_sensor_without_a_bearing_is_ignored() -> None:
-    assert BearingScan({"front": 0.0}, (0.0, 1.0)).take("light", 0.5, STAMP) is None
+def test_a_sensor_without_a_bearing_is_ignored_and_sensors_that_look_the_same_way_share_a_point() -> None:
+    ring = BearingScan({"a": 0.0, "b": 0.0}, (0.0, 9.0))
+    assert ring.take("light", 0.5, STAMP) is None
+    assert ring.take("a", 1.0, STAMP) is None
+    scan = ring.take("b", 2.0, STAMP)
+    assert scan is not None
+    assert scan.ranges.tolist() == [2.0]
 
 
 def test_uneven_bearings_are_a_point_a_degree() -> None:
@@ -50,14 +55,6 @@ def test_uneven_bearings_are_a_point_a_degree() -> None:
     assert (scan.angle_min, scan.angle_increment) == pytest.approx((math.radians(-20), math.radians(1)))
     there = {place: float(range_m) for place, range_m in enumerate(scan.ranges) if not math.isnan(range_m)}
     assert (len(scan.ranges), there) == (33, {0: 3.0, 20: 2.0, 30: 1.0, 32: 4.0})
-
-
-def test_sensors_that_look_the_same_way_share_a_point() -> None:
-    ring = BearingScan({"a": 0.0, "b": 0.0}, (0.0, 9.0))
-    assert ring.take("a", 1.0, STAMP) is None
-    scan = ring.take("b", 2.0, STAMP)
-    assert scan is not None
-    assert scan.ranges.tolist() == [2.0]
 
 
 def test_a_sector_has_the_nearest_range_in_it() -> None:

@@ -56,13 +56,9 @@ def test_a_robot_is_ready_while_its_driving_session_is_established() -> None:
     assert not robot.ready
 
 
-def test_a_robot_is_asked_for_everything_unless_it_says_otherwise() -> None:
+def test_a_robot_is_asked_for_everything_unless_it_says_otherwise_and_an_outcome_reports_nothing() -> None:
     assert ToyRobot().known(topics.MAP) is None
-
-
-def test_an_outcome_without_anything_reports_nothing() -> None:
-    assert Outcome().telemetry == ()
-    assert Outcome().left_out is None
+    assert (Outcome().telemetry, Outcome().left_out) == ((), None)
 
 
 def test_the_installed_protocols_are_found_by_name() -> None:
@@ -88,14 +84,14 @@ def test_an_unknown_protocol_is_an_error_that_names_those_there_are() -> None:
         find_protocol("nope")
 
 
-def test_an_entry_that_is_no_protocol_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("odd", "math:pi", GROUP)
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints([point]))
-    with pytest.raises(ConfigError, match="math:pi is no zbridge protocol"):
-        find_protocol("odd")
-
-
-def test_without_any_protocol_the_error_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints([]))
-    with pytest.raises(ConfigError, match="none installed"):
-        find_protocol("tcpudp")
+@pytest.mark.parametrize(
+    ("entries", "name", "error"),
+    [
+        ([EntryPoint("odd", "math:pi", GROUP)], "odd", "math:pi is no zbridge protocol"),
+        ([], "tcpudp", "none installed"),
+    ],
+)
+def test_an_entry_that_is_no_protocol_or_none_at_all_is_an_error(monkeypatch, entries, name: str, error: str) -> None:
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints(entries))
+    with pytest.raises(ConfigError, match=error):
+        find_protocol(name)

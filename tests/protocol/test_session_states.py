@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.protocol.test_session import LIMITS, WELCOME, Toy
-from zbridge.protocol.session import LINGER_S, State
+from zbridge.protocol.session import State
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 
 ORDER = list(State)
@@ -64,21 +64,8 @@ def test_an_ended_session_is_not_established_any_more() -> None:
         assert (session.state, session.version, session.features) == (state, None, ())
 
 
-def test_the_first_reason_stands() -> None:
-    session = session_in(State.CLOSING)
-    session.lost("closed by peer")
-    assert session.reason == "over"
-
-
 def test_a_handshake_whose_limit_is_lifted_takes_as_long_as_its_own_timers() -> None:
     session = session_in(State.HANDSHAKING)
     session.lift_limit()
     session.expire(1e9)
     assert (session.state, session.deadline()) == (State.HANDSHAKING, None)
-
-
-def test_each_end_has_a_time_limit() -> None:
-    session = session_in(State.ESTABLISHED)
-    session.send(b"last words")
-    session.close("over", 2.0)
-    assert session.deadline(writing=False) == 2.0 + LINGER_S

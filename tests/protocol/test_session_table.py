@@ -12,63 +12,33 @@ def named(name: str) -> Toy:
     return Toy(LIMITS, name=name)
 
 
-def test_a_new_session_shows_in_the_table_as_it_is_now() -> None:
-    manager = SessionTable()
-    session = named("robot")
-    manager.add(session)
-    assert [shown.state for shown in manager.snapshots()] == ["connecting"]
-    session.open(0.0)
-    assert [shown.state for shown in manager.snapshots()] == ["handshaking"]
-
-
-def test_an_ended_session_is_remembered_behind_the_live_ones() -> None:
-    manager = SessionTable()
-    first, second = named("first"), named("second")
-    manager.add(first)
-    manager.add(second)
+def test_a_session_shows_in_the_table_as_it_is_now_and_is_remembered_as_it_ended_behind_the_live_ones() -> None:
+    table, first, second = SessionTable(), named("first"), named("second")
+    table.add(first)
+    table.add(second)
+    assert [shown.state for shown in table.snapshots()] == ["connecting"] * 2
+    first.open(0.0)
+    assert table.snapshots()[0].state == "handshaking"
     first.lost("closed by peer")
-    manager.remove(first)
-    assert [(shown.name, shown.reason) for shown in manager.snapshots()] == [
+    for removed in (first, first, named("stranger")):
+        table.remove(removed)
+    first.name = "changed"
+    assert [(shown.name, shown.reason) for shown in table.snapshots()] == [
         ("second", None),
         ("first", "closed by peer"),
     ]
-
-
-def test_an_ended_session_no_longer_changes() -> None:
-    manager = SessionTable()
-    session = named("robot")
-    manager.add(session)
-    session.lost("closed by peer")
-    manager.remove(session)
-    session.name = "changed"
-    assert manager.snapshots()[0].name == "robot"
+    assert repr(table) == "<SessionTable 1 live, 1 ended>"
 
 
 def test_the_table_remembers_a_bounded_number_of_ended_sessions() -> None:
-    manager = SessionTable()
+    table = SessionTable()
     for number in range(REMEMBERED + 5):
         session = named(str(number))
-        manager.add(session)
-        manager.remove(session)
-    shown = manager.snapshots()
+        table.add(session)
+        table.remove(session)
+    shown = table.snapshots()
     assert len(shown) == REMEMBERED
     assert [shown[0].name, shown[-1].name] == ["5", str(REMEMBERED + 4)]
-
-
-def test_removing_a_session_twice_or_one_never_added_does_no_harm() -> None:
-    manager = SessionTable()
-    session = named("robot")
-    manager.add(session)
-    manager.remove(session)
-    manager.remove(session)
-    manager.remove(named("stranger"))
-    assert len(manager.snapshots()) == 1
-
-
-def test_a_manager_prints_its_numbers() -> None:
-    manager = SessionTable()
-    manager.add(named("robot"))
-    assert repr(manager) == "<SessionTable 1 live, 0 ended>"
 
 
 class Middle(random.Random):
@@ -78,15 +48,10 @@ class Middle(random.Random):
         return (a + b) / 2
 
 
-def test_delays_double_up_to_the_most_and_stay_there() -> None:
+def test_delays_double_up_to_the_most_and_a_reset_begins_anew() -> None:
     backoff = Backoff(0.5, 10.0, Middle())
+    assert repr(backoff) == "<Backoff next 0.5 s>"
     assert [backoff.delay_s() for _ in range(7)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
-
-
-def test_a_reset_begins_anew() -> None:
-    backoff = Backoff(0.5, 10.0, Middle())
-    for _ in range(5):
-        backoff.delay_s()
     backoff.reset()
     assert backoff.delay_s() == 0.5
 
@@ -96,10 +61,6 @@ def test_delays_are_spread_by_a_quarter_either_way() -> None:
     delays = [backoff.delay_s() for _ in range(500)]
     assert 0.75 <= min(delays) < 0.8
     assert 1.2 < max(delays) <= 1.25
-
-
-def test_a_backoff_prints_its_next_delay() -> None:
-    assert repr(Backoff(0.5)) == "<Backoff next 0.5 s>"
 
 
 def test_two_backoffs_do_not_march_in_step() -> None:

@@ -351,7 +351,6 @@ def test_a_simulation_that_cannot_start_is_found() -> None:
 
 def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> None:
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
-    monkeypatch.setattr("logging.disable", lambda level: None)
     assert kit.main(["toy"]) == 0
     out = capsys.readouterr().out
     assert out.endswith("hold, 0 do not\n")
@@ -362,7 +361,6 @@ def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsy
     findings = [Finding("one"), Finding("two", "it does not"), Finding.of("three", ["a", "b", "c", "d"], "tried")]
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
     monkeypatch.setattr(kit, "check", lambda protocol, name: findings)
-    monkeypatch.setattr("logging.disable", lambda level: None)
     assert kit.main(["toy"]) == 1
     assert capsys.readouterr().out.splitlines() == [
         *("ok    one", "FAIL  two", "      it does not"),

@@ -32,8 +32,14 @@ class Rig:
         )
 
 
-def established() -> Rig:
-    rig = Rig()
+@pytest.fixture
+async def rig() -> Rig:
+    return Rig()
+
+
+@pytest.fixture
+async def up(rig: Rig) -> Rig:
+    """An established session."""
     rig.conversation.attached(rig.link)
     rig.conversation.received(WELCOME)
     rig.link.written.clear()
@@ -41,30 +47,22 @@ def established() -> Rig:
     return rig
 
 
-async def test_a_link_that_is_up_opens_the_session_and_writes_its_first_frame() -> None:
-    rig = Rig()
+async def test_a_link_that_is_up_opens_the_session_and_changes_are_told_before_the_messages_of_a_read(rig) -> None:
     rig.conversation.attached(rig.link)
     assert rig.session.peer == "tcp://toy.test:1"
     assert rig.link.written == [b"\x05hello"]
-    assert rig.happened == [State.HANDSHAKING]
-
-
-async def test_a_change_of_state_is_told_before_the_messages_of_the_same_read() -> None:
-    rig = Rig()
-    rig.conversation.attached(rig.link)
     rig.conversation.received(WELCOME + b"\x01a\x01b")
     assert rig.happened == [State.HANDSHAKING, State.ESTABLISHED, [b"a", b"b"]]
 
 
-async def test_a_doubt_is_told_when_it_comes_and_when_it_goes() -> None:
-    rig = established()
+async def test_a_doubt_is_told_when_it_comes_and_when_it_goes(up: Rig) -> None:
     for doubts in (("client id 3",), ("client id 3",), ()):
-        rig.session.doubts = doubts
-        rig.conversation.pump()
-    assert rig.happened == [State.ESTABLISHED, State.ESTABLISHED]
+        up.session.doubts = doubts
+        up.conversation.pump()
+    assert up.happened == [State.ESTABLISHED, State.ESTABLISHED]
 
 
-async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_look() -> None:
+async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_look(up: Rig) -> None:
     """The look comes before everything that is written: it stops a robot whose driver is silent."""
     clock_s, looks = [0.0], []
 
@@ -92,42 +90,38 @@ async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_l
     conversation.abandon()
 
 
-async def test_a_read_without_a_whole_message_delivers_nothing() -> None:
-    rig = established()
-    rig.conversation.received(b"\x05ab")
-    assert rig.happened == []
-    rig.conversation.received(b"cde")
-    assert rig.happened == [[b"abcde"]]
+async def test_a_read_without_a_whole_message_delivers_nothing(up: Rig) -> None:
+    up.conversation.received(b"\x05ab")
+    assert up.happened == []
+    up.conversation.received(b"cde")
+    assert up.happened == [[b"abcde"]]
 
 
-async def test_frames_are_written_one_at_a_time_with_the_gap_between_them() -> None:
-    rig = established()
+async def test_frames_are_written_one_at_a_time_with_the_gap_between_them(up: Rig) -> None:
     await asyncio.sleep(1)
     for message in (b"a", b"b", b"c"):
-        rig.session.send(message)
-    rig.conversation.pump()
-    assert rig.link.written == [b"\x01a"]
+        up.session.send(message)
+    up.conversation.pump()
+    assert up.link.written == [b"\x01a"]
     await asyncio.sleep(0.0101)
-    assert rig.link.written == [b"\x01a", b"\x01b"]
+    assert up.link.written == [b"\x01a", b"\x01b"]
     await asyncio.sleep(0.0101)
-    assert rig.link.written == [b"\x01a", b"\x01b", b"\x01c"]
+    assert up.link.written == [b"\x01a", b"\x01b", b"\x01c"]
 
 
-async def test_nothing_is_written_to_a_link_that_is_not_ready_until_it_is() -> None:
-    rig = established()
+async def test_nothing_is_written_to_a_link_that_is_not_ready_until_it_is(up: Rig) -> None:
     await asyncio.sleep(1)
-    rig.link.ready = False
-    rig.session.send(b"a")
-    rig.conversation.pump()
+    up.link.ready = False
+    up.session.send(b"a")
+    up.conversation.pump()
     await asyncio.sleep(10)
-    assert rig.link.written == []
-    rig.link.ready = True
-    rig.conversation.writable()
-    assert rig.link.written == [b"\x01a"]
+    assert up.link.written == []
+    up.link.ready = True
+    up.conversation.writable()
+    assert up.link.written == [b"\x01a"]
 
 
-async def test_an_unfinished_handshake_ends_the_conversation_and_its_link() -> None:
-    rig = Rig()
+async def test_an_unfinished_handshake_ends_the_conversation_and_its_link(rig: Rig) -> None:
     rig.conversation.attached(rig.link)
     await asyncio.sleep(4.9)
     assert not rig.conversation.ended.done()
@@ -138,58 +132,53 @@ async def test_an_unfinished_handshake_ends_the_conversation_and_its_link() -> N
     assert rig.happened == [State.HANDSHAKING, State.CLOSED]
 
 
-async def test_a_lost_link_ends_the_conversation() -> None:
-    rig = established()
-    rig.conversation.lost("closed by peer")
-    assert rig.conversation.ended.done()
-    assert rig.session.reason == "closed by peer"
-    assert rig.happened == [State.CLOSED]
-    rig.conversation.pump()
-    rig.conversation.received(b"\x01a")
-    assert rig.happened == [State.CLOSED]
-    assert rig.link.written == []
+async def test_a_lost_link_ends_the_conversation(up: Rig) -> None:
+    up.conversation.lost("closed by peer")
+    assert up.conversation.ended.done()
+    assert up.session.reason == "closed by peer"
+    assert up.happened == [State.CLOSED]
+    up.conversation.pump()
+    up.conversation.received(b"\x01a")
+    assert up.happened == [State.CLOSED]
+    assert up.link.written == []
 
 
-async def test_closing_writes_what_waits_and_then_closes_the_link() -> None:
-    rig = established()
-    rig.session.send(b"a")
-    rig.session.send(b"b")
-    rig.conversation.close("enough")
-    assert not rig.link.closed
-    await asyncio.wait_for(rig.conversation.ended, 1.0)
-    assert rig.link.written == [b"\x01a", b"\x01b"]
-    assert rig.link.closed
-    assert rig.happened == [State.CLOSING, State.CLOSED]
-    assert rig.session.reason == "enough"
+async def test_closing_writes_what_waits_and_then_closes_the_link(up: Rig) -> None:
+    up.session.send(b"a")
+    up.session.send(b"b")
+    up.conversation.close("enough")
+    assert not up.link.closed
+    await asyncio.wait_for(up.conversation.ended, 1.0)
+    assert up.link.written == [b"\x01a", b"\x01b"]
+    assert up.link.closed
+    assert up.happened == [State.CLOSING, State.CLOSED]
+    assert up.session.reason == "enough"
 
 
-async def test_closing_does_not_wait_long_for_a_link_that_takes_nothing() -> None:
-    rig = established()
-    rig.link.ready = False
-    rig.session.send(b"a")
-    rig.conversation.close("enough")
-    start = rig.loop.time()
-    await rig.conversation.ended
-    assert rig.loop.time() - start == pytest.approx(LINGER_S)
-    assert rig.link.closed
+async def test_closing_does_not_wait_long_for_a_link_that_takes_nothing(up: Rig) -> None:
+    up.link.ready = False
+    up.session.send(b"a")
+    up.conversation.close("enough")
+    start = up.loop.time()
+    await up.conversation.ended
+    assert up.loop.time() - start == pytest.approx(LINGER_S)
+    assert up.link.closed
 
 
-async def test_a_broken_stream_ends_conversation_and_link_after_the_messages_before_it() -> None:
-    rig = established()
-    rig.conversation.received(b"\x01a\xff")
-    assert rig.happened == [[b"a"], State.CLOSED]
-    assert rig.conversation.ended.done()
-    assert rig.link.closed
+async def test_a_broken_stream_ends_conversation_and_link_after_the_messages_before_it(up: Rig) -> None:
+    up.conversation.received(b"\x01a\xff")
+    assert up.happened == [[b"a"], State.CLOSED]
+    assert up.conversation.ended.done()
+    assert up.link.closed
 
 
-async def test_messages_before_the_peers_farewell_are_delivered_before_the_end_is_told() -> None:
-    rig = established()
-    rig.conversation.received(b"\x01a\x03bye\x01b")
-    await rig.conversation.ended
-    assert rig.happened[0] == [b"a"]
-    assert rig.happened[-1] is State.CLOSED
-    assert [b"b"] not in rig.happened
-    assert rig.link.written == [b"\x07bye too"]
+async def test_messages_before_the_peers_farewell_are_delivered_before_the_end_is_told(up: Rig) -> None:
+    up.conversation.received(b"\x01a\x03bye\x01b")
+    await up.conversation.ended
+    assert up.happened[0] == [b"a"]
+    assert up.happened[-1] is State.CLOSED
+    assert [b"b"] not in up.happened
+    assert up.link.written == [b"\x07bye too"]
 
 
 async def test_malformed_messages_are_counted() -> None:
@@ -235,35 +224,31 @@ async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say
     assert session.reason == "rivalled"
 
 
-async def test_a_session_that_drops_its_source_has_its_link_forget_it() -> None:
-    rig = established()
-    rig.conversation.pump()
-    assert rig.link.sources_dropped == 0
-    rig.session.drops_source = True
-    rig.conversation.pump()
-    rig.conversation.pump()
-    assert rig.link.sources_dropped == 1
+async def test_a_session_that_drops_its_source_has_its_link_forget_it(up: Rig) -> None:
+    up.conversation.pump()
+    assert up.link.sources_dropped == 0
+    up.session.drops_source = True
+    up.conversation.pump()
+    up.conversation.pump()
+    assert up.link.sources_dropped == 1
 
 
-async def test_abandoning_ends_everything_at_once_and_twice_does_no_harm() -> None:
-    rig = established()
-    rig.session.send(b"a")
-    rig.conversation.abandon()
-    rig.conversation.abandon()
-    assert rig.conversation.ended.done()
-    assert rig.link.closed
-    assert rig.link.written == []
-    assert rig.session.state is State.CLOSED
+async def test_abandoning_ends_everything_at_once_and_twice_does_no_harm(up: Rig) -> None:
+    up.session.send(b"a")
+    up.conversation.abandon()
+    up.conversation.abandon()
+    assert up.conversation.ended.done()
+    assert up.link.closed
+    assert up.link.written == []
+    assert up.session.state is State.CLOSED
 
 
-async def test_a_conversation_that_never_had_a_link_can_be_abandoned() -> None:
-    rig = Rig()
+async def test_a_conversation_that_never_had_a_link_can_be_abandoned(rig: Rig) -> None:
     rig.conversation.abandon()
     assert rig.conversation.ended.done()
 
 
-async def test_an_ended_conversation_leaves_no_timer_behind() -> None:
-    rig = Rig()
+async def test_an_ended_conversation_leaves_no_timer_behind(rig: Rig) -> None:
     rig.conversation.attached(rig.link)
     rig.conversation.lost("closed by peer")
     happened = list(rig.happened)
@@ -271,22 +256,20 @@ async def test_an_ended_conversation_leaves_no_timer_behind() -> None:
     assert rig.happened == happened
 
 
-async def test_pause_and_resume_are_passed_to_the_link_while_there_is_one() -> None:
-    rig = established()
-    rig.conversation.pause()
-    assert rig.link.paused
-    rig.conversation.resume()
-    assert not rig.link.paused
-    rig.conversation.lost("closed by peer")
-    rig.conversation.pause()
-    assert not rig.link.paused
+async def test_pause_and_resume_are_passed_to_the_link_while_there_is_one(up: Rig) -> None:
+    up.conversation.pause()
+    assert up.link.paused
+    up.conversation.resume()
+    assert not up.link.paused
+    up.conversation.lost("closed by peer")
+    up.conversation.pause()
+    assert not up.link.paused
 
 
-async def test_malformed_messages_are_logged_ever_more_rarely(caplog: pytest.LogCaptureFixture) -> None:
-    rig = established()
+async def test_malformed_messages_are_logged_ever_more_rarely(up: Rig, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         for _ in range(100):
-            rig.conversation.received(b"\x01?")
+            up.conversation.received(b"\x01?")
     assert [record.args[1] for record in caplog.records if isinstance(record.args, tuple)] == [1, 2, 4, 8, 16, 32, 64]
     assert "what is ?" in caplog.text
 
@@ -295,16 +278,15 @@ async def test_a_conversation_prints_its_session() -> None:
     assert repr(Rig().conversation) == "<Conversation <Toy robot connecting>>"
 
 
-async def test_a_timer_that_does_not_tell_when_it_is_due_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_timer_that_does_not_tell_when_it_is_due_is_replaced(up: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """uvloop gives a plain handle for a timer that is due at once."""
-    rig = established()
-    rig.session.send(b"one")
-    rig.session.send(b"two")
-    monkeypatch.setattr(rig.loop, "call_at", lambda when, callback: asyncio.Handle(callback, (), rig.loop))
-    rig.conversation.pump()
-    rig.session.send(b"three")
-    rig.conversation.pump()
-    assert rig.session.state is State.ESTABLISHED
+    up.session.send(b"one")
+    up.session.send(b"two")
+    monkeypatch.setattr(up.loop, "call_at", lambda when, callback: asyncio.Handle(callback, (), up.loop))
+    up.conversation.pump()
+    up.session.send(b"three")
+    up.conversation.pump()
+    assert up.session.state is State.ESTABLISHED
 
 
 # Faults of the protocol's own code

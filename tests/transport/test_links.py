@@ -9,6 +9,8 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
+from tests.clock import jumping
+from tests.e2e.conftest import free_port
 from tests.transport.recorder import SOON_S, Recorder
 from zbridge.address import Address
 from zbridge.errors import LinkError
@@ -539,8 +541,8 @@ async def test_a_listener_without_datagrams_serves_no_udp() -> None:
 
 
 async def test_a_udp_port_that_is_taken_is_a_link_error_and_leaves_nothing_open() -> None:
-    with sources(1) as (taken,):
-        host, port = taken.getsockname()
+    host, port = "127.0.0.1", free_port()  # a number that no program of this machine is given by chance
+    with contextlib.closing(udp_socket((host, port))):
         with pytest.raises(LinkError, match=f"tcp://{host}:{port}"):
             async with listen(Address(host, port), Recorder, datagrams=True):
                 pass
@@ -566,6 +568,7 @@ def all_heard(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "STRAY_S", 0.0)
 
 
+@jumping
 async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() -> None:
     """So a flood costs little, however many links its host has."""
     foreign = Count()

@@ -5,12 +5,11 @@ import os
 import sys
 import termios
 import tty
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvloop
 
 from tests.transport.recorder import SOON_S, Recorder
 from zbridge.address import SerialAddress
@@ -20,7 +19,7 @@ from zbridge.transport.connect import connect
 from zbridge.transport.link import STALLED_S
 from zbridge.transport.serial import SerialLink
 
-Run = Callable[[Coroutine[Any, Any, None]], None]
+pytestmark = pytest.mark.both_loops
 
 
 class Device:
@@ -56,12 +55,6 @@ class Device:
         self.fd = self._near = -1
 
 
-@pytest.fixture(params=[asyncio.run, uvloop.run], ids=["asyncio", "uvloop"])
-def run(request: pytest.FixtureRequest) -> Run:
-    runner: Run = request.param
-    return runner
-
-
 @pytest.fixture
 def device() -> Iterator[Device]:
     made = Device()
@@ -69,7 +62,10 @@ def device() -> Iterator[Device]:
     made.unplug()
 
 
-async def connected(device: Device) -> tuple[SerialLink, Recorder]:
+Line = tuple[SerialLink, Recorder]
+
+
+async def connected(device: Device) -> Line:
     recorder = Recorder()
     link = await connect(device.address, recorder)
     assert isinstance(link, SerialLink)
@@ -77,173 +73,139 @@ async def connected(device: Device) -> tuple[SerialLink, Recorder]:
     return link, recorder
 
 
-async def closed(link: SerialLink, recorder: Recorder) -> None:
+@pytest.fixture
+async def line(device: Device) -> AsyncIterator[Line]:
+    """A link over the line, and what it brings."""
+    link, recorder = await connected(device)
+    yield link, recorder
     link.abort()
     await recorder.until("lost")
 
 
-def test_bytes_go_both_ways_whatever_they_are(run: Run, device: Device) -> None:
+def fill(link: SerialLink) -> int:
+    """Write until the line takes no more; return how much."""
+    sent = 0
+    while link.ready:
+        link.write(bytes(1000))
+        sent += 1000
+        assert sent < 1_000_000
+    return sent
+
+
+async def test_bytes_go_both_ways_whatever_they_are(device: Device) -> None:
     every_byte = bytes(range(256))
-
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        assert (link.peer, link.ready, link.silent_s) == (str(device.address), True, 0.0)
-        link.write(every_byte)
-        assert await device.read(256) == every_byte
-        device.write(every_byte)
-        await recorder.until("received", received=256)
-        assert recorder.data == every_byte
-        await closed(link, recorder)
-        assert recorder.calls.count("lost") == 1
-
-    run(scene())
+    link, recorder = await connected(device)
+    assert (link.peer, link.ready, link.silent_s) == (str(device.address), True, 0.0)
+    link.write(every_byte)
+    assert await device.read(256) == every_byte
+    device.write(every_byte)
+    await recorder.until("received", received=256)
+    assert recorder.data == every_byte
+    link.abort()
+    await recorder.until("lost")
+    assert recorder.calls.count("lost") == 1
 
 
-def test_the_line_has_the_configured_speed(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        assert device.settings()[4:6] == [termios.B57600, termios.B57600]
-        await closed(link, recorder)
-
-    run(scene())
+@pytest.mark.usefixtures("line")
+async def test_the_line_has_the_configured_speed(device: Device) -> None:
+    assert device.settings()[4:6] == [termios.B57600, termios.B57600]
 
 
-def test_a_line_that_takes_nothing_is_not_ready_until_it_takes_again(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        sent = 0
-        while link.ready:
-            link.write(bytes(1000))
-            sent += 1000
-            assert sent < 1_000_000
-        assert "writable" not in recorder.calls
-        await device.read(sent)
-        await recorder.until("writable")
-        assert link.ready
-        await closed(link, recorder)
-
-    run(scene())
+async def test_a_line_that_takes_nothing_is_not_ready_until_it_takes_again(device: Device, line: Line) -> None:
+    link, recorder = line
+    sent = fill(link)
+    assert "writable" not in recorder.calls
+    await device.read(sent)
+    await recorder.until("writable")
+    assert link.ready
 
 
-def test_what_the_line_does_not_carry_is_unacknowledged(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        assert link.unacknowledged_s == 0.0
-        sent = 0
-        while link.ready:
-            link.write(bytes(1000))
-            sent += 1000
-        await asyncio.sleep(STALLED_S + 0.1)
-        assert STALLED_S < link.unacknowledged_s < SOON_S
-        await device.read(sent)
-        await recorder.until("writable")
-        assert link.unacknowledged_s == 0.0
-        await closed(link, recorder)
-
-    run(scene())
+async def test_what_the_line_does_not_carry_is_unacknowledged(device: Device, line: Line) -> None:
+    link, recorder = line
+    assert link.unacknowledged_s == 0.0
+    sent = fill(link)
+    await asyncio.sleep(STALLED_S + 0.1)
+    assert STALLED_S < link.unacknowledged_s < SOON_S
+    await device.read(sent)
+    await recorder.until("writable")
+    assert link.unacknowledged_s == 0.0
 
 
-def test_nothing_is_read_while_paused(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        link.pause()
-        link.pause()
-        device.write(b"abc")
-        await asyncio.sleep(0.02)
-        assert not recorder.data
-        link.resume()
-        link.resume()
-        await recorder.until("received", received=3)
-        await closed(link, recorder)
-
-    run(scene())
+async def test_nothing_is_read_while_paused(device: Device, line: Line) -> None:
+    link, recorder = line
+    link.pause()
+    link.pause()
+    device.write(b"abc")
+    await asyncio.sleep(0.02)
+    assert not recorder.data
+    link.resume()
+    link.resume()
+    await recorder.until("received", received=3)
 
 
-def test_an_unplugged_device_is_lost_with_a_reason(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        device.unplug()
-        await recorder.until("lost")
-        assert recorder.reason is not None
-        assert recorder.reason.startswith("connection lost: ")
-        link.write(b"x")
-        link.pause()
-        link.resume()
-        link.close()
-        link.abort()
-        await asyncio.sleep(0)
-        assert (link.ready, link.unacknowledged_s, recorder.calls.count("lost")) == (False, 0.0, 1)
-
-    run(scene())
+async def test_an_unplugged_device_is_lost_with_a_reason(device: Device, line: Line) -> None:
+    link, recorder = line
+    device.unplug()
+    await recorder.until("lost")
+    assert recorder.reason is not None
+    assert recorder.reason.startswith("connection lost: ")
+    link.write(b"x")
+    link.pause()
+    link.resume()
+    link.close()
+    link.abort()
+    await asyncio.sleep(0)
+    assert (link.ready, link.unacknowledged_s, recorder.calls.count("lost")) == (False, 0.0, 1)
 
 
-def test_a_write_to_an_unplugged_device_is_lost_later_and_not_within_the_write(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        link.pause()
-        device.unplug()
-        link.write(b"x")
-        assert "lost" not in recorder.calls
-        assert not link.ready
-        await recorder.until("lost")
-
-    run(scene())
+async def test_a_write_to_an_unplugged_device_is_lost_later_and_not_within_the_write(device, line) -> None:
+    link, recorder = line
+    link.pause()
+    device.unplug()
+    link.write(b"x")
+    assert "lost" not in recorder.calls
+    assert not link.ready
+    await recorder.until("lost")
 
 
-def test_close_writes_what_waits_first(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        sent = 0
-        while link.ready:
-            link.write(bytes(1000))
-            sent += 1000
-        link.close()
-        link.close()
-        link.write(b"too late")
-        assert await device.read(sent) == bytes(sent)
-        await recorder.until("lost")
-        assert recorder.reason == "closed"
-
-    run(scene())
+async def test_close_writes_what_waits_first(device: Device, line: Line) -> None:
+    link, recorder = line
+    sent = fill(link)
+    link.close()
+    link.close()
+    link.write(b"too late")
+    assert await device.read(sent) == bytes(sent)
+    await recorder.until("lost")
+    assert recorder.reason == "closed"
 
 
-def test_close_waits_for_a_line_that_takes_nothing_only_so_long(run, device, monkeypatch) -> None:
+async def test_close_waits_for_a_line_that_takes_nothing_only_so_long(device, monkeypatch, line) -> None:
     monkeypatch.setattr(serial, "CLOSE_S", 0.05)
-
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        while link.ready:
-            link.write(bytes(1000))
-        link.close()
-        await recorder.until("lost")
-
-    run(scene())
+    link, recorder = line
+    fill(link)
+    link.close()
+    await recorder.until("lost")
 
 
-def test_a_line_in_use_is_refused_and_free_again_after_it(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        with pytest.raises(LinkError, match="another program uses this line"):
-            await connect(device.address, Recorder())
-        await closed(link, recorder)
-        link, recorder = await connected(device)
-        device.write(b"x")
-        await recorder.until("received", received=1)
-        await closed(link, recorder)
+async def test_a_line_in_use_is_refused_and_free_again_after_it(device: Device, line: Line) -> None:
+    link, recorder = line
+    with pytest.raises(LinkError, match="another program uses this line"):
+        await connect(device.address, Recorder())
+    link.abort()
+    await recorder.until("lost")
+    link, recorder = await connected(device)
+    device.write(b"x")
+    await recorder.until("received", received=1)
+    link.abort()
+    await recorder.until("lost")
 
-    run(scene())
 
-
-def test_datagrams_are_nobodys(run: Run, device: Device) -> None:
-    async def scene() -> None:
-        link, recorder = await connected(device)
-        link.write_datagram(b"lost")
-        link.drop_source()
-        link.write(b"kept")
-        assert await device.read(4) == b"kept"
-        await closed(link, recorder)
-
-    run(scene())
+async def test_datagrams_are_nobodys(device: Device, line: Line) -> None:
+    link, _ = line
+    link.write_datagram(b"lost")
+    link.drop_source()
+    link.write(b"kept")
+    assert await device.read(4) == b"kept"
 
 
 @pytest.mark.parametrize(
@@ -260,25 +222,21 @@ async def test_without_pyserial_the_error_names_the_extra(monkeypatch: pytest.Mo
         await connect(SerialAddress("/dev/ttyUSB0", 9600), Recorder())
 
 
-def test_a_device_that_is_plugged_in_again_is_connected_again(run: Run, device: Device, tmp_path: Path) -> None:
+async def test_a_device_that_is_plugged_in_again_is_connected_again(device: Device, tmp_path: Path) -> None:
     line = tmp_path / "robot"
     line.symlink_to(device.address.path)
     address = SerialAddress(str(line), 57600)
-
-    async def scene() -> None:
-        recorder = Recorder()
-        await connect(address, recorder)
-        device.unplug()
-        await recorder.until("lost")
-        again = Device()
-        line.unlink()
-        line.symlink_to(again.address.path)
-        recorder = Recorder()
-        link = await connect(address, recorder)
-        again.write(b"back")
-        await recorder.until("received", received=4)
-        link.close()
-        await recorder.until("lost")
-        again.unplug()
-
-    run(scene())
+    recorder = Recorder()
+    await connect(address, recorder)
+    device.unplug()
+    await recorder.until("lost")
+    again = Device()
+    line.unlink()
+    line.symlink_to(again.address.path)
+    recorder = Recorder()
+    link = await connect(address, recorder)
+    again.write(b"back")
+    await recorder.until("received", received=4)
+    link.close()
+    await recorder.until("lost")
+    again.unplug()

@@ -35,8 +35,7 @@ LINES: Lines[Line] = Lines((Drive, Ask, Warm))
 
 
 @pytest.mark.parametrize(
-    ("message", "line"),
-    [(Drive(100, -100), b"D,100,-100\n"), (Ask(), b"ask\n"), (Warm(21.5), b"w,21.500000\n")],
+    ("message", "line"), [(Drive(100, -100), b"D,100,-100\n"), (Ask(), b"ask\n"), (Warm(21.5), b"w,21.500000\n")]
 )
 def test_lines_both_ways(message: Line, line: bytes) -> None:
     assert LINES.write(message) == line
@@ -53,20 +52,11 @@ def test_the_separator_is_the_protocols() -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        b"\n",
-        b"X\n",
-        b"d,1,2\n",
-        b"D\n",
-        b"D,1\n",
-        b"D,1,2,3\n",
-        b"D,1,\n",
-        b"D,1,2x3\n",
-        b"D,1,128\n",
-        b"D,1,+2\n",
-        b"ask,\n",
+        b"\n", b"X\n", b"d,1,2\n", b"D\n", b"D,1\n", b"D,1,2,3\n", b"D,1,\n", b"D,1,2x3\n", b"D,1,128\n",
+        b"D,1,+2\n", b"ask,\n",
     ]
     + [b"D,1, 2\n", b"D,1,0.5\n", b"D,1,1_0\n", b"ask,1\n", b"\xff\n"],
-)
+)  # fmt: skip
 def test_what_is_no_line_of_the_protocol(line: bytes) -> None:
     with pytest.raises(ProtocolError):
         LINES.read(line)

@@ -213,38 +213,25 @@ def test_truth_is_every_number_but_zero(text: bytes, on: bool) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        b"1|-2",
-        b"|1|-2|",
-        b"1||-2",
-        b"1-2",
-        b"1 -2",
-        b"1,-2",
-        b"1\n-2\r\n",
-        b"speed 1, angle -2 degrees",
-        b"- 1|--2",
-        b"+1|+-2",
-        b"01|-002",
-        b"\x00\xff1\x00-2\xfe",
-        b"1;-2",
+        b"1|-2", b"|1|-2|", b"1||-2", b"1-2", b"1 -2", b"1,-2", b"1\n-2\r\n", b"speed 1, angle -2 degrees",
+        b"- 1|--2", b"+1|+-2", b"01|-002", b"\x00\xff1\x00-2\xfe", b"1;-2",
     ],
-)
+)  # fmt: skip
 def test_everything_but_a_number_separates(body: bytes) -> None:
     assert PAIR.decode(body) == Pair(1, -2)
 
 
-def test_a_minus_belongs_to_a_number_only_where_it_touches_it() -> None:
-    assert PAIR.decode(b"- 1|-|2") == Pair(1, 2)
-
-
-def test_a_number_has_one_point() -> None:
-    assert REALS.decode(b"1.2.3") == Reals(1.2, 0.3)
-    assert REALS.decode(b"1...2") == Reals(1.0, 0.2)
-
-
-def test_an_exponent_is_a_field_of_its_own() -> None:
-    assert REALS.decode(b"1.5e3") == Reals(1.5, 3.0)
-    with pytest.raises(ProtocolError, match="2 fields, expected 1"):
-        REAL.decode(b"1.5e3")
+@pytest.mark.parametrize(
+    ("codec", "body", "message"),
+    [
+        (PAIR, b"- 1|-|2", Pair(1, 2)),  # a minus belongs to a number only where it touches it
+        (REALS, b"1.2.3", Reals(1.2, 0.3)),  # a number has one point
+        (REALS, b"1...2", Reals(1.0, 0.2)),
+        (REALS, b"1.5e3", Reals(1.5, 3.0)),  # an exponent is a field of its own
+    ],
+)
+def test_a_number_ends_where_it_can_be_no_longer(codec: TextCodec[Any], body: bytes, message: Message) -> None:
+    assert codec.decode(body) == message
 
 
 # Fields that are missing, too many, empty, no numbers, out of range
@@ -260,6 +247,7 @@ def test_an_exponent_is_a_field_of_its_own() -> None:
         (PAIR, b"1|nan", "1 fields"),
         (PAIR, b"one|two", "0 fields"),
         (PAIR, b"1|2|3", "3 fields"),
+        (REAL, b"1.5e3", "2 fields, expected 1"),
         (REAL, b"inf", "0 fields"),
         (REAL, b".", "0 fields"),
         (REAL, b"-", "0 fields"),
@@ -273,31 +261,31 @@ def test_a_wrong_number_of_fields_is_a_protocol_error(codec: TextCodec[Any], bod
         codec.decode(body)
 
 
+FIELDS = [b"7", b"-300", b"-2", b"4", b"1.5", b"-0.25", b"1", b"0.9", b"-90"]
+"""Of a message with every kind of field."""
+
+
+def everything_with(place: int, number: bytes) -> bytes:
+    return b"|".join([*FIELDS[:place], number, *FIELDS[place + 1 :]])
+
+
 @pytest.mark.parametrize("place", range(9))
 @pytest.mark.parametrize("number", [GOOGOL4, b"-" + GOOGOL4, b"9" * 6000], ids=["10^400", "-10^400", "6000 nines"])
 def test_a_number_that_nothing_can_hold_is_a_protocol_error_in_every_kind_of_field(place: int, number: bytes) -> None:
-    fields = [b"7", b"-300", b"-2", b"4", b"1.5", b"-0.25", b"1", b"0.9", b"-90"]
-    fields[place] = number
     with pytest.raises(ProtocolError) as caught:
-        EVERYTHING.decode(b"|".join(fields))
+        EVERYTHING.decode(everything_with(place, number))
     assert len(str(caught.value)) < 300
 
 
+OUT_OF_RANGE = {0: (256, -1), 1: (32768, -32769), 2: (2147483648, -2147483649), 3: (4294967296, -1), 8: (91, -91)}
+
+
 @pytest.mark.parametrize(
-    ("place", "number"),
-    [
-        *((0, number) for number in (b"256", b"-1")),
-        *((1, number) for number in (b"32768", b"-32769")),
-        *((2, number) for number in (b"2147483648", b"-2147483649")),
-        *((3, number) for number in (b"4294967296", b"-1")),
-        *((8, number) for number in (b"91", b"-91")),
-    ],
+    ("place", "number"), [(place, number) for place in OUT_OF_RANGE for number in OUT_OF_RANGE[place]]
 )
-def test_an_integer_out_of_its_range_is_a_protocol_error(place: int, number: bytes) -> None:
-    fields = [b"7", b"-300", b"-2", b"4", b"1.5", b"-0.25", b"1", b"0.9", b"-90"]
-    fields[place] = number
+def test_an_integer_out_of_its_range_is_a_protocol_error(place: int, number: int) -> None:
     with pytest.raises(ProtocolError, match=r"Everything\.\w+ = .*expected -?\d+ to \d+"):
-        EVERYTHING.decode(b"|".join(fields))
+        EVERYTHING.decode(everything_with(place, b"%d" % number))
 
 
 @pytest.mark.parametrize(
@@ -366,51 +354,30 @@ def test_an_array_is_written_from_anything_that_holds_numbers(values: Any) -> No
     assert SWEEP.encode(Sweep(5, values, 9)) == b"5|1|2|3|9"
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        [math.nan],
-        [1, math.inf],
-        np.array([1.0, math.nan]),
-        np.array([1.0, -math.inf], np.float32),
-        ["near"],
-        [None],
-        [2**31],
-        [2**70],
-        None,
-    ],
-    ids=repr,
-)
+NOT_FINITE = ([math.nan], [1, math.inf], np.array([1.0, math.nan]), np.array([1.0, -math.inf], np.float32))
+
+
+@pytest.mark.parametrize("values", [*NOT_FINITE, ["near"], [None], [2**31], [2**70], None], ids=repr)
 def test_an_array_that_readers_cannot_hold_is_an_encode_error(values: Any) -> None:
     with pytest.raises(EncodeError, match="Sweep"):
         SWEEP.encode(Sweep(5, values, 9))
 
 
 @pytest.mark.parametrize(
-    ("body", "expected"),
+    "body",
     [
-        (b"5|10|20|9|", (5, [10, 20], 9)),
-        (b"|5|10|20|9", (5, [10, 20], 9)),
-        (b"5||10|20|9", (5, [10, 20], 9)),
-        (b"5|10 20|9", (5, [10, 20], 9)),
-        (b"5|10|20 9", (5, [10, 20], 9)),
-        (b"5|10|20|9x", (5, [10, 20], 9)),
-        (b"5, 10, 20, 9\r\n", (5, [10, 20], 9)),
-        (b"5|10-20|9", (5, [10, -20], 9)),
-        (b"5|\x0010|\xff20|9", (5, [10, 20], 9)),
-        (b"5|+10|20|9", (5, [10, 20], 9)),
-        (b"5| 10|\t20|9", (5, [10, 20], 9)),
-        (b"5|010|0020|9", (5, [10, 20], 9)),
-        (b"5|--10|20|9", (5, [-10, 20], 9)),
-        (b"5|- 10|20|9", (5, [10, 20], 9)),
-        (b"5|-|10|20|9", (5, [10, 20], 9)),
-        (b"5|+|10|20|9", (5, [10, 20], 9)),
-        (b"5|10|20|-|9", (5, [10, 20], 9)),
-        (b"5|10|-\n20|9", (5, [10, 20], 9)),
+        *(b"5|10|20|9|", b"|5|10|20|9", b"5||10|20|9", b"5|10 20|9", b"5|10|20 9", b"5|10|20|9x", b"5, 10, 20, 9\r\n"),
+        *(b"5|\x0010|\xff20|9", b"5|+10|20|9", b"5| 10|\t20|9", b"5|010|0020|9", b"5|- 10|20|9", b"5|-|10|20|9"),
+        *(b"5|+|10|20|9", b"5|10|20|-|9", b"5|10|-\n20|9"),
     ],
 )
-def test_everything_but_a_number_separates_around_an_array_too(body, expected) -> None:
-    assert row(SWEEP.decode(body)) == expected
+def test_everything_but_a_number_separates_around_an_array_too(body: bytes) -> None:
+    assert row(SWEEP.decode(body)) == (5, [10, 20], 9)
+
+
+@pytest.mark.parametrize(("body", "points"), [(b"5|10-20|9", [10, -20]), (b"5|--10|20|9", [-10, 20])])
+def test_a_minus_that_touches_a_number_of_an_array_belongs_to_it(body: bytes, points: list[int]) -> None:
+    assert row(SWEEP.decode(body)) == (5, points, 9)
 
 
 @pytest.mark.parametrize("place", range(5))
@@ -533,21 +500,16 @@ HEAD, TAIL = "07000000", "01 feffffff"
 POINTS = "e803000000000000 0000000000000000 fdffffffffffffff 0000000000000080"
 
 
-def test_an_array_that_fills_a_message_is_read_and_written() -> None:
-    body = bytes.fromhex(HEAD + POINTS + TAIL)
+@pytest.mark.parametrize(("points", "values"), [(POINTS, [1000, 0, -3, -(2**63)]), ("", [])])
+def test_an_array_that_fills_a_message_is_read_and_written_and_may_be_empty(points: str, values: list[int]) -> None:
+    body = bytes.fromhex(HEAD + points + TAIL)
     message = PACKED.decode(body, 0)
     assert (message.sequence, message.first, message.last) == (7, 1, 2**32 - 2)
-    assert message.points.tolist() == [1000, 0, -3, -(2**63)]
+    assert message.points.tolist() == values
     assert message.points.dtype == np.dtype("<i8")
     assert not message.points.flags.writeable
     assert PACKED.encode(message) == body
-    assert PACKED.decode(b"\xff\xff" + body, 2).points.tolist() == [1000, 0, -3, -(2**63)]
-
-
-def test_an_array_that_fills_a_message_may_be_empty() -> None:
-    message = PACKED.decode(bytes.fromhex(HEAD + TAIL), 0)
-    assert (message.points.tolist(), message.last) == ([], 2**32 - 2)
-    assert PACKED.encode(message) == bytes.fromhex(HEAD + TAIL)
+    assert PACKED.decode(b"\xff\xff" + body, 2).points.tolist() == values
 
 
 def test_the_bytes_that_are_always_there_are_known() -> None:

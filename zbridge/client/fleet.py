@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 from collections.abc import AsyncIterator, Iterable
 from typing import Any
 
@@ -41,6 +42,9 @@ CONFIRM_S = 2.0
 """Longest wait for the confirmation of a stop, seconds."""
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
+_attempts = itertools.count(1)
+"""Numbers the wishes for a lease. Each has a liveliness token of its own: a gateway may hear of the end of the token of
+an earlier wish only after it has granted a later one, which must not end for it."""
 _STOP_EVERY_S = 0.05
 _ASK_S = 0.3
 
@@ -134,7 +138,7 @@ class ControlFeed(StateFeed[Control]):
             priority=priority,
             lease_s=lease_s,
             deadman_s=deadman_s,
-            alive=f"operator.{escape(name)}.{self._bus.zid}",
+            alive=f"operator.{escape(name)}.{self._bus.zid}.{next(_attempts)}",
         )
         async with holding(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s) as driver:
             yield driver

@@ -59,7 +59,6 @@ def main(arguments: list[str]) -> int:
     except ConfigError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    logging.disable(logging.CRITICAL)
     failed = held = 0
     for finding in check(protocol, arguments[0]):
         failed, held = failed + (finding.problem is not None), held + (finding.problem is None)

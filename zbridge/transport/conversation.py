@@ -128,12 +128,11 @@ class Conversation:
         self._foreign.value += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
-        session = self.session
-        if not session.over:
+        if not self.session.over:
             self._notify()
         if messages:  # the messages before the end of a session are delivered before the end is reported
             self._deliver(messages)
-        if session.traffic.malformed != self._malformed_logged:
+        if self.session.traffic.malformed != self._malformed_logged:
             self._report_malformed()
 
     def _fault(self, error: Exception) -> None:

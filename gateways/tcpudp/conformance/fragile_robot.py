@@ -110,7 +110,9 @@ class FragileRobot(FragileServer):
         self._sending = asyncio.Lock()
         self._empty_at = self._unread_s = 0.0
         self._wake_at = 0.0
-        self._closed_at = 0.0
+        self._awake_s = 0.0
+        """This process's own time, which stands still while the process is late: it judges what was in flight."""
+        self._closed_s = 0.0
         self._forget()
 
     def _forget(self) -> None:
@@ -175,7 +177,7 @@ class FragileRobot(FragileServer):
         except OSError as error:
             self._event(f"the connection broke: {error!r}")
         finally:
-            self._phase, self._conn, self._closed_at = _Phase.FROZEN, None, time.monotonic()
+            self._phase, self._conn, self._closed_s = _Phase.FROZEN, None, self._awake_s
             self._awake.set()
             with contextlib.suppress(OSError):
                 conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
@@ -240,7 +242,7 @@ class FragileRobot(FragileServer):
         if self._loses():
             return
         if self._phase is _Phase.FROZEN:
-            if time.monotonic() - self._closed_at > self._times.flight_s:
+            if self._awake_s - self._closed_s > self._times.flight_s:
                 self._violate(f"a datagram after the TCP connection ended: {show(data)}")
             return
         if not self._offered:
@@ -313,7 +315,7 @@ class FragileRobot(FragileServer):
             return f"packet {kind} by {channel.upper()} instead of {'UDP' if by_udp else 'TCP'}"
         if channel == "tcp" and kind != wire.UDP_STATUS and time.monotonic() < self._quiet_until:
             return f"packet {kind} by TCP within {self._times.silence_s:g} s of the 4"
-        if kind == wire.GET_MAP and time.monotonic() - self._parts_since > self._times.flight_s:
+        if kind == wire.GET_MAP and self._awake_s - self._parts_since > self._times.flight_s:
             return "packet 52 to a robot that sends its map in parts by itself"
         return wire.body_problem(kind, body)
 
@@ -362,6 +364,7 @@ class FragileRobot(FragileServer):
         await self._send(wire.START_UDP)
         self._start(self._miss_status())
         await asyncio.sleep(self._times.probe_s)
+        late_s = time.monotonic() - self._wake_at
         self._phase = _Phase.WOKEN
         self._awake.set()
         data = self._waiting()
@@ -374,7 +377,9 @@ class FragileRobot(FragileServer):
         if data is not None:
             packets, rest, _ = wire.cut(data)
             if rest or [packet.kind for packet in packets] != [wire.UDP_STATUS]:
-                self._violate(f"TCP other than one 7 within {self._times.probe_s:g} s of the 4: {show(data)}")
+                problem = f"TCP other than one 7 within {self._times.probe_s:g} s of the 4: {show(data)}"
+                late = f" (this process slept {late_s:.2f} s too long)"
+                self._violate(problem + late * (self._times.probe_s + late_s >= self._times.silence_s))
             await self._read(data)
 
     async def _miss_status(self) -> None:
@@ -412,6 +417,7 @@ class FragileRobot(FragileServer):
         ticker = Ticker(_STEP_S)
         while True:
             await ticker.tick()
+            self._awake_s += min(ticker.passed_s, _STEP_S)
             self.machine.step(min(ticker.passed_s, _MOST_MOVE_S))
 
     async def _send_map(self) -> None:
@@ -430,7 +436,7 @@ class FragileRobot(FragileServer):
                     if self._conn is not conn:
                         return
                     await self._send(wire.MAP_PART, body)
-                    self._parts_since = min(self._parts_since, time.monotonic())
+                    self._parts_since = min(self._parts_since, self._awake_s)
                     await asyncio.sleep(self._times.part_s)
 
     async def _chatter(self, conn: socket.socket | None) -> None:

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gateways.alf.messages import (
     MESSAGES,
@@ -13,7 +11,6 @@ from gateways.alf.messages import (
     Dialect,
     DriveCommand,
     DriveInfo,
-    End,
     Measurement,
     ScannerInit,
     Sender,
@@ -33,7 +30,6 @@ from tests.gateways.alf.golden import (
     ALL,
     BINARY,
     DRIVE_BYTES,
-    GOLDEN_BINARY,
     GOLDEN_TEXT,
     INFO_BYTES,
     INIT_BYTES,
@@ -126,26 +122,13 @@ def test_a_text_that_is_no_message_is_a_protocol_error_that_says_why(text: bytes
 
 
 @pytest.mark.parametrize("golden", [golden for _, golden in GOLDEN_TEXT])
-def test_ten_to_the_four_hundred_is_a_protocol_error_in_every_field_of_every_message(golden: bytes) -> None:
+def test_a_text_with_a_field_missing_or_empty_or_no_number_or_one_of_400_digits_is_a_protocol_error(golden) -> None:
     fields = golden[:-1].split(b"|")
     for place in range(len(fields)):
-        for number in (GOOGOL4, b"-" + GOOGOL4, GOOGOL4 + b".000000"):
-            broken = b"|".join(fields[:place] + [number] + fields[place + 1 :]) + b";"
-            try:
-                message = read_text(broken, ALL)
-            except ProtocolError:
-                continue
-            pytest.fail(f"field {place} = {number[:9]!r}... was taken: {plain(message)}")
-
-
-@pytest.mark.parametrize("golden", [golden for _, golden in GOLDEN_TEXT])
-def test_a_text_with_a_field_missing_or_empty_or_no_number_is_a_protocol_error(golden: bytes) -> None:
-    fields = golden[:-1].split(b"|")
-    for place in range(1, len(fields)):
-        for instead in ([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]):
+        huge = ([GOOGOL4], [b"-" + GOOGOL4], [GOOGOL4 + b".000000"])
+        for instead in (*huge, *(([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]) if place else ())):
             broken = b"|".join(fields[:place] + instead + fields[place + 1 :]) + b";"
-            got = heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken)
-            assert got == []
+            assert heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken) == []
 
 
 def test_tolerance_goes_no_further_than_the_readers_of_the_field_and_as_far() -> None:
@@ -189,65 +172,42 @@ def test_every_byte_of_light_but_zero_is_on() -> None:
 
 
 @pytest.mark.parametrize(
-    "message",
+    ("write", "message"),
     [
-        DriveCommand(-1, 0, 0, False),
-        DriveCommand(2**31, 0, 0, False),
-        DriveCommand(0, 0, -91, False),
-        DriveCommand(0, 0, 91, False),
-        DriveInfo(0, math.nan, 0, 0, 0, 0, 0, 0),
-        DriveInfo(0, 0, 0, 0, 0, 0, 0, math.inf),
-        ScannerInit(math.nan, 0, 1, 0, 0, 0),
-        ScannerInit(0, 0, 1, 2**31, 0, 0),
-        Measurement(0, 0, np.array([2**31]), 0, 0),
+        (write_text, DriveCommand(-1, 0, 0, False)),
+        (write_text, DriveCommand(2**31, 0, 0, False)),
+        (write_text, DriveCommand(0, 0, -91, False)),
+        (write_text, DriveCommand(0, 0, 91, False)),
+        (write_text, DriveInfo(0, math.nan, 0, 0, 0, 0, 0, 0)),
+        (write_text, DriveInfo(0, 0, 0, 0, 0, 0, 0, math.inf)),
+        (write_text, ScannerInit(math.nan, 0, 1, 0, 0, 0)),
+        (write_text, ScannerInit(0, 0, 1, 2**31, 0, 0)),
+        (write_text, Measurement(0, 0, np.array([2**31]), 0, 0)),
+        (write_binary, DriveCommand(256, 0, 0, False)),
+        (write_binary, DriveCommand(0, 0, -1, False)),
+        (write_binary, DriveInfo(0, 32768, 0, 0, 0, 0, 0, 0)),
+        (write_binary, DriveInfo(0, 0.25, 0, 0, 0, 0, 0, 0)),
+        (write_binary, Measurement(2**32, 0, np.zeros(3, np.int64), 0, 0)),
+        (write_binary, Measurement(0, 0, np.zeros(3, np.int64), -1, 0)),
     ],
 )
-def test_what_text_cannot_carry_is_an_encode_error(message: AlfMessage) -> None:
+def test_what_a_dialect_cannot_carry_is_an_encode_error(write, message: AlfMessage) -> None:
     with pytest.raises(EncodeError):
-        write_text(message)
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        DriveCommand(256, 0, 0, False),
-        DriveCommand(0, 0, -1, False),
-        DriveInfo(0, 32768, 0, 0, 0, 0, 0, 0),
-        DriveInfo(0, 0.25, 0, 0, 0, 0, 0, 0),
-        Measurement(2**32, 0, np.zeros(3, np.int64), 0, 0),
-        Measurement(0, 0, np.zeros(3, np.int64), -1, 0),
-    ],
-)
-def test_what_binary_cannot_carry_is_an_encode_error(message: AlfMessage) -> None:
-    with pytest.raises(EncodeError):
-        write_binary(message)
+        write(message)
 
 
 # Framing
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-def test_a_full_scan_comes_whole_byte_by_byte(dialect: Dialect) -> None:
-    scan = Measurement(7, 5000, np.arange(1000, 1769), 44, 725)
+def test_a_full_scan_comes_whole_also_a_thousand_in_one_read(dialect: Dialect) -> None:
     if dialect is TEXT:
         frame = b"1|7|5000|" + b"".join(b"%d|" % mm for mm in range(1000, 1769)) + b"44|725;"
     else:
         points = b"".join(mm.to_bytes(8, "little") for mm in range(1000, 1769))
         frame = bytes.fromhex("01 07000000 88130000") + points + bytes.fromhex("2c000000 d5020000")
-    by = session(HqRole, dialect, 769)
-    assert heard(by, *(frame[at : at + 1] for at in range(len(frame)))) == [plain(scan)]
-
-
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_thousand_scans_may_come_in_one_read(dialect: Dialect) -> None:
-    if dialect is TEXT:
-        frame = b"1|7|5000|" + b"1000|" * 769 + b"44|725;"
-    else:
-        frame = bytes.fromhex("01 07000000 88130000" + "e803000000000000" * 769 + "2c000000 d5020000")
-    by = session(HqRole, dialect, 769)
-    scans = by.receive(frame * 1000, 0.0)
-    assert len(scans) == 1000
-    assert all(isinstance(scan, Measurement) and (scan.points == 1000).all() for scan in scans)
+    scan = plain(Measurement(7, 5000, np.arange(1000, 1769), 44, 725))
+    assert heard(session(HqRole, dialect, 769), frame * 1000) == [scan] * 1000
 
 
 @pytest.mark.parametrize("read_bytes", [1000, 65_536])
@@ -269,40 +229,21 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory(read_bytes: 
     assert by.traffic.malformed >= 1
 
 
-@pytest.mark.parametrize("length", [text_limit(769) + 100, 3 * text_limit(769), 500_000])
+LIMIT = text_limit(769)
+LONG = [
+    *(b"1" + b"|3|80|0|30|1" * (length // 12) + b";" for length in (LIMIT + 100, 3 * LIMIT, 500_000)),
+    *(b"1|" + b"9" * (LIMIT - 2 - cut) + tail for cut in range(12) for tail in (b"3|80|0|30|1;", b"255|1;")),
+]
+
+
 @pytest.mark.parametrize("read_bytes", [1 << 20, 4096, 1000])
-def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(length, read_bytes) -> None:
-    """The end of a message that is too long may look like one: cut anywhere, it must not drive a vehicle."""
-    long = b"1" + b"|3|80|0|30|1" * (length // 12) + b";"
+@pytest.mark.parametrize("long", LONG, ids=range(len(LONG)))
+def test_after_a_text_that_is_too_long_the_next_one_is_read_and_nothing_of_the_long_one(long, read_bytes) -> None:
+    """The end of a message that is too long may look like one: cut anywhere, it must not drive a vehicle or end it."""
     by = session(VehicleRole, TEXT, 769)
-    data = long + b"3|50|1|-90|0;"
-    assert heard(by, *(data[at : at + read_bytes] for at in range(0, len(data), read_bytes))) == [
-        plain(DriveCommand(50, 1, -90, False))
-    ]
+    reads = [long[at : at + read_bytes] for at in range(0, len(long), read_bytes)]
+    assert heard(by, *reads, b"3|50|1|-90|0;") == [plain(DriveCommand(50, 1, -90, False))]
     assert by.traffic.malformed >= 1
-    assert by.state is State.ESTABLISHED
-
-
-@pytest.mark.parametrize("offset", range(12))
-def test_nothing_of_a_text_that_is_too_long_is_taken_for_a_message_wherever_it_is_cut(offset: int) -> None:
-    """And an END in it ends nothing."""
-    limit = text_limit(769)
-    for tail in (b"3|80|0|30|1;", b"255|1;"):
-        by = session(VehicleRole, TEXT, 769)
-        long = b"1|" + b"9" * (limit - 2 - offset) + tail
-        assert heard(by, long, b"3|50|1|-90|0;") == [plain(DriveCommand(50, 1, -90, False))]
-        assert by.state is State.ESTABLISHED
-
-
-def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
-    by = session(HqRole, TEXT)
-    good = b"1|7|5000|1000|0|3|1|2;"
-    bad = (b"1|7|5000|1000|0|3|1;", b"9|9;", b";", b"hello;", b"3|80|0|30|1;", b"4|1|2;", b"1|" + GOOGOL4 + b";")
-    for number, text in enumerate(bad, 1):
-        assert heard(by, text + good) == [plain(Measurement(7, 5000, np.array([1000, 0, 3]), 1, 2))]
-        assert by.traffic.malformed == number
-        assert by.last_malformed
-    assert "without an id" not in (by.last_malformed or "")
     assert by.state is State.ESTABLISHED
 
 
@@ -310,7 +251,7 @@ def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
     ("kind", "garbage"),
     [
         (HqRole, b"\x00"),
-        (HqRole, bytes(10_000)),
+        (HqRole, bytes(5_000)),
         (HqRole, bytes.fromhex("03 50 00 78 00")),
         (HqRole, b"hello, vehicle"),
         (HqRole, bytes(range(5, 255))),
@@ -322,7 +263,8 @@ def test_a_bad_text_is_counted_shown_and_the_next_one_is_read() -> None:
 def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[AlfSession], garbage: bytes) -> None:
     golden = INFO_BYTES if kind is HqRole else DRIVE_BYTES
     message = plain(read_binary(golden, ALL))
-    for reads in ((garbage + golden,), (golden + garbage, golden), (garbage, golden)):
+    byte_by_byte = [garbage[at : at + 1] for at in range(len(garbage))]
+    for reads in ([garbage + golden], [golden + garbage, golden], [garbage, golden], [*byte_by_byte, golden]):
         by = session(kind, BINARY)
         assert heard(by, *reads) == [message] * b"".join(reads).count(golden)
         assert by.traffic.malformed >= 1
@@ -330,22 +272,11 @@ def test_bytes_that_begin_no_binary_message_are_counted_and_skipped(kind: type[A
         assert by.state is State.ESTABLISHED
 
 
-def test_binary_garbage_byte_by_byte_is_skipped_too() -> None:
-    by = session(HqRole, BINARY)
-    assert heard(by, *[b"\x00"] * 5000, INFO_BYTES) == [plain(DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5))]
-    assert by.traffic.malformed >= 1
-
-
-def test_endless_binary_garbage_takes_bounded_memory_and_makes_few_frames() -> None:
-    frame_end = binary_frame_end(OF_VEHICLE, lambda: 769)
-    buffer = FrameBuffer(frame_end, 80_017)
+def test_endless_binary_garbage_takes_bounded_memory_and_a_measurement_no_more_than_its_length() -> None:
+    buffer = FrameBuffer(binary_frame_end(OF_VEHICLE, lambda: 769), 80_017)
     frames = sum(len(list(buffer.feed(bytes(65_536)))) for _ in range(100))
     assert len(buffer) == 0
     assert frames <= 100 * 65_536 // 1000
-
-
-def test_a_binary_measurement_that_is_not_whole_is_kept_and_no_more_of_it_than_its_length() -> None:
-    buffer = FrameBuffer(binary_frame_end(OF_VEHICLE, lambda: 769), 80_017)
     assert list(buffer.feed(b"\x01" + bytes(6167))) == []
     assert len(buffer) == 6168
     assert [len(frame) for frame in buffer.feed(b"\x00" + INIT_BYTES)] == [6169, 25]
@@ -371,19 +302,3 @@ def test_a_message_of_the_wrong_side_is_no_message() -> None:
 
 
 # Anything at all
-
-PIECES = st.one_of(
-    st.binary(max_size=30),
-    st.sampled_from([golden for message, golden in GOLDEN_TEXT + GOLDEN_BINARY if not isinstance(message, End)]),
-    st.sampled_from([b"3|80|", b";", b"1|", b"\x01", b"\xff\x00", b"4|"]),
-)
-
-
-@given(st.sampled_from(list(Dialect)), st.sampled_from([HqRole, VehicleRole]), st.lists(PIECES, max_size=12))
-def test_random_reads_give_messages_or_are_counted_and_end_nothing_but_by_end(dialect, kind, reads) -> None:
-    by = session(kind, dialect)
-    ids = OF_VEHICLE if kind is HqRole else OF_HQ
-    for read in reads:
-        for message in by.receive(read, 0.0):
-            assert message.spec.id in ids
-    assert by.state is State.ESTABLISHED or by.reason == "ended"

@@ -7,8 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, End, Measurement, ScannerInit
+from gateways.alf.messages import AlfMessage, Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import AlfSession, HqRole, VehicleRole
+from tests.gateways.rig import drained, exchange
 from zbridge.errors import Refused
 from zbridge.protocol.session import Role, State
 
@@ -40,32 +41,21 @@ def vehicle(dialect: Dialect = TEXT) -> VehicleRole:
     return session
 
 
-def waiting(session: AlfSession, now: float) -> list[bytes]:
-    """What may be written now."""
-    frames = []
-    while (frame := session.outgoing(now)) is not None:
-        frames.append(frame)
-        assert len(frames) < 1000
-    return frames
-
-
-def until(session: AlfSession, start: float, end: float) -> list[tuple[float, bytes]]:
+def until(
+    session: AlfSession, start: float, end: float, *driven: tuple[float, DriveCommand]
+) -> list[tuple[float, bytes]]:
     """What leaves from ``start`` up to but not at ``end``, with its time, by the session's own deadlines."""
-    sent, now = [], start
+    sent, now, commands = [], start, list(driven)
     while now < end:
-        sent += [(now, frame) for frame in waiting(session, now)]
-        due = session.deadline()
-        if due is None:
-            break
+        while commands and commands[0][0] <= now:
+            session.drive(commands.pop(0)[1], now)
+            assert session.deadline() == pytest.approx(now), "a new command goes out at once"
+        sent += [(now, frame) for frame in drained(session, now)]
+        due = min(session.deadline() or end, commands[0][0] if commands else end)
         assert due > now, "a timer that is due at once again"
         now = due
         session.expire(now)
     return sent
-
-
-def timed(sent: list[tuple[float, bytes]]) -> list[tuple[int, bytes]]:
-    """The same in whole milliseconds."""
-    return [(round(at * 1000), frame) for at, frame in sent]
 
 
 # Who is connected is established
@@ -79,104 +69,81 @@ def test_who_is_connected_is_established_and_no_handshake_is_ever_overdue(kind, 
     session.open(0.0)
     assert before is State.CONNECTING
     assert (session.role, session.state, session.reason) == (role, State.ESTABLISHED, None)
-    assert waiting(session, 0.0) == []
+    assert drained(session, 0.0) == []
     session.expire(3600.0)
     assert session.state is State.ESTABLISHED
     assert session.deadline() is None
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_messages_are_delivered_from_the_first_byte_on(dialect: Dialect) -> None:
-    assert hq(dialect).receive(INFO[dialect], 0.0) == [INFO_MESSAGE[dialect]]
-    assert vehicle(dialect).receive(COMMAND[dialect], 0.0) == [COMMAND_MESSAGE[dialect]]
-
-
 # The drive command
 
 
-def test_a_drive_link_says_speed_0_at_once_and_every_20_ms() -> None:
-    sent = until(hq(), 0.0, 0.995)
-    assert [frame for _, frame in sent] == [NEUTRAL_TEXT] * 50
-    assert [at for at, _ in sent] == pytest.approx([0.02 * number for number in range(50)])
+@pytest.mark.parametrize(
+    ("driven", "end", "sent_ms"),
+    [
+        ([], 0.05, [(0, NEUTRAL_TEXT), (20, NEUTRAL_TEXT), (40, NEUTRAL_TEXT)]),
+        ([(0.0, AHEAD)], 0.03, [(0, AHEAD_TEXT), (20, AHEAD_TEXT)]),
+        ([(0.007, AHEAD)], 0.03, [(0, NEUTRAL_TEXT), (7, AHEAD_TEXT), (27, AHEAD_TEXT)]),
+        ([(0.007, AHEAD), (0.015, BACK)], 0.03, [(0, NEUTRAL_TEXT), (7, AHEAD_TEXT), (15, BACK_TEXT)]),
+    ],
+)
+def test_a_drive_link_says_speed_0_at_once_a_new_command_at_once_and_the_last_every_20_ms(
+    driven: list[tuple[float, DriveCommand]], end: float, sent_ms: list[tuple[int, bytes]]
+) -> None:
+    assert [(round(at * 1000), frame) for at, frame in until(hq(), 0.0, end, *driven)] == sent_ms
 
 
-def test_binary_speed_0_is_straight_ahead_at_90_degrees() -> None:
-    session = hq(BINARY, DriveCommand(0, 0, 90, False))
-    assert timed(until(session, 0.0, 0.03)) == [
-        (0, bytes.fromhex("03 00 00 5a 00")),
-        (20, bytes.fromhex("03 00 00 5a 00")),
-    ]
-
-
-def test_a_command_is_repeated_for_as_long_as_the_link_stands() -> None:
-    session = hq()
-    session.drive(AHEAD, 0.0)
-    sent = until(session, 0.0, 120.0)
-    assert {frame for _, frame in sent} == {AHEAD_TEXT}
+@pytest.mark.parametrize(
+    ("dialect", "neutral"), [(TEXT, NEUTRAL_TEXT), (BINARY, bytes.fromhex("03 00 00 5a 00"))], ids=["text", "binary"]
+)
+def test_a_command_is_repeated_for_as_long_as_the_link_stands(dialect: Dialect, neutral: bytes) -> None:
+    sent = until(hq(dialect, drives_of(dialect)), 0.0, 120.0)
+    assert {frame for _, frame in sent} == {neutral}
     assert 5990 <= len(sent) <= 6010
     assert max(later - earlier for (earlier, _), (later, _) in pairwise(sent)) < 0.0201
-
-
-def test_a_new_command_goes_out_at_once_and_is_then_what_is_repeated() -> None:
-    session = hq()
-    until(session, 0.0, 0.1)
-    session.drive(AHEAD, 0.107)
-    assert session.deadline() == pytest.approx(0.107)
-    assert timed(until(session, 0.107, 0.165)) == [(107, AHEAD_TEXT), (127, AHEAD_TEXT), (147, AHEAD_TEXT)]
-    session.drive(BACK, 0.165)
-    assert waiting(session, 0.165) == [BACK_TEXT]
-
-
-def test_of_commands_that_could_not_be_written_meanwhile_only_the_newest_is() -> None:
-    session = hq()
-    until(session, 0.0, 0.1)
-    for speed in range(100):
-        session.drive(DriveCommand(speed, 0, 0, False), 0.1 + speed / 1e6)
-    assert waiting(session, 0.11) == [b"3|99|0|0|0;"]
-
-
-def test_a_link_that_took_nothing_for_long_gets_one_command_and_no_burst() -> None:
-    session = hq()
-    waiting(session, 0.0)
-    assert waiting(session, 10.0) == [NEUTRAL_TEXT]
-    assert session.deadline() == pytest.approx(10.02)
 
 
 def test_an_urgent_command_replaces_what_stands_and_goes_first() -> None:
     session = hq()
     session.drive(AHEAD, 0.0)
     session.drive(NEUTRAL, 0.0, urgent=True)
-    assert waiting(session, 0.0) == [NEUTRAL_TEXT]
-    assert timed(until(session, 0.001, 0.05)) == [(20, NEUTRAL_TEXT), (40, NEUTRAL_TEXT)]
+    assert [frame for _, frame in until(session, 0.0, 0.05)] == [NEUTRAL_TEXT] * 3
+
+
+def test_a_link_that_took_nothing_for_long_gets_the_newest_command_alone_and_no_burst() -> None:
+    session = hq()
+    until(session, 0.0, 0.1)
+    for speed in range(100):
+        session.drive(DriveCommand(speed, 0, 0, False), 0.1 + speed / 1e6)
+    assert drained(session, 0.11) == [b"3|99|0|0|0;"]
+    assert drained(session, 10.0) == [b"3|99|0|0|0;"]
+    assert session.deadline() == pytest.approx(10.02)
 
 
 def test_two_messages_keep_the_gap_that_is_configured() -> None:
     session = HqRole(TEXT, drives=NEUTRAL, gap_s=0.005)
     session.open(0.0)
-    assert waiting(session, 0.0) == [NEUTRAL_TEXT]
+    assert drained(session, 0.0) == [NEUTRAL_TEXT]
     session.drive(AHEAD, 0.001)
-    assert waiting(session, 0.001) == []
+    assert drained(session, 0.001) == []
     assert session.deadline() == pytest.approx(0.005)
-    assert waiting(session, 0.005) == [AHEAD_TEXT]
+    assert drained(session, 0.005) == [AHEAD_TEXT]
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-def test_a_laser_link_is_told_nothing_but_end(dialect: Dialect) -> None:
-    session = hq(dialect, None)
-    assert session.receive(INFO[dialect], 0.1) == [INFO_MESSAGE[dialect]]
-    assert session.deadline() is None
-    assert waiting(session, 3600.0) == []
-    session.close("done", 3600.0)
-    assert waiting(session, 3600.0) == [END[dialect]]
-
-
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_vehicle_says_what_it_is_told_to_and_repeats_nothing(dialect: Dialect) -> None:
-    session = vehicle(dialect)
-    session.send(INFO_MESSAGE[dialect])
-    assert waiting(session, 0.0) == [INFO[dialect]]
-    assert session.deadline() is None
-    assert waiting(session, 3600.0) == []
+def test_a_laser_link_says_nothing_but_end_and_a_vehicle_what_it_is_told_to_and_repeats_nothing(
+    dialect,
+) -> None:
+    laser, robot = hq(dialect, None), vehicle(dialect)
+    robot.send(INFO_MESSAGE[dialect])
+    assert robot.receive(COMMAND[dialect], 0.0) == [COMMAND_MESSAGE[dialect]]
+    assert laser.receive(INFO[dialect], 0.0) == [INFO_MESSAGE[dialect]]
+    assert drained(robot, 0.0) == [INFO[dialect]]
+    for session in (laser, robot):
+        assert session.deadline() is None
+        assert drained(session, 3600.0) == []
+        session.close("done", 3600.0)
+        assert drained(session, 3600.0) == [END[dialect]]
 
 
 # END
@@ -196,10 +163,10 @@ def drives_of(dialect: Dialect) -> DriveCommand:
 @pytest.mark.parametrize("side", SIDES)
 def test_end_is_answered_once_and_nothing_follows(side, dialect: Dialect) -> None:  # type: ignore[no-untyped-def]
     session = side(dialect)
-    waiting(session, 0.0)
+    drained(session, 0.0)
     assert session.receive(END[dialect] * 3, 0.1) == []
     assert (session.state, session.reason) == (State.CLOSING, "ended")
-    assert waiting(session, 0.1) == [END[dialect]]
+    assert drained(session, 0.1) == [END[dialect]]
     assert (session.state, session.reason) == (State.CLOSED, "ended")
     assert session.receive(END[dialect], 0.2) == []
     assert until(session, 0.2, 3600.0) == []
@@ -215,31 +182,24 @@ def test_end_is_said_once_when_we_close_and_its_answer_is_not_answered(  # type:
     side, dialect: Dialect
 ) -> None:
     session = side(dialect)
-    waiting(session, 0.0)
+    drained(session, 0.0)
     session.close("gateway stopped", 0.1)
     session.close("and again", 0.1)
     assert session.receive(END[dialect], 0.1) == []
-    assert waiting(session, 0.1) == [END[dialect]]
+    assert drained(session, 0.1) == [END[dialect]]
     assert (session.state, session.reason) == (State.CLOSED, "gateway stopped")
     assert session.receive(END[dialect], 0.2) == []
     assert until(session, 0.2, 3600.0) == []
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-def test_what_came_before_end_is_delivered_and_nothing_behind_it(dialect: Dialect) -> None:
+def test_what_came_before_end_is_delivered_and_nothing_behind_it_and_it_may_come_in_pieces(dialect: Dialect) -> None:
     session = hq(dialect)
-    data = INFO[dialect] * 2 + END[dialect] + INFO[dialect]
-    assert session.receive(data, 0.1) == [INFO_MESSAGE[dialect]] * 2
+    assert session.receive(INFO[dialect] * 2 + END[dialect][:1], 0.1) == [INFO_MESSAGE[dialect]] * 2
+    assert session.state is State.ESTABLISHED
+    assert session.receive(END[dialect][1:] + INFO[dialect], 0.1) == []
+    assert (session.state, session.reason) == (State.CLOSING, "ended")
     assert session.receive(INFO[dialect], 0.1) == []
-
-
-@pytest.mark.parametrize("dialect", Dialect)
-def test_end_may_come_in_pieces(dialect: Dialect) -> None:
-    session = hq(dialect, None)
-    for byte in END[dialect]:
-        assert session.state is State.ESTABLISHED
-        session.receive(bytes([byte]), 0.1)
-    assert session.reason == "ended"
 
 
 def test_a_stop_that_waits_goes_before_end_and_the_command_that_stood_does_not() -> None:
@@ -247,28 +207,21 @@ def test_a_stop_that_waits_goes_before_end_and_the_command_that_stood_does_not()
     session.drive(AHEAD, 0.0)
     session.drive(NEUTRAL, 0.0, urgent=True)
     session.close("gateway stopped", 0.0)
-    assert waiting(session, 0.0) == [NEUTRAL_TEXT, END[TEXT]]
+    assert drained(session, 0.0) == [NEUTRAL_TEXT, END[TEXT]]
 
 
-def test_the_newest_command_does_not_go_behind_end() -> None:
+@pytest.mark.parametrize("written_first", [False, True])
+def test_no_command_goes_behind_end_neither_the_newest_nor_one_that_comes_while_the_session_ends(written_first) -> None:
     session = hq()
+    drained(session, 0.0)
     session.drive(AHEAD, 0.0)
-    session.receive(END[TEXT], 0.0)
-    assert waiting(session, 0.0) == [END[TEXT]]
-
-
-def test_whoever_drives_on_while_a_session_ends_is_not_heard() -> None:
-    for written_first in (False, True):
-        session = hq()
-        waiting(session, 0.0)
-        session.receive(END[TEXT], 0.1)
-        sent = [session.outgoing(0.1)] if written_first else []
+    session.receive(END[TEXT], 0.1)
+    sent = [session.outgoing(0.1)] if written_first else []
+    for urgent in (False, True):
         with contextlib.suppress(Refused):
-            session.drive(AHEAD, 0.1)
-        with contextlib.suppress(Refused):
-            session.drive(AHEAD, 0.1, urgent=True)
-        assert sent + waiting(session, 0.1) + waiting(session, 0.2) == [END[TEXT]]
-        assert session.state is State.CLOSED
+            session.drive(AHEAD, 0.1, urgent=urgent)
+    assert sent + drained(session, 0.1) + drained(session, 0.2) == [END[TEXT]]
+    assert session.state is State.CLOSED
 
 
 def test_a_vehicle_sends_nothing_behind_end_whatever_it_still_measures() -> None:
@@ -277,7 +230,7 @@ def test_a_vehicle_sends_nothing_behind_end_whatever_it_still_measures() -> None
     session.close("vehicle stopped", 0.1)
     with contextlib.suppress(Refused):
         session.send(INFO_MESSAGE[TEXT])
-    assert waiting(session, 0.1) == [INFO[TEXT], END[TEXT]]
+    assert drained(session, 0.1) == [INFO[TEXT], END[TEXT]]
     assert session.state is State.CLOSED
 
 
@@ -294,15 +247,11 @@ def test_a_connection_that_breaks_is_lost_at_once_and_nothing_is_written_or_wait
     session = hq(dialect, drives_of(dialect))
     session.lost("closed by peer")
     assert (session.state, session.reason) == (State.CLOSED, "closed by peer")
-    assert waiting(session, 0.0) == []
-    assert session.deadline() is None
-
-
-def test_a_session_that_is_closed_before_it_was_connected_says_nothing() -> None:
-    session = HqRole(TEXT, drives=NEUTRAL)
-    session.close("gateway stopped", 0.0)
+    assert (drained(session, 0.0), session.deadline()) == ([], None)
+    session = HqRole(dialect, drives=NEUTRAL)
+    session.close("gateway stopped", 0.0)  # before it was connected
     session.open(0.0)
-    assert waiting(session, 0.0) == []
+    assert drained(session, 0.0) == []
 
 
 # Malformed
@@ -324,27 +273,24 @@ def test_a_session_that_is_closed_before_it_was_connected_says_nothing() -> None
         b"255|2;",
         b";",
         b"\xff\xfe\x00;",
+        b"\x00",
+        b"\x05",
+        bytes.fromhex("ff 00"),
+        bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 0000c07f"),
+        bytes.fromhex("02" + "00" * 24),
+        bytes.fromhex("03 50 00 78 00"),
     ],
 )
-def test_a_malformed_text_is_counted_shown_and_the_session_kept(bad: bytes) -> None:
-    session = hq()
-    assert session.receive(INFO[TEXT] + bad + INFO[TEXT], 0.1) == [INFO_MESSAGE[TEXT]] * 2
-    assert session.traffic.malformed == 1
+def test_a_malformed_message_is_counted_shown_and_the_session_kept(bad: bytes) -> None:
+    dialect = TEXT if bad.endswith(b";") else BINARY
+    session = hq(dialect, drives_of(dialect))
+    for count in (1, 2):
+        assert session.receive(INFO[dialect] + bad + INFO[dialect], 0.1) == [INFO_MESSAGE[dialect]] * 2
+        assert session.traffic.malformed == count
     assert session.last_malformed
     assert len(session.last_malformed) < 300
     assert session.state is State.ESTABLISHED
-    assert waiting(session, 0.1) == [NEUTRAL_TEXT]
-
-
-@pytest.mark.parametrize(
-    "bad", ["00", "05", "ff 00", "04 0a fa00 0cfe e803 0f00 e5ff d204 0000c07f", "02" + "00" * 24, "03 50 00 78 00"]
-)
-def test_malformed_binary_is_counted_shown_and_the_session_kept(bad: str) -> None:
-    session = hq(BINARY, drives_of(BINARY))
-    assert session.receive(INFO[BINARY] + bytes.fromhex(bad) + INFO[BINARY], 0.1) == [INFO_MESSAGE[BINARY]] * 2
-    assert session.traffic.malformed == 1
-    assert session.last_malformed
-    assert session.state is State.ESTABLISHED
+    assert len(drained(session, 0.1)) == 1
 
 
 def test_a_measurement_with_another_number_of_points_says_so() -> None:
@@ -357,29 +303,7 @@ def test_a_measurement_with_another_number_of_points_says_so() -> None:
     assert len(session.receive(b"1|7|5000|" + b"1000|" * 769 + b"44|725;", 0.1)) == 1
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_a_flood_of_rubbish_ends_nothing_and_commands_go_on(dialect: Dialect) -> None:
-    session = hq(dialect, drives_of(dialect), points=769)
-    rng = random.Random(5)
-    rubbish = bytes(rng.choices([*range(5, 48), *range(58, 255)], k=1_000_000))  # no id of either dialect
-    for start in range(0, len(rubbish), 65_536):
-        assert session.receive(rubbish[start : start + 65_536], 0.1) == []
-    assert session.state is State.ESTABLISHED
-    assert session.traffic.malformed > 0
-    assert len(waiting(session, 0.1)) == 1
-
-
 # Both roles back to back
-
-
-def exchange(sender: AlfSession, receiver: AlfSession, now: float, rng: random.Random) -> list[AlfMessage]:
-    """Carry what may be written now, cut anywhere."""
-    data, messages = b"".join(waiting(sender, now)), []
-    while data:
-        size = rng.choice((1, 2, 7, 100, len(data)))
-        messages += receiver.receive(data[:size], now)
-        data = data[size:]
-    return messages
 
 
 @pytest.mark.parametrize("dialect", Dialect)
@@ -425,7 +349,3 @@ def test_an_hq_and_a_vehicle_understand_each_other_to_the_end(dialect: Dialect, 
         "vehicle stopped" if ends != "hq" else "ended",
     )
     assert ours.traffic.malformed == theirs.traffic.malformed == 0
-
-
-def test_the_end_of_one_session_is_always_1() -> None:
-    assert End() == End(1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gateways.alf import PROTOCOL
-from gateways.alf.messages import Dialect, DriveCommand, Measurement, ScannerInit
+from gateways.alf.messages import Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import HqRole, VehicleRole
-from gateways.alf.simulator import SCANNER, Car
+from gateways.alf.simulator import SCANNER, SPEED_M_S, TEMPERATURE, Car
 from zbridge.address import Address
 from zbridge.errors import ConfigError
 from zbridge.protocol.plugin import Simulation
@@ -69,74 +69,61 @@ def story(seed: int, dialect: Dialect) -> list[object]:
     return [places, first.points.tolist(), second.points.tolist(), second.timestamp_ms, told.info()]
 
 
-@pytest.mark.parametrize("dialect", Dialect)
-def test_the_same_seed_and_commands_give_the_same_world(dialect: Dialect) -> None:
-    assert story(7, dialect) == story(7, dialect)
-
-
-def test_another_seed_begins_elsewhere_and_measures_otherwise() -> None:
-    (one, first, *_), (other, second, *_) = story(7, TEXT), story(8, TEXT)
-    assert one != other
-    assert first != second
-
-
-def test_both_dialects_live_in_the_same_world() -> None:
+def test_the_same_seed_and_commands_give_the_same_world_in_both_dialects_and_another_seed_another() -> None:
     text, binary = story(7, TEXT), story(7, BINARY)
+    assert (text, binary) == (story(7, TEXT), story(7, BINARY))
     assert text[:4] == binary[:4]
+    place, first, *_ = story(8, TEXT)
+    assert place != text[0]
+    assert first != text[1]
 
 
 # Steering
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-def test_it_goes_straight_ahead_and_straight_back(dialect: Dialect) -> None:
+def test_it_goes_straight_ahead_and_straight_back_and_says_its_speed_without_the_sign(dialect: Dialect) -> None:
     moved = car(dialect=dialect)
-    live(moved, 1.0, command(50, dialect=dialect))
-    assert moved.body.x > 0.2
-    assert (moved.body.y, moved.body.heading) == (0.0, 0.0)
+    before = seen_m(moved, 0)
+    live(moved, 1.5, command(50, dialect=dialect))
     x = moved.body.x
+    assert x > 0.2
+    assert seen_m(moved, 0) == pytest.approx(before - x, abs=0.04), "the range ahead is shorter by as much"
+    assert moved.info().speed == 50
     live(moved, 2.0, command(50, backward=True, dialect=dialect))
     assert moved.body.x < x - 0.2
+    assert moved.info().speed == 50
     assert (moved.body.y, moved.body.heading) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("dialect", Dialect)
 @pytest.mark.parametrize("right_deg", [-90, -45, -10, 10, 45, 90])
 def test_it_turns_to_where_the_wheels_point_and_backwards_to_the_other_side(right_deg: int, dialect: Dialect) -> None:
-    ahead = turned(car(dialect=dialect), 1.0, command(50, right_deg, dialect=dialect))
+    moved = car(dialect=dialect)
+    ahead = turned(moved, 1.0, command(50, right_deg, dialect=dialect))
     back = turned(car(dialect=dialect), 1.0, command(50, right_deg, backward=True, dialect=dialect))
     left = right_deg < 0
     assert (ahead > 0.01) if left else (ahead < -0.01), "to the left is counter-clockwise"
     assert back == pytest.approx(-ahead)
+    assert (moved.body.y > 0) is left
+    assert moved.body.x > 0
 
 
-def test_it_moves_to_the_side_it_steers_to() -> None:
-    left, right = car(), car()
-    live(left, 1.0, command(50, -60))
-    live(right, 1.0, command(50, 60))
-    assert left.body.y > 0.02
-    assert right.body.y == pytest.approx(-left.body.y)
-    assert right.body.x == pytest.approx(left.body.x)
-
-
-def test_binary_0_is_full_left_and_180_full_right() -> None:
-    assert turned(car(dialect=BINARY), 1.0, DriveCommand(50, 0, 0, False)) > 0.1
-    assert turned(car(dialect=BINARY), 1.0, DriveCommand(50, 0, 180, False)) < -0.1
-    assert turned(car(dialect=BINARY), 1.0, DriveCommand(50, 0, 255, False)) == turned(
-        car(dialect=BINARY), 1.0, DriveCommand(50, 0, 180, False)
-    )
-
-
-def test_more_steering_turns_more() -> None:
+def test_more_steering_turns_more_and_binary_0_is_full_left_and_180_full_right() -> None:
     turns = [turned(car(), 1.0, command(50, right_deg)) for right_deg in (0, -20, -40, -60, -90)]
     assert turns == sorted(turns)
     assert turns[0] == 0.0
+    binary = [turned(car(dialect=BINARY), 1.0, DriveCommand(50, 0, steering, False)) for steering in (0, 180, 255)]
+    assert binary == pytest.approx([turns[-1], -turns[-1], -turns[-1]])
+    assert turns[-1] > 0.1
 
 
-def test_it_is_a_car_it_never_turns_on_the_spot() -> None:
-    stands = car()
-    assert turned(stands, 1.0, command(0, -90)) == 0.0
-    assert (stands.body.x, stands.body.y) == (0.0, 0.0)
+def test_it_is_a_car_it_never_turns_on_the_spot_and_stands_until_it_is_driven() -> None:
+    stands = car(1.0, -2.0, 0.5)
+    live(stands, 5.0)
+    live(stands, 1.0, command(0, -90))
+    assert (stands.body.x, stands.body.y, stands.body.heading) == (1.0, -2.0, 0.5)
+    assert repr(stands).startswith("<Car <Body x=1.00 y=-2.00")
 
 
 def test_the_circle_it_drives_does_not_depend_on_its_speed() -> None:
@@ -156,32 +143,13 @@ def test_the_circle_it_drives_does_not_depend_on_its_speed() -> None:
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-def test_speed_is_percent_and_twice_as_much_is_twice_as_fast(dialect: Dialect) -> None:
+def test_speed_is_percent_and_above_100_without_clamping_in_text_and_100_in_binary(dialect: Dialect) -> None:
     speeds = []
-    for percent in (25, 50, 100):
+    for percent in (25, 50, 100, 101, 255):
         moved = car(-4.0, dialect=dialect)
-        live(moved, 1.5, command(percent, dialect=dialect))
-        speeds.append(moved.speed_m_s)
-    assert speeds == pytest.approx([speeds[2] / 4, speeds[2] / 2, speeds[2]])
-    assert speeds[2] > 0
-
-
-def test_binary_speed_above_100_counts_as_100() -> None:
-    speeds = []
-    for percent in (100, 101, 255):
-        moved = car(-4.0, dialect=BINARY)
-        live(moved, 2.0, command(percent, dialect=BINARY))
-        speeds.append(moved.speed_m_s)
-    assert speeds == [speeds[0]] * 3
-
-
-def test_text_speed_is_taken_as_percent_without_clamping_so_255_is_two_and_a_half_times_full() -> None:
-    speeds = []
-    for percent in (100, 255):
-        moved = car(-4.0)
-        live(moved, 2.0, command(percent))
-        speeds.append(moved.speed_m_s)
-    assert speeds[1] == pytest.approx(2.55 * speeds[0])
+        live(moved, 2.0, command(percent, dialect=dialect))
+        speeds.append(moved.speed_m_s / SPEED_M_S)
+    assert speeds == pytest.approx([0.25, 0.5, 1.0, *([1.01, 2.55] if dialect is TEXT else [1.0, 1.0])])
 
 
 def test_speed_0_stops_it() -> None:
@@ -195,32 +163,17 @@ def test_speed_0_stops_it() -> None:
 
 
 def test_its_motor_stops_after_some_20_cycles_of_silence_and_not_much_earlier() -> None:
-    moved = car(-4.0)
-    live(moved, 1.0, command(100))
+    moved = car(-4.5)
+    live(moved, 1.0, command(50))
     full = moved.speed_m_s
-    live(moved, 15 * CYCLE_S)
-    assert moved.speed_m_s == full
-    live(moved, 15 * CYCLE_S)
+    for _ in range(10):
+        live(moved, 18 * CYCLE_S)
+        assert moved.speed_m_s == full, "a command now and then keeps it going"
+        moved.take(command(50))
+    live(moved, 30 * CYCLE_S)
     assert moved.speed_m_s < full
     live(moved, 2.0)
     assert moved.speed_m_s == 0.0
-
-
-def test_a_command_now_and_then_keeps_it_going() -> None:
-    moved = car(-4.5)
-    moved.take(command(50))
-    live(moved, 1.0, None)
-    assert moved.speed_m_s == 0.0
-    for _ in range(10):
-        moved.take(command(50))
-        live(moved, 18 * CYCLE_S)
-    assert moved.speed_m_s > 0.4
-
-
-def test_a_car_that_was_never_driven_stands() -> None:
-    stands = car(1.0, -2.0, 0.5)
-    live(stands, 5.0)
-    assert (stands.body.x, stands.body.y, stands.body.heading) == (1.0, -2.0, 0.5)
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.8, 1.6, 2.4, 3.1, -0.8, -1.6, -2.4])
@@ -248,22 +201,17 @@ def test_the_light_is_what_it_was_told() -> None:
 # The laser
 
 
-def test_its_scanner_is_the_deployed_one() -> None:
-    deployed = ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600)
-    assert deployed == SCANNER
-
-
-def test_a_measurement_has_769_points_of_which_44_to_725_are_valid() -> None:
-    for number in range(1, 4):
-        scan = car().measure()
-        assert scan.points.dtype == np.int64
-        assert len(scan.points) == 769
-        assert (scan.first_valid, scan.last_valid) == (44, 725)
-        assert not scan.points[:44].any()
-        assert not scan.points[726:].any()
-        assert (scan.points >= 0).all(), number
-        assert (scan.points <= 5700).all()
-    assert car().measure().points[44:726].astype(bool).mean() > 0.5
+def test_its_scanner_is_the_deployed_one_and_of_769_points_44_to_725_are_valid() -> None:
+    assert ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600) == SCANNER
+    scan = car().measure()
+    assert scan.points.dtype == np.int64
+    assert len(scan.points) == 769
+    assert (scan.first_valid, scan.last_valid) == (44, 725)
+    assert not scan.points[:44].any()
+    assert not scan.points[726:].any()
+    assert (scan.points >= 0).all()
+    assert (scan.points <= 5700).all()
+    assert scan.points[44:726].astype(bool).mean() > 0.5
 
 
 def test_measurements_are_numbered_and_their_counter_is_in_milliseconds() -> None:
@@ -291,15 +239,14 @@ def test_measurements_are_numbered_and_their_counter_is_in_milliseconds() -> Non
         (0.0, 2.0, 0, 0, 1.5),  # the same from the side
         (2.0, 0.0, 0, 90, 1.0),
         (3.0, 2.0, 180, 0, 0.5),
+        (-4.0, 0.0, 0, 0, 0.0),  # farther than the scanner reaches
+        (4.0, 0.0, 180, 0, 0.0),
     ],
 )
-def test_ranges_are_those_to_the_walls_and_boxes(x, y, heading_deg, angle_deg, range_m) -> None:
-    assert seen_m(car(x, y, math.radians(heading_deg)), angle_deg) == pytest.approx(range_m, abs=0.04)
-
-
-def test_what_is_farther_than_the_scanner_reaches_is_0() -> None:
-    assert seen_m(car(-4.0, 0.0), 0) == 0.0
-    assert seen_m(car(4.0, 0.0, math.pi), 0) == 0.0
+def test_ranges_are_those_to_the_walls_and_boxes_as_far_as_the_scanner_reaches(
+    x: float, y: float, heading_deg: float, angle_deg: float, range_m: float
+) -> None:
+    assert seen_m(car(x, y, math.radians(heading_deg)), angle_deg) == pytest.approx(range_m, abs=0.04 * bool(range_m))
 
 
 def test_measurements_are_a_little_noisy() -> None:
@@ -309,38 +256,18 @@ def test_measurements_are_a_little_noisy() -> None:
     assert abs(ranges.mean() - 5000) < 5
 
 
-def test_driving_towards_a_wall_shortens_the_range_ahead() -> None:
-    moved = car()
-    before = seen_m(moved, 0)
-    live(moved, 2.0, command(50))
-    assert seen_m(moved, 0) == pytest.approx(before - moved.body.x, abs=0.04)
-    assert moved.body.x > 0.5
-
-
 # Drive info
 
 
-def test_info_of_text_is_in_percent_g_and_degrees_per_second() -> None:
-    told = car().info()
-    assert (told.speed, told.longitudinal, told.lateral, told.vertical) == (0, 0.0, 0.0, 1.0)
-    assert (told.gyro_x, told.gyro_y, told.gyro_z) == (0.0, 0.0, 0.0)
-    assert math.isfinite(told.temperature)
-
-
-def test_info_of_binary_is_in_integers() -> None:
-    told = car(dialect=BINARY).info()
-    assert (told.speed, told.longitudinal, told.lateral, told.vertical) == (0, 0, 0, 1000)
-    live(moved := car(dialect=BINARY), 0.3, command(70, -45, dialect=BINARY))
+def test_info_of_a_vehicle_at_rest_feels_1_g_upwards_and_binary_is_in_integers() -> None:
+    assert car().info() == DriveInfo(0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, TEMPERATURE)
+    assert math.isfinite(TEMPERATURE)
+    moved = car(dialect=BINARY)
+    assert moved.info() == DriveInfo(0, 0, 0, 1000, 0, 0, 0, TEMPERATURE)
+    live(moved, 0.3, command(70, -45, dialect=BINARY))
     told = moved.info()
     values = (told.longitudinal, told.lateral, told.vertical, told.gyro_x, told.gyro_y, told.gyro_z)
     assert all(isinstance(value, int) for value in values)
-
-
-@pytest.mark.parametrize("backward", [False, True])
-def test_info_says_the_speed_without_its_sign(backward: bool) -> None:
-    moved = car()
-    live(moved, 1.0, command(50, backward=backward))
-    assert moved.info().speed == 50
 
 
 def test_info_says_the_acceleration_along_the_car_in_g() -> None:
@@ -401,7 +328,3 @@ def test_everything_it_says_can_be_sent_and_is_read_back(speed: int, dialect: Di
 async def test_what_a_vehicle_has_not_is_refused(simulation: Simulation, what: str) -> None:
     with pytest.raises(ConfigError, match=what):
         await PROTOCOL.simulate(simulation)
-
-
-def test_it_prints_where_it_is() -> None:
-    assert repr(car(1.0, 2.0)).startswith("<Car <Body x=1.00 y=2.00")

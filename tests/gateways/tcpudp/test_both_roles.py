@@ -5,7 +5,7 @@ import random
 from collections.abc import Callable, Iterable
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gateways.tcpudp.messages import (
@@ -241,7 +241,6 @@ SAID = [(True, 1), (False, 0)]
 @example(robot_udp=True, hq_udp=True, weather=Weather(1, lost=1.0), said=SAID)
 @example(robot_udp=True, hq_udp=True, weather=Weather(1, doubled=1.0), said=SAID)
 @example(robot_udp=True, hq_udp=True, weather=Weather(1, late=1.0), said=SAID)
-@settings(max_examples=100, deadline=None)
 def test_both_agree_whatever_the_network_does(version, robot_udp, hq_udp, weather, said) -> None:
     robot, hq = ends(version, robot_udp=robot_udp, hq_udp=hq_udp)
     network = Network(robot, hq, weather)
@@ -275,7 +274,6 @@ RUBBISH = st.tuples(
 
 @pytest.mark.parametrize("version", VERSIONS)
 @given(udp=st.booleans(), weather=weathers, rubbish=st.lists(RUBBISH, max_size=12))
-@settings(max_examples=100, deadline=None)
 def test_rubbish_costs_at_most_the_session(version, udp, weather, rubbish) -> None:
     robot, hq = ends(version, robot_udp=udp, hq_udp=True)
     network = Network(robot, hq, weather)

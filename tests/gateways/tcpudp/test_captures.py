@@ -1,54 +1,22 @@
 """Both recorded sessions through the sessions of both roles, each segment and datagram at its recorded time."""
 
-from gateways.tcpudp.messages import (
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientJoystickMove,
-    ClientJoystickRotate,
-    ClientJoystickStop,
-    ClientSimulatedLidarData,
-    DebugMessage,
-    Packet,
-    ServerGetSimulatedLidarData,
-    ServerPosition,
-    ServerSLAMMap,
-)
+import pytest
+
+from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
+from tests.conformance.side import plain
 from tests.gateways.tcpudp.frames import Timed
+from tests.gateways.tcpudp.golden import TCP_SESSION_MESSAGES, UDP_SESSION_MESSAGES
 from zbridge.protocol.session import State
 
 OLD, NEW = "tcpudp-1.1-tcp.hex", "tcpudp-1.3-udp.hex"
+MESSAGES = {OLD: TCP_SESSION_MESSAGES, NEW: UDP_SESSION_MESSAGES}
 ROBOT = 11001
-POSE = ServerPosition(1.5, -2.25, 90.0)
-MAP = ServerSLAMMap(bytes((0, 1, 2) * 133 + (0,)))
-MOVE = ClientJoystickMove(0.6000000238418579, 0.800000011920929, 1.5)
-COMMANDS: list[Packet] = [
-    DebugMessage("hi there"),
-    ClientControllMode(2),
-    MOVE,
-    ClientJoystickRotate(-0.75),
-    ClientJoystickStop(),
-    ClientGetPosition(),
-    ClientGetSLAMMap(),
-]
-
-
-def replay(timed: Timed, name: str, *, from_robot: bool) -> list[tuple[float, Packet]]:
-    """Feed what one side sent; return each message with the time it was delivered."""
-    delivered: list[tuple[float, Packet]] = []
-    for record in payloads(name, source=ROBOT) if from_robot else payloads(name, destination=ROBOT):
-        if record.transport == "TCP":
-            messages = timed.stream(record.payload, record.seconds)
-        else:
-            if record.payload[5] == 5:
-                assert timed.session.claims(record.payload, record.source)
-            messages = timed.datagram(record.payload, record.seconds)
-        delivered += [(record.seconds, message) for message in messages]
-    assert timed.session.traffic.malformed == 0
-    return delivered
+SETTINGS_13 = RobotSettings13(udp=True, lidar_sim=True, slam_map=True, slam_map_size=2048, slam_map_interval=1)
+ANSWER_11 = bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")
+"""What the gateway answers a robot of 1.1; the captured HQ announces datagrams and sends none."""
 
 
 def recorded(name: str, index: int, *, from_robot: bool) -> bytes:
@@ -56,55 +24,72 @@ def recorded(name: str, index: int, *, from_robot: bool) -> bytes:
     return (payloads(name, source=ROBOT) if from_robot else payloads(name, destination=ROBOT))[index].payload
 
 
-def test_the_gateway_as_hq_understands_a_robot_of_1_1() -> None:
-    timed = Timed(HqRole(limits(0.01)))
-    delivered = replay(timed, OLD, from_robot=True)
-    assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.1")
-    assert (timed.session.transport, timed.session.features) == ("tcp", ())
-    assert timed.frames("tcp") == [bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")]
-    assert timed.frames("udp") == []
-    assert delivered == [(6.4158, POSE), (6.7163, ServerSLAMMap()), (7.0166, DebugMessage("bye"))]
-
-
-def test_the_gateway_as_robot_of_1_1_understands_its_hq() -> None:
-    timed = Timed(RobotRole(limits(0.0), Settings(), 1, ("1.1",)))
-    delivered = replay(timed, OLD, from_robot=False)
-    assert timed.frames("tcp") == [recorded(OLD, 0, from_robot=True)]
-    assert timed.frames("udp") == []
-    assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.1")
-    assert (timed.session.transport, timed.session.features) == ("tcp", ("udp",))
-    times = [4.1193, 4.4285, 4.7242, 5.0322, 5.3240, 5.6314, 5.9225]
-    assert delivered == list(zip(times, COMMANDS, strict=True))
-
-
-def test_the_gateway_as_hq_understands_a_robot_of_1_3() -> None:
-    timed = Timed(HqRole(limits(0.01)))
-    delivered = replay(timed, NEW, from_robot=True)
-    assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.3")
-    assert (timed.session.transport, timed.session.features) == ("udp", ("udp", "lidar_sim", "slam_map"))
-    assert timed.frames("tcp") == [recorded(NEW, 0, from_robot=False), bytes.fromhex("03000000 01 07 01")]
-    assert timed.frames("udp") == [bytes.fromhex("02000000 01 05")]
-    assert delivered == [
-        (5.6253, POSE),
-        (5.9346, MAP),
-        (6.1171, ServerGetSimulatedLidarData()),
-        (6.4174, POSE),
-        (6.7181, MAP),
-        (7.0182, DebugMessage("bye")),
-    ]
-
-
-def test_the_gateway_as_robot_of_1_3_understands_its_hq() -> None:
-    announced = RobotSettings13(udp=True, lidar_sim=True, slam_map=True, slam_map_size=2048, slam_map_interval=1)
-    timed = Timed(RobotRole(limits(0.0), announced, 1))
-    delivered = replay(timed, NEW, from_robot=False)
-    assert timed.frames("tcp") == [recorded(NEW, 0, from_robot=True), bytes.fromhex("02000000 01 04")]
-    assert timed.frames("udp") == [bytes.fromhex("03000000 01 06 01")]
-    assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, "1.3")
-    assert (timed.session.transport, timed.session.features) == ("udp", ("udp", "lidar_sim"))
-    *others, (at, scan) = delivered
-    times = [4.1288, 4.4204, 4.7293, 5.0221, 5.3328, 5.6252, 5.9344]
-    assert others == list(zip(times, COMMANDS, strict=True))
-    assert isinstance(scan, ClientSimulatedLidarData)
-    assert at == 6.1298
-    assert scan.ranges.tolist() == [100.0 + degree / 2 for degree in range(360)]
+@pytest.mark.parametrize(
+    ("session", "name", "by_tcp", "by_udp", "outcome", "times"),
+    [
+        pytest.param(
+            HqRole(limits(0.01)),
+            OLD,
+            [ANSWER_11],
+            [],
+            ("1.1", "tcp", ()),
+            [6.4158, 6.7163, 7.0166],
+            id="hq of a robot of 1.1",
+        ),
+        pytest.param(
+            RobotRole(limits(0.0), Settings(), 1, ("1.1",)),
+            OLD,
+            [recorded(OLD, 0, from_robot=True)],
+            [],
+            ("1.1", "tcp", ("udp",)),
+            [4.1193, 4.4285, 4.7242, 5.0322, 5.3240, 5.6314, 5.9225],
+            id="robot of 1.1",
+        ),
+        pytest.param(
+            HqRole(limits(0.01)),
+            NEW,
+            [recorded(NEW, 0, from_robot=False), bytes.fromhex("03000000 01 07 01")],
+            [bytes.fromhex("02000000 01 05")],
+            ("1.3", "udp", ("udp", "lidar_sim", "slam_map")),
+            [5.6253, 5.9346, 6.1171, 6.4174, 6.7181, 7.0182],
+            id="hq of a robot of 1.3",
+        ),
+        pytest.param(
+            RobotRole(limits(0.0), SETTINGS_13, 1),
+            NEW,
+            [recorded(NEW, 0, from_robot=True), bytes.fromhex("02000000 01 04")],
+            [bytes.fromhex("03000000 01 06 01")],
+            ("1.3", "udp", ("udp", "lidar_sim")),
+            [4.1288, 4.4204, 4.7293, 5.0221, 5.3328, 5.6252, 5.9344, 6.1298],
+            id="robot of 1.3",
+        ),
+    ],
+)
+def test_the_gateway_in_either_role_understands_the_recorded_peer(
+    session: HqRole | RobotRole,
+    name: str,
+    by_tcp: list[bytes],
+    by_udp: list[bytes],
+    outcome: tuple[str, str, tuple[str, ...]],
+    times: list[float],
+) -> None:
+    from_robot = isinstance(session, HqRole)
+    timed = Timed(session)
+    delivered: list[tuple[float, Packet]] = []
+    expected = []
+    for record, message in zip(payloads(name), MESSAGES[name], strict=True):
+        if from_robot != (record.source == ROBOT):
+            continue
+        if record.transport == "UDP" and record.payload[5] == 5:
+            assert session.claims(record.payload, record.source)
+        receive = timed.stream if record.transport == "TCP" else timed.datagram
+        delivered += [(record.seconds, message) for message in receive(record.payload, record.seconds)]
+        if record.payload[5] not in range(2, 8):  # the handshake
+            expected.append(plain(message))
+    assert [plain(message) for _, message in delivered] == expected
+    assert [at for at, _ in delivered] == times
+    assert timed.frames("tcp") == by_tcp
+    assert timed.frames("udp") == by_udp
+    assert session.state is State.ESTABLISHED
+    assert (session.version, session.transport, session.features) == outcome
+    assert session.traffic.malformed == 0

@@ -1,7 +1,6 @@
 """What HQ programs of each version are shown, and what they command. Bytes come from the protocol page, by hand."""
 
 import math
-from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +15,7 @@ from gateways.tcpudp.hq import client as client_module
 from gateways.tcpudp.maps import resampled, squared
 from gateways.tcpudp.messages import Packet, encode_packet
 from tests.captures import payloads
-from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, POSITION, START, Timed, client_settings, counted, framed
+from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, POSITION, START, Timed, client_settings, framed
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import payload as payloads_codec
 from zbridge.fleet import topics
@@ -31,14 +30,22 @@ POSE = Pose(0.015, -0.0225, math.pi)
 """1.5 cm, -2.25 cm, 90 degrees of the robot: what both captures hold."""
 CORNER = Map(2, 3, 0.1, (0.0, 0.0), np.array([[1, 2, 0], [0, 0, 2]], np.uint8))
 """Two rows of y, three columns of x."""
-CORNER_CELLS = "010000 020000 000200"
+CORNER_CELLS = "010000020000000200"
 """x = 0, 1, 2, each from y = 0 to 2."""
+CORNER_FRAME = bytes.fromhex("0f000000 01 35 09000000" + CORNER_CELLS)
+NO_MAP = Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8))
 EMPTY_MAP = bytes.fromhex("06000000 01 35 00000000")
 """n = 0: deployed HQ programs throw for good on a 53 without its int."""
+REQUEST = Text("simulated lidar data", "request")
 BLOCKS = {"1.1": "0100000000", "1.2": "010000000001", "1.3": "01000000000101"}
 """What HQ programs of each version announce: UDP, LidarSim and SLAMMap as far as they have the flag."""
 LISTS = {"1.1": b"1.1", "1.2": b"1.2", "1.3": LISTED}
+VERSIONS = [*LISTS]
 OLD, NEW = "tcpudp-1.1-tcp.hex", "tcpudp-1.3-udp.hex"
+ASK_MAP, ASK_POSE = bytes.fromhex("02000000 02 34"), bytes.fromhex("02000000 02 36")
+
+each_version = pytest.mark.parametrize("version", VERSIONS)
+by_either = pytest.mark.parametrize("udp", [False, True], ids=["tcp", "udp"])
 
 
 def robot(version: str | None, *features: str, protocol: str = "tcpudp") -> RobotView:
@@ -49,21 +56,73 @@ def robot(version: str | None, *features: str, protocol: str = "tcpudp") -> Robo
     return view
 
 
+def knowing(grid: Map | None = None, pose: Pose | None = None, view: RobotView | None = None) -> RobotView:
+    """The view of a robot whose map and position, as far as given, are known."""
+    view = view or RobotView()
+    if grid is not None:
+        view.note(topics.MAP, grid)
+    if pose is not None:
+        view.note(topics.POSE, pose)
+    return view
+
+
 def side(view: RobotView | None = None, **options: Any) -> TcpUdpHq:
-    return TcpUdpHq(HqOptions(**options), view if view is not None else RobotView())
+    return TcpUdpHq(HqOptions(**options), view or RobotView())
 
 
-def connected(listener: TcpUdpHq, number: int = 2) -> Timed:
-    return Timed(listener.session(number, BOUNDS))
+class Client(Timed):
+    """A client of a listener; every act gives the frames that left because of it within a second."""
+
+    session: HqClient
+
+    def __init__(self, listener: TcpUdpHq, number: int = 2) -> None:
+        self.listener = listener
+        super().__init__(listener.session(number, BOUNDS))
+
+    def begun(self) -> list[bytes]:
+        self.listener.begin(self.session, self.now)
+        return self.left()
+
+    def shown(self, topic: Topic, message: FleetMessage, *, at_once: bool = False) -> list[bytes]:
+        """What the client gets of news of the robot."""
+        if (send := self.listener.show(topic, message)) is not None:
+            send(self.session, self.now)
+        return [] if at_once else self.left()
+
+    def answered(self, topic: Topic, message: FleetMessage | None = None) -> list[bytes]:
+        self.listener.answer(self.session, topic, message, self.now)
+        return self.left()
+
+    def said(self, data: bytes | str, *, datagram: bool = False) -> list[tuple[Topic, FleetMessage]]:
+        """What the listener makes of what the client sends."""
+        data = bytes.fromhex(data) if isinstance(data, str) else data
+        receive = self.datagram if datagram else self.stream
+        return [entry for message in receive(data, self.now) for entry in self.listener.take(self.session, message)]
+
+    def left(self) -> list[bytes]:
+        before = len(self.sent)
+        self.until(self.now + 1.0)
+        return [sent.frame for sent in self.sent[before:]]
+
+    def gone(self) -> set[str]:
+        """By which channels anything left since the handshake."""
+        return {sent.by for sent in self.sent}
 
 
 def joined(
-    listener: TcpUdpHq, version: str = "1.3", *, udp: bool = False, number: int = 2, block: str = "", asks: bool = True
-) -> Timed:
+    version: str = "1.3",
+    view: RobotView | None = None,
+    *,
+    listener: TcpUdpHq | None = None,
+    udp: bool = False,
+    number: int = 2,
+    block: str = "",
+    asks: bool = True,
+    **options: Any,
+) -> Client:
     """A client whose handshake is done, and that asked for map and position; what it was sent so far is forgotten."""
-    client = connected(listener, number)
-    flags = block or BLOCKS[version]
-    flags = ("01" if udp else "00") + flags[2:]
+    client = Client(listener or side(view, **options), number)
+    flags = ("01" if udp else "00") + (block or BLOCKS[version])[2:]
     assert client.stream(client_settings(LISTS[version], flags, sender=number), 0.1) == []
     if udp:
         assert client.datagram(framed(number, 5), 0.2) == []
@@ -72,41 +131,13 @@ def joined(
     assert client.session.transport == ("udp" if udp else "tcp")
     client.until(1.0)
     if asks:
-        said(listener, client, framed(number, 52) + framed(number, 54))
+        client.said(framed(number, 52) + framed(number, 54))
     client.sent.clear()
     return client
 
 
-def show(listener: TcpUdpHq, topic: Topic, message: FleetMessage, *clients: Timed) -> None:
-    """What the listener does with news of the robot."""
-    send = listener.show(topic, message)
-    for client in clients:
-        if send is not None:
-            send(client.session, client.now)
-        client.until(client.now + 1.0)
-
-
-def begin(listener: TcpUdpHq, client: Timed) -> None:
-    assert isinstance(client.session, HqClient)
-    listener.begin(client.session, client.now)
-    client.until(client.now + 1.0)
-
-
-def answer(listener: TcpUdpHq, client: Timed, topic: Topic, message: FleetMessage | None) -> None:
-    assert isinstance(client.session, HqClient)
-    listener.answer(client.session, topic, message, client.now)
-    client.until(client.now + 1.0)
-
-
-def said(listener: TcpUdpHq, client: Timed, data: bytes, *, datagram: bool = False) -> list[tuple[Topic, FleetMessage]]:
-    """What the listener makes of what a client sent."""
-    assert isinstance(client.session, HqClient)
-    receive = client.datagram if datagram else client.stream
-    return [entry for message in receive(data, client.now) for entry in listener.take(client.session, message)]
-
-
 def greeting(listener: TcpUdpHq) -> bytes:
-    (frame,) = connected(listener).frames("tcp")
+    (frame,) = Client(listener).frames("tcp")
     return frame
 
 
@@ -115,8 +146,9 @@ def flags(listener: TcpUdpHq) -> str:
     return greeting(listener)[-15:-8].hex()
 
 
-def announced(frame: bytes) -> tuple[int, int]:
+def announced(listener: TcpUdpHq) -> tuple[int, int]:
     """SLAMMapSize and SLAMMapIntervall of the settings of 1.3, which end with them."""
+    frame = greeting(listener)
     return int.from_bytes(frame[-8:-4], "little"), int.from_bytes(frame[-4:], "little")
 
 
@@ -128,6 +160,10 @@ def cells_of(frame: bytes) -> bytes:
     return frame[10:]
 
 
+def ids(frames: list[bytes]) -> list[int]:
+    return [frame[5] for frame in frames]
+
+
 def wall(side_cells: int, cell_m: float = 0.1) -> Map:
     """A free square with one obstacle in its far corner."""
     cells = np.ones((side_cells, side_cells), np.uint8)
@@ -137,73 +173,77 @@ def wall(side_cells: int, cell_m: float = 0.1) -> Map:
 
 # The settings, which the robot sends first
 
-
-def test_a_client_is_greeted_with_its_id_the_versions_and_all_features_while_no_robot_was_seen() -> None:
-    expected = bytes.fromhex("21000000 01 02 07 0b000000") + LISTED + bytes.fromhex("01010101010101 e8030000 0a000000")
-    assert connected(side(), 7).frames("tcp") == [expected]
+SEEN = robot("1.3", "joystick", "lidar_sim")
 
 
 @pytest.mark.parametrize(
-    ("versions", "expected"),
+    ("options", "view", "expected"),
     [
-        (("1.1",), "0f000000 01 02 02 03000000 312e31 0101010101"),
-        (("1.2",), "10000000 01 02 02 03000000 312e32 010101010101"),
-        (("1.2", "1.1"), "14000000 01 02 02 07000000 312e322c312e31 010101010101"),
-        (("1.3",), "19000000 01 02 02 03000000 312e33 01010101010101 e8030000 0a000000"),
+        ({}, None, "21000000 01 02 02 0b000000 312e312c312e322c312e33 01010101010101 e8030000 0a000000"),
+        ({"versions": ("1.1",)}, None, "0f000000 01 02 02 03000000 312e31 0101010101"),
+        ({"versions": ("1.2",)}, None, "10000000 01 02 02 03000000 312e32 010101010101"),
+        ({"versions": ("1.2", "1.1")}, None, "14000000 01 02 02 07000000 312e322c312e31 010101010101"),
+        ({"versions": ("1.3",)}, None, "19000000 01 02 02 03000000 312e33 01010101010101 e8030000 0a000000"),
         (
-            ("1.1", "1.2", "1.3", "1.4"),
+            {"versions": ("1.1", "1.2", "1.3", "1.4")},
+            None,
             "25000000 01 02 02 0f000000 312e312c312e322c312e332c312e34 01010101010101 e8030000 0a000000",
         ),
+        ({"versions": ("1.1",)}, SEEN, "0f000000 01 02 02 03000000 312e31 0100010000"),
+        # the byte that some HQ programs skip is left out where the listener says so
+        (
+            {"skip_map_flag": True},
+            SEEN,
+            "20000000 01 02 02 0b000000 312e312c312e322c312e33 010001000001 e8030000 0a000000",
+        ),
+        ({"skip_map_flag": True, "versions": ("1.2",)}, SEEN, "10000000 01 02 02 03000000 312e32 010001000001"),
     ],
-)
-def test_versions_are_sent_verbatim_with_the_settings_of_the_newest(versions: tuple[str, ...], expected: str) -> None:
-    assert greeting(side(versions=versions)) == bytes.fromhex(expected)
-
-
-def test_a_listener_without_datagrams_does_not_announce_them() -> None:
-    listener = side(udp=False)
-    assert flags(listener) == "00010101010101"
-    assert not listener.datagrams
-    assert side().datagrams
+)  # fmt: skip
+def test_a_client_is_greeted_with_its_id_the_versions_verbatim_and_the_settings_of_the_newest(
+    options: dict[str, Any], view: RobotView | None, expected: str
+) -> None:
+    assert greeting(side(view, **options)) == bytes.fromhex(expected)
 
 
 @pytest.mark.parametrize(
-    ("version", "features", "expected"),
+    ("view", "expected"),
     [
-        ("1.1", ("udp", "joystick"), "01000100000000"),
-        ("1.1", ("joystick", "lidar"), "01000100010001"),  # no flag of its own for the map: Lidar says it
-        ("1.2", ("cam", "chat", "lidar", "lidar_sim"), "01010001010101"),
-        ("1.3", ("udp", "lidar_sim", "slam_map"), "01000000000101"),
-        ("1.3", ("joystick", "lidar"), "01000100010000"),
-        ("1.4", ("joystick", "slam_map"), "01000100000001"),
-        ("1.3", (), "01000000000000"),
-        ("1.3", ("joystick", "of tomorrow"), "01000100000000"),
+        (RobotView(), "01010101010101"),  # all while no robot was seen
+        (robot("1.1", "udp", "joystick"), "01000100000000"),
+        (robot("1.1", "joystick", "lidar"), "01000100010001"),  # no flag of its own for the map: Lidar says it
+        (robot("1.2", "cam", "chat", "lidar", "lidar_sim"), "01010001010101"),
+        (robot("1.3", "udp", "lidar_sim", "slam_map"), "01000000000101"),
+        (robot("1.3", "joystick", "lidar"), "01000100010000"),
+        (robot("1.4", "joystick", "slam_map"), "01000100000001"),
+        (robot("1.3"), "01000000000000"),
+        (robot("1.3", "joystick", "of tomorrow"), "01000100000000"),
+        # a robot of another protocol can be driven, and has a map where there is one
+        (robot(None, "lidar", "chat", protocol="alf"), "01000100000000"),
+        (knowing(CORNER, view=robot(None, "lidar", "chat", protocol="alf")), "01000100000001"),
     ],
 )
-def test_a_robot_of_the_same_protocol_is_announced_as_it_announced_itself(version, features, expected) -> None:
-    assert flags(side(robot(version, *features))) == expected
+def test_a_robot_is_announced_as_it_announced_itself(view: RobotView, expected: str) -> None:
+    listener = side(view)
+    assert flags(listener) == expected
+    assert listener.datagrams
+    without = side(view, udp=False)
+    assert flags(without) == "00" + expected[2:]
+    assert not without.datagrams
 
 
-def test_a_robot_of_another_protocol_can_be_driven_and_has_a_map_where_there_is_one() -> None:
-    view = robot(None, "lidar", "chat", protocol="alf")
-    assert flags(side(view)) == "01000100000000"
-    view.note(topics.MAP, CORNER)
-    assert flags(side(view)) == "01000100000001"
-
-
-def test_a_feature_that_the_version_agreed_has_no_flag_for_is_counted_as_left_out() -> None:
-    view = robot("1.3", "joystick", "lidar_sim", "slam_map")
-
-    def left_out(version: str, **options: Any) -> dict[str, int]:
-        listener = side(view, **options)
-        client = joined(listener, version)
-        begin(listener, client)
-        return dict(client.session.left_out)
-
-    assert left_out("1.1") == left_out("1.1", versions=("1.1",)) == {"feature lidar_sim": 1, "feature slam_map": 1}
-    assert left_out("1.2") == {"feature slam_map": 1}
-    assert left_out("1.3") == {}
-    assert greeting(side(view, versions=("1.1",)))[-5:].hex() == "0100010000"
+@pytest.mark.parametrize(
+    ("version", "options", "left_out"),
+    [
+        ("1.1", {}, {"feature lidar_sim": 1, "feature slam_map": 1}),
+        ("1.1", {"versions": ("1.1",)}, {"feature lidar_sim": 1, "feature slam_map": 1}),
+        ("1.2", {}, {"feature slam_map": 1}),
+        ("1.3", {}, {}),
+    ],
+)
+def test_a_feature_that_the_version_agreed_has_no_flag_for_is_counted_as_left_out(version, options, left_out) -> None:
+    client = joined(version, robot("1.3", "joystick", "lidar_sim", "slam_map"), **options)
+    client.begun()
+    assert client.session.left_out == left_out
 
 
 def test_each_client_is_announced_the_robot_as_it_is_when_it_connects() -> None:
@@ -216,60 +256,51 @@ def test_each_client_is_announced_the_robot_as_it_is_when_it_connects() -> None:
     assert flags(listener) == "01010000000000"  # away for a moment, the same robot
 
 
-def test_the_byte_that_some_hq_programs_skip_is_left_out_where_the_listener_says_so() -> None:
-    view = robot("1.3", "joystick", "lidar_sim")
-    expected = "20000000 01 02 02 0b000000" + LISTED.hex() + "010001000001 e8030000 0a000000"
-    assert greeting(side(view, skip_map_flag=True)) == bytes.fromhex(expected)
-    twelve = "10000000 01 02 02 03000000 312e32 010001000001"
-    assert greeting(side(view, skip_map_flag=True, versions=("1.2",))) == bytes.fromhex(twelve)
-
-
-def test_a_map_of_no_cells_cannot_be_configured() -> None:
-    with pytest.raises(msgspec.ValidationError, match="slam_map_size is smaller than slam_map_interval"):
-        msgspec.convert({"slam_map_size": 5, "slam_map_interval": 10}, HqOptions)
-
-
-@pytest.mark.parametrize("versions", [[], ["one"], ["1.1,1.2"], [""]])
-def test_versions_that_are_none_cannot_be_configured(versions: list[str]) -> None:
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert({"versions": versions}, HqOptions)
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"slam_map_size": 5, "slam_map_interval": 10}, "slam_map_size is smaller than slam_map_interval"),
+        *[({"versions": versions}, "version") for versions in ([], ["one"], ["1.1,1.2"], [""])],
+    ],
+)
+def test_a_map_of_no_cells_and_versions_that_are_none_cannot_be_configured(options: object, reason: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=reason):
+        msgspec.convert(options, HqOptions)
 
 
 # The size of the map, announced before the client is known
 
 
-def test_the_map_is_announced_in_its_own_cells() -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(50, 0.1))
-    assert announced(greeting(side(view))) == (500, 10)
-
-
-def test_a_map_that_is_not_known_yet_is_announced_as_configured_but_no_larger_than_fits() -> None:
-    assert announced(greeting(side(slam_map_size=300, slam_map_interval=3))) == (300, 3)
-    assert announced(greeting(side(slam_map_size=1000, slam_map_interval=1))) == (244, 1)
-    assert announced(greeting(side(slam_map_size=1000, slam_map_interval=1, udp=False))) == (46, 1)
+@pytest.mark.parametrize(
+    ("view", "options", "expected"),
+    [
+        (knowing(wall(50, 0.1)), {}, (500, 10)),  # in its own cells
+        # not known yet: as configured, but no larger than fits
+        (RobotView(), {"slam_map_size": 300, "slam_map_interval": 3}, (300, 3)),
+        (RobotView(), {"slam_map_size": 1000, "slam_map_interval": 1}, (244, 1)),
+        (RobotView(), {"slam_map_size": 1000, "slam_map_interval": 1, "udp": False}, (46, 1)),
+    ],
+)
+def test_the_map_is_announced_in_its_own_cells_or_as_configured(view, options, expected) -> None:
+    assert announced(side(view, **options)) == expected
 
 
 @pytest.mark.parametrize("cell", [0.0, -0.1, math.nan, math.inf, 1e-300, 1e9, 1e300])
 def test_a_map_with_absurd_cells_keeps_no_client_from_connecting(cell: float) -> None:
-    view = RobotView()
-    view.note(topics.MAP, Map(1, 1, cell, (0.0, 0.0), np.array([[2]], np.uint8)))
-    view.note(topics.POSE, POSE)
-    listener = side(view)
-    assert announced(greeting(listener)) == (1000, 10)
-    client = joined(listener)
-    begin(listener, client)
-    assert client.frames("tcp") == [POSITION]
+    absurd = Map(1, 1, cell, (0.0, 0.0), np.array([[2]], np.uint8))
+    client = joined(view=knowing(absurd, POSE))
+    assert announced(client.listener) == (1000, 10)
+    assert client.begun() == [POSITION]
     assert client.session.left_out == {"map": 1}
     with pytest.raises(EncodeError):
-        show(listener, topics.MAP, view.map or CORNER, client)
+        client.shown(topics.MAP, absurd)
 
 
 # Handshakes
 
 
 def test_a_client_of_1_3_shakes_hands_with_datagrams() -> None:
-    client = connected(side(robot("1.3", "joystick")), 5)
+    client = Client(side(robot("1.3", "joystick")), 5)
     client.stream(client_settings(sender=0), 0.1)  # before it has read the settings its id is 0
     assert client.frames("tcp", 0.05) == [START]
     assert client.session.claims(framed(0, 5), 11000)
@@ -282,61 +313,23 @@ def test_a_client_of_1_3_shakes_hands_with_datagrams() -> None:
     assert client.session.traffic.malformed == 0
 
 
-def test_a_client_whose_datagram_is_lost_is_shown_the_robot_by_tcp() -> None:
-    listener = side()
-    client = connected(listener, 5)
+@pytest.mark.parametrize(("options", "port"), [({}, 11000), ({"client_port": 40000}, 40000)])
+def test_a_client_whose_datagram_is_lost_is_shown_the_robot_by_tcp_and_may_send_its_own(options, port) -> None:
+    client = Client(side(**options), 5)
     client.stream(client_settings(), 0.1)
     client.until(2.0)
     assert client.frames("tcp", 0.05) == [START]
     client.stream(framed(5, 7, b"\x01"), 2.3)  # "their 7 is always true"
     assert (client.session.state, client.session.transport) == (State.ESTABLISHED, "tcp")
-    show(listener, topics.POSE, POSE, client)
-    assert client.frames("tcp", 2.3) == [POSITION]
+    assert client.shown(topics.POSE, POSE) == [POSITION]
     assert client.frames("udp") == []
-
-
-@pytest.mark.parametrize(("options", "port"), [({}, 11000), ({"client_port": 40000}, 40000)])
-def test_a_client_that_sends_its_datagrams_all_the_same_is_understood(options: dict[str, Any], port: int) -> None:
-    listener = side(**options)
-    client = connected(listener, 5)
-    client.stream(client_settings(), 0.1)
-    client.stream(framed(5, 7, b"\x01"), 2.3)
     assert not client.session.claims(bytes.fromhex("02000000 05 0d"), port + 1)
     assert client.session.claims(bytes.fromhex("02000000 05 0d"), port)
-    assert said(listener, client, bytes.fromhex("06000000 05 0c 0000003f"), datagram=True) == [
-        (topics.CMD_DRIVE, Drive(turn=-0.5))
-    ]
-
-
-@pytest.mark.parametrize("version", ["1.1", "1.2", "1.3"])
-def test_one_listener_shakes_hands_with_clients_of_each_version(version: str) -> None:
-    joined(side(), version)
-    joined(side(), version, udp=True)
-
-
-def test_a_client_of_1_1_at_its_own_port_is_greeted_as_by_a_robot_of_1_1() -> None:
-    listener = side(robot("1.1", "lidar", "joystick"), versions=("1.1",), udp=False)
-    client = connected(listener)
-    assert client.frames("tcp") == [bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000010001")]
-    client.stream(bytes.fromhex("0e000000 00 03 03000000 312e31 0100000000"), 0.1)
-    assert (client.session.state, client.session.version) == (State.ESTABLISHED, "1.1")
-    assert client.frames("tcp", 0.05) == []
-
-
-def test_a_client_without_a_common_version_is_told_why_and_let_go() -> None:
-    client = connected(side(versions=("1.3",)))
-    client.stream(client_settings(b"1.1", "0100000000"), 0.1)
-    client.until(1.0)
-    (told,) = client.frames("tcp", 0.05)
-    assert told[4:6] == b"\x01\x01"
-    assert b"1.1" in told
-    assert b"1.3" in told
-    assert client.session.state is State.CLOSED
-    assert "no common version" in str(client.session.reason)
+    assert client.said("06000000 05 0c 0000003f", datagram=True) == [(topics.CMD_DRIVE, Drive(turn=-0.5))]
 
 
 def test_a_client_that_does_not_answer_the_settings_is_let_go() -> None:
-    client = connected(side())
+    client = Client(side())
     client.until(6.0)
     assert client.session.state is State.CLOSED
     assert "5 s" in str(client.session.reason)
@@ -345,93 +338,49 @@ def test_a_client_that_does_not_answer_the_settings_is_let_go() -> None:
 # What clients are shown
 
 
-def test_the_last_map_and_position_are_sent_once_after_the_handshake() -> None:
-    view = RobotView()
-    view.note(topics.MAP, CORNER)
-    view.note(topics.POSE, POSE)
-    listener = side(view)
-    client = joined(listener)
-    begin(listener, client)
-    map_frame, position = client.frames("tcp")
-    assert map_frame == bytes.fromhex("0f000000 01 35 09000000" + CORNER_CELLS)
-    assert position == POSITION
+def test_the_last_map_and_position_are_sent_once_after_the_handshake_if_there_are_any() -> None:
+    assert joined(view=knowing(CORNER, POSE)).begun() == [CORNER_FRAME, POSITION]
+    assert joined().begun() == []
 
 
-def test_a_client_of_a_robot_that_said_nothing_yet_is_sent_nothing_after_the_handshake() -> None:
-    listener = side()
-    client = joined(listener)
-    begin(listener, client)
-    assert client.sent == []
-
-
-@pytest.mark.parametrize("version", ["1.1", "1.2", "1.3"])
-@pytest.mark.parametrize("udp", [False, True])
+@each_version
+@by_either
 def test_positions_go_to_clients_of_every_version_by_what_was_agreed(version: str, udp: bool) -> None:
-    listener = side()
-    client = joined(listener, version, udp=udp)
-    show(listener, topics.POSE, POSE, client)
-    assert client.frames("udp" if udp else "tcp") == [POSITION]
-    assert len(client.sent) == 1
+    client = joined(version, udp=udp)
+    assert client.shown(topics.POSE, POSE) == [POSITION]
+    assert client.gone() == {"udp" if udp else "tcp"}
 
 
 def test_positions_are_scaled_and_turned_as_configured() -> None:
-    listener = side(length_unit_m=1.0, heading_offset=0.0)
-    client = joined(listener)
-    show(listener, topics.POSE, Pose(1.5, -2.25, math.pi / 2), client)
-    assert client.frames("tcp") == [POSITION]
+    client = joined(length_unit_m=1.0, heading_offset=0.0)
+    assert client.shown(topics.POSE, Pose(1.5, -2.25, math.pi / 2)) == [POSITION]
 
 
 @pytest.mark.parametrize(
     "pose", [Pose(math.nan, 0.0, 0.0), Pose(0.0, math.inf, 0.0), Pose(0.0, 0.0, -math.inf), Pose(1e300, 0.0, 0.0)]
 )
 def test_a_position_that_is_no_number_is_not_shown(pose: Pose) -> None:
-    view = RobotView()
-    view.note(topics.POSE, pose)
-    view.note(topics.MAP, CORNER)
-    listener = side(view)
-    client = joined(listener)
+    client = joined(view=knowing(CORNER, pose))
     with pytest.raises(EncodeError):
-        listener.show(topics.POSE, pose)
-    begin(listener, client)
-    assert [frame[5] for frame in client.frames("tcp")] == [0x35]
+        client.listener.show(topics.POSE, pose)
+    assert ids(client.begun()) == [53]
     assert client.session.left_out == {"pose": 1}
 
 
 def test_of_positions_that_could_not_be_written_yet_only_the_newest_is() -> None:
-    listener = side()
-    client = joined(listener)
+    client = joined()
     for x in (1.0, 2.0, 3.0):
-        send = listener.show(topics.POSE, Pose(x, 0.0, math.pi / 2))
-        assert send is not None
-        send(client.session, client.now)
-    client.until(client.now + 1.0)
-    assert client.frames("tcp") == [bytes.fromhex("0e000000 01 37 00009643 00000000 00000000")]
+        client.shown(topics.POSE, Pose(x, 0.0, math.pi / 2), at_once=True)
+    assert client.left() == [bytes.fromhex("0e000000 01 37 00009643 00000000 00000000")]
 
 
 def test_packets_are_never_written_together() -> None:
-    listener = side(gap_s=0.05)
-    client = joined(listener)
-    for topic, message in ((topics.POSE, POSE), (topics.MAP, CORNER), (topics.LIDAR, Switch(True))):
-        send = listener.show(topic, message)
-        assert send is not None
-        send(client.session, client.now)
-    for text in ("one", "two"):
-        send = listener.show(topics.TEXT, Text(text))
-        assert send is not None
-        send(client.session, client.now)
-    client.until(client.now + 1.0)
-    times = [sent.at for sent in client.sent]
-    assert len(times) == 5
-    assert min(later - earlier for earlier, later in pairwise(times)) >= 0.05 - 1e-9
-
-
-@pytest.mark.parametrize(("on", "expected"), [(True, "06000000 01 33 01000000"), (False, "06000000 01 33 02000000")])
-def test_the_state_of_the_lidar_goes_by_tcp(on: bool, expected: str) -> None:
-    listener = side()
-    client = joined(listener, udp=True)
-    show(listener, topics.LIDAR, Switch(on), client)
-    assert client.frames("tcp") == [bytes.fromhex(expected)]
-    assert client.frames("udp") == []
+    client = joined(gap_s=0.05)
+    news = ((topics.POSE, POSE), (topics.MAP, CORNER), (topics.LIDAR, Switch(True)))
+    for topic, message in (*news, (topics.TEXT, Text("one")), (topics.TEXT, Text("two"))):
+        client.shown(topic, message, at_once=True)
+    assert len(client.left()) == 5
+    assert min(later.at - earlier.at for earlier, later in pairwise(client.sent)) >= 0.05 - 1e-9
 
 
 ALL_OF_A_ROBOT: tuple[tuple[Topic, FleetMessage], ...] = (
@@ -440,7 +389,7 @@ ALL_OF_A_ROBOT: tuple[tuple[Topic, FleetMessage], ...] = (
     (topics.LIDAR, Switch(True)),
     (topics.CAMERA, Switch(True)),
     (topics.TEXT, Text("bye")),
-    (topics.TEXT, Text("simulated lidar data", "request")),
+    (topics.TEXT, REQUEST),
     (topics.RAW("tcpudp"), Raw(40, b"chat")),
     (topics.RAW("tcpudp"), Raw(70, b"led")),
     (topics.RAW("tcpudp"), Raw(70, b"led")),
@@ -448,44 +397,49 @@ ALL_OF_A_ROBOT: tuple[tuple[Topic, FleetMessage], ...] = (
 
 
 @pytest.mark.parametrize(
-    ("version", "ids"), [("1.1", [1, 51, 53, 55]), ("1.2", [1, 51, 53, 55, 60]), ("1.3", [1, 51, 53, 55, 60])]
+    ("version", "known"), [("1.1", [1, 51, 53, 55]), ("1.2", [1, 51, 53, 55, 60]), ("1.3", [1, 51, 53, 55, 60])]
 )
-@pytest.mark.parametrize("udp", [False, True])
-def test_a_client_gets_the_packets_that_its_version_knows_and_the_rest_is_counted(version, ids, udp) -> None:
-    listener = side()
-    client = joined(listener, version, udp=udp)
-    for topic, message in ALL_OF_A_ROBOT:
-        show(listener, topic, message, client)
-    assert sorted(sent.frame[5] for sent in client.sent) == ids
+@by_either
+def test_a_client_gets_the_packets_that_its_version_knows_and_the_rest_is_counted(version, known, udp) -> None:
+    client = joined(version, udp=udp)
+    assert sorted(ids([frame for news in ALL_OF_A_ROBOT for frame in client.shown(*news)])) == known
     assert client.session.left_out["serverCamMode (31)"] == 1
     assert client.session.left_out["chatMessage (40)"] == 1
     assert client.session.left_out["packet 70"] == 2
 
 
-def test_packets_that_a_listener_says_its_clients_know_are_passed_on() -> None:
-    listener = side(known=(31, 40, 70))
-    client = joined(listener, "1.1")
-    for topic, message in ALL_OF_A_ROBOT[:-1]:
-        show(listener, topic, message, client)
-    frames = {frame[5]: frame for frame in client.frames("tcp")}
-    assert frames[31] == bytes.fromhex("06000000 01 1f 01000000")
-    assert frames[40] == bytes.fromhex("06000000 01 28 63686174")
-    assert frames[70] == bytes.fromhex("05000000 01 46 6c6564")
+@pytest.mark.parametrize(
+    ("topic", "message", "expected"),
+    [
+        (topics.LIDAR, Switch(True), "06000000 01 33 01000000"),
+        (topics.LIDAR, Switch(False), "06000000 01 33 02000000"),
+        (topics.CAMERA, Switch(True), "06000000 01 1f 01000000"),
+        (topics.RAW("tcpudp"), Raw(40, b"chat"), "06000000 01 28 63686174"),
+        (topics.RAW("tcpudp"), Raw(70, b"led"), "05000000 01 46 6c6564"),
+        (topics.TEXT, Text("bye"), "09000000 01 01 03000000 627965"),
+        # texts are shown in ASCII
+        (topics.TEXT, Text("grün"), "0d000000 01 01 07000000 67725c7866636e"),
+        (topics.TEXT, Text("\N{ROBOT FACE}"), "10000000 01 01 0a000000 5c553030303166393136"),
+        (topics.TEXT, Text("\udcff"), "0c000000 01 01 06000000 5c7564636666"),
+    ],
+)
+def test_news_go_by_tcp_to_clients_that_know_their_packet_or_are_said_to_know_it(topic, message, expected) -> None:
+    for client in (joined(udp=True, known=(31, 40, 70)), joined("1.1", known=(31, 40, 70))):
+        assert client.shown(topic, message) == [bytes.fromhex(expected)]
+        assert client.gone() == {"tcp"}
 
 
 def test_raw_packets_are_none_that_a_fleet_message_holds_none_beyond_a_byte_and_none_that_clients_lose() -> None:
-    listener = side(known=(2, 13, 40, 55))
+    client = joined(known=(2, 13, 40, 55))
     raw = topics.RAW("tcpudp")
     for held in (1, 2, 13, 53, 55):
-        assert listener.show(raw, Raw(held, b"")) is None
+        assert client.listener.show(raw, Raw(held, b"")) is None
     for packet_id in (256, -1):
         with pytest.raises(EncodeError):
-            listener.show(raw, Raw(packet_id))
-    client = joined(listener)
-    show(listener, raw, Raw(40, bytes(2193)), client)
-    assert [len(frame) for frame in client.frames("tcp")] == [2199]
+            client.listener.show(raw, Raw(packet_id))
+    assert [len(frame) for frame in client.shown(raw, Raw(40, bytes(2193)))] == [2199]
     with pytest.raises(EncodeError):  # they lose packets of 2.2 kB
-        listener.show(raw, Raw(40, bytes(2194)))
+        client.listener.show(raw, Raw(40, bytes(2194)))
 
 
 @pytest.mark.parametrize(
@@ -499,111 +453,68 @@ def test_raw_packets_are_none_that_a_fleet_message_holds_none_beyond_a_byte_and_
     ],
 )
 def test_simulated_lidar_data_is_asked_of_those_who_announced_it(version: str, block: str, asked: bool) -> None:
-    listener = side()
-    client = joined(listener, version, block=block)
-    show(listener, topics.TEXT, Text("simulated lidar data", "request"), client)
-    assert client.frames("tcp") == ([bytes.fromhex("02000000 01 3c")] if asked else [])
+    expected = [bytes.fromhex("02000000 01 3c")] if asked else []
+    assert joined(version, block=block).shown(topics.TEXT, REQUEST) == expected
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("bye", "627965"),
-        ("grün", "67725c7866636e"),
-        ("\N{ROBOT FACE}", "5c553030303166393136"),
-        ("\udcff", "5c7564636666"),
-    ],
-)
-def test_texts_are_shown_in_ascii(text: str, shown: str) -> None:
-    listener = side()
-    client = joined(listener, udp=True)
-    show(listener, topics.TEXT, Text(text), client)
-    body = bytes.fromhex(shown)
-    assert client.frames("tcp") == [framed(1, 1, counted(body))]
-
-
-def test_an_empty_text_is_shown_to_nobody() -> None:
+def test_empty_texts_scans_and_readings_have_no_packet() -> None:
     assert side().show(topics.TEXT, Text("")) is None
+    assert side().show(topics.SCAN, Scan(0.0, 0.1, 0.0, 1.0, np.ones(3, np.float32))) is None
 
 
 @pytest.mark.parametrize("text", ["a" * 100_000, "ü" * 5000])
 def test_a_long_text_is_cut_so_that_clients_do_not_lose_it(text: str) -> None:
-    listener = side()
-    client = joined(listener)
-    show(listener, topics.TEXT, Text(text), client)
-    assert isinstance(client.session, HqClient)
-    listener.tell(client.session, text, client.now)
-    client.until(client.now + 1.0)
-    shown, told = client.frames("tcp")
-    assert shown == told
+    client = joined()
+    (shown,) = client.shown(topics.TEXT, Text(text))
+    client.listener.tell(client.session, text, client.now)
+    assert client.left() == [shown]
     assert 500 < len(shown) < 2200
 
 
 def test_texts_are_queued_and_none_replaces_another_until_too_many_wait() -> None:
-    listener = side()
-    client = joined(listener)
+    client = joined()
     with pytest.raises(Refused):  # noqa: PT012
         for number in range(1000):
-            send = listener.show(topics.TEXT, Text(f"{number:03}"))
-            assert send is not None
-            send(client.session, client.now)
+            client.shown(topics.TEXT, Text(f"{number:03}"), at_once=True)
     client.until(client.now + 10.0)
     texts = [frame[10:].decode() for frame in client.frames("tcp")]
     assert texts == [f"{number:03}" for number in range(len(texts))]
     assert len(texts) >= 16
 
 
-def test_scans_and_readings_have_no_packet() -> None:
-    scan = Scan(0.0, 0.1, 0.0, 1.0, np.ones(3, np.float32))
-    assert side().show(topics.SCAN, scan) is None
-
-
 # Maps
 
 
-@pytest.mark.parametrize("version", ["1.1", "1.2", "1.3"])
-def test_a_map_that_is_not_there_yet_has_a_count_of_no_cells(version: str) -> None:
-    listener = side()
-    client = joined(listener, version)
-    show(listener, topics.MAP, Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), client)
-    assert client.frames("tcp") == [EMPTY_MAP]
+@each_version
+@by_either
+def test_a_map_goes_by_what_was_agreed_and_one_that_is_not_there_yet_has_a_count_of_no_cells(version, udp) -> None:
+    size = {"slam_map_size": 30, "slam_map_interval": 10} if version == "1.3" else {}
+    client = joined(version, udp=udp, **size)  # type: ignore[arg-type]
+    assert client.shown(topics.MAP, NO_MAP) == [EMPTY_MAP]
+    assert client.shown(topics.MAP, CORNER) == [CORNER_FRAME], "the smallest square for those who are told no size"
+    assert client.gone() == {"udp" if udp else "tcp"}
 
 
-@pytest.mark.parametrize("version", ["1.1", "1.2"])
-def test_clients_that_were_told_no_size_get_the_smallest_square_around_the_map(version: str) -> None:
-    listener = side()
-    client = joined(listener, version, udp=True)
-    show(listener, topics.MAP, CORNER, client)
-    assert client.frames("udp") == [bytes.fromhex("0f000000 01 35 09000000" + CORNER_CELLS)]
-    assert client.frames("tcp") == []
-
-
-def test_a_map_of_the_captured_robot_is_passed_on_as_it_was() -> None:
+@pytest.mark.parametrize("version", ["1.1", "1.3"])
+@by_either
+def test_a_map_of_the_captured_robot_is_passed_on_as_it_was(version: str, udp: bool) -> None:
     recorded = next(record.payload for record in payloads(NEW, source=11001) if record.payload[5] == 53)
-    cells = np.frombuffer(recorded[10:], np.uint8).reshape(20, 20).T
-    view = robot("1.3", "udp", "lidar_sim", "slam_map")
-    view.note(topics.MAP, Map(20, 20, 0.01, (-0.1, -0.1), cells))
-    listener = side(view)
-    assert announced(greeting(listener)) == (20, 1)
-    for version in ("1.1", "1.3"):
-        for udp in (False, True):
-            client = joined(listener, version, udp=udp)
-            begin(listener, client)
-            assert client.frames("udp" if udp else "tcp") == [recorded]
+    grid = Map(20, 20, 0.01, (-0.1, -0.1), np.frombuffer(recorded[10:], np.uint8).reshape(20, 20).T)
+    client = joined(version, knowing(grid, view=robot("1.3", "udp", "lidar_sim", "slam_map")), udp=udp)
+    assert announced(client.listener) == (20, 1)
+    assert client.begun() == [recorded]
+    assert client.gone() == {"udp" if udp else "tcp"}
 
 
-@pytest.mark.parametrize("version", ["1.1", "1.2", "1.3"])
+@each_version
 @pytest.mark.parametrize(("udp", "limit"), [(False, 2199), (True, 60_000)])
-@pytest.mark.parametrize("side_cells", [20, 46, 47, 244, 245, 400, 2048])
+@pytest.mark.parametrize("side_cells", [20, 46, 47, 100, 244, 245, 400, 2048])
 def test_a_map_of_any_size_fits_and_keeps_its_obstacle(version: str, udp: bool, limit: int, side_cells: int) -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(side_cells))
-    listener = side(view)
-    size, interval = announced(greeting(listener))
+    client = joined(version, knowing(wall(side_cells)), udp=udp)
+    size, interval = announced(client.listener)
     assert size >= side_cells * 10
-    client = joined(listener, version, udp=udp)
-    begin(listener, client)
-    (frame,) = client.frames("udp" if udp else "tcp")
+    (frame,) = client.begun()
+    assert client.gone() == {"udp" if udp else "tcp"}
     assert len(frame) <= limit
     cells = cells_of(frame)
     root = math.isqrt(len(cells))
@@ -613,123 +524,96 @@ def test_a_map_of_any_size_fits_and_keeps_its_obstacle(version: str, udp: bool, 
         assert root == size // interval
     if side_cells**2 + 10 <= limit:
         assert root == side_cells
-
-
-def test_a_client_of_1_3_gets_every_later_map_in_the_cells_it_was_announced() -> None:
-    view = RobotView()
-    view.note(topics.MAP, CORNER)
-    listener = side(view)
-    client = joined(listener, udp=True)
-    finer = np.zeros((8, 8), np.uint8)
-    finer[0, 1] = 2  # at x 5 to 10 cm, y 0 to 5 cm: in the cell (0, 0)
-    finer[5, 2] = 1  # at x 10 to 15 cm, y 25 to 30 cm: in the cell x 1, y 2
-    show(listener, topics.MAP, Map(6, 6, 0.05, (0.0, 0.0), finer[:6, :6]), client)
-    assert [cells_of(frame).hex() for frame in client.frames("udp")] == ["020000000001000000"]
-    assert client.session.left_out == {}
-
-
-def test_a_map_larger_than_a_client_was_told_is_shown_whole_in_larger_cells_and_that_is_counted() -> None:
-    view = RobotView()
-    view.note(topics.MAP, CORNER)
-    listener = side(view)
-    client = joined(listener, udp=True)
-    cells = np.zeros((6, 6), np.uint8)
-    cells[0, 0], cells[5, 5], cells[3, 4] = 2, 2, 1
-    show(listener, topics.MAP, Map(6, 6, 0.1, (0.0, 0.0), cells), client)
-    assert [cells_of(frame).hex() for frame in client.frames("udp")] == ["020000000000000102"]
-    assert client.session.left_out == {"map to scale": 1}
-
-
-def test_the_zero_of_a_robot_of_the_same_protocol_stays_where_its_programs_see_it() -> None:
-    centred = np.zeros((40, 40), np.uint8)
-    centred[20, 20] = 2  # at (0, 0) of a map of 4 m around it
-    for origin, cell in (((-2.0, -2.0), (50, 50)), ((0.0, 0.0), (20, 20))):
-        listener = side(robot("1.3", "joystick"))
-        client = joined(listener, udp=True)
-        show(listener, topics.MAP, Map(40, 40, 0.1, origin, centred), client)
-        (frame,) = client.frames("udp")
-        shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
-        assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
-
-
-def test_a_map_of_another_robot_is_centred_on_zero_or_placed_as_the_option_says() -> None:
-    cells = np.zeros((20, 10), np.uint8)
-    cells[5, 10 - 1] = 2  # x -0.1 to 0, y -1 to -0.9
-    grid = Map(20, 10, 0.1, (-1.0, -1.5), cells)
-    for options, cell in (({}, (49, 40)), ({"map_origin": (-2.0, -3.0)}, (19, 20))):
-        listener = side(robot(None, protocol="alf"), **options)
-        client = joined(listener, udp=True)
-        show(listener, topics.MAP, grid, client)
-        (frame,) = client.frames("udp")
-        shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
-        assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
-
-
-def test_clients_that_came_at_different_times_each_get_what_they_were_announced() -> None:
-    view = RobotView()
-    listener = side(view, slam_map_size=20, slam_map_interval=10)
-    early = joined(listener, udp=True)
-    view.note(topics.MAP, CORNER)
-    late = joined(listener, udp=True, number=3)
-    show(listener, topics.MAP, CORNER, early, late)
-    assert [cells_of(frame).hex() for frame in early.frames("udp")] == ["01000202"]
-    assert [cells_of(frame).hex() for frame in late.frames("udp")] == [CORNER_CELLS.replace(" ", "")]
-
-
-def test_a_client_of_1_3_whose_datagrams_fail_gets_a_square_by_tcp_where_the_announced_one_does_not_fit() -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(100))
-    listener = side(view)
-    client = joined(listener)
-    begin(listener, client)
-    (frame,) = client.frames("tcp")
-    assert len(cells_of(frame)) == 46 * 46
-    assert frame[-1] == 2
+    elif not udp:
+        assert root == 46, "the largest that fits, for 1.3 too where the announced one does not"
+        assert cells[-1] == 2
 
 
 def test_a_listener_without_datagrams_announces_a_map_that_fits_by_tcp() -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(100))
-    listener = side(view, udp=False)
-    size, interval = announced(greeting(listener))
-    client = joined(listener)
-    begin(listener, client)
-    (frame,) = client.frames("tcp")
+    client = joined(listener=side(knowing(wall(100)), udp=False))
+    size, interval = announced(client.listener)
+    (frame,) = client.begun()
     assert len(frame) < 2200
     assert len(cells_of(frame)) == (size // interval) ** 2
     assert size >= 1000
 
 
+def drawn(rows: int, columns: int, cell_m: float, origin: tuple[float, float], **cells: tuple[int, int]) -> Map:
+    """A map whose cells are unknown but for one that is free and those that are obstacles: (row, column) of each."""
+    values = np.zeros((rows, columns), np.uint8)
+    for name, place in cells.items():
+        values[place] = 1 if name == "free" else 2
+    return Map(rows, columns, cell_m, origin, values)
+
+
+@pytest.mark.parametrize(
+    ("grid", "shown", "left_out"),
+    [
+        # The obstacle at x 5 to 10 cm, y 0 to 5 cm: in the cell (0, 0). Free at x 10 to 15, y 25 to 30: in x 1, y 2.
+        (drawn(6, 6, 0.05, (0.0, 0.0), obstacle=(0, 1), free=(5, 2)), "020000000001000000", {}),
+        # larger than the client was told: shown whole in larger cells
+        (
+            drawn(6, 6, 0.1, (0.0, 0.0), obstacle=(0, 0), another=(5, 5), free=(3, 4)),
+            "020000000000000102",
+            {"map to scale": 1},
+        ),
+    ],
+)
+def test_a_client_of_1_3_gets_every_later_map_in_the_cells_it_was_announced(grid, shown, left_out) -> None:
+    client = joined(view=knowing(CORNER), udp=True)
+    assert [cells_of(frame).hex() for frame in client.shown(topics.MAP, grid)] == [shown]
+    assert client.session.left_out == left_out
+
+
+CENTRED = {"rows": 40, "columns": 40, "cell_m": 0.1, "obstacle": (20, 20)}
+OFF_CENTRE = drawn(20, 10, 0.1, (-1.0, -1.5), obstacle=(5, 9))  # x -0.1 to 0, y -1 to -0.9
+
+
+@pytest.mark.parametrize(
+    ("view", "options", "grid", "cell"),
+    [
+        # the zero of a robot of the same protocol stays where its programs see it
+        (robot("1.3", "joystick"), {}, drawn(**CENTRED, origin=(-2.0, -2.0)), (50, 50)),  # type: ignore[arg-type]
+        (robot("1.3", "joystick"), {}, drawn(**CENTRED, origin=(0.0, 0.0)), (20, 20)),  # type: ignore[arg-type]
+        # a map of another robot is centred on zero or placed as the option says
+        (robot(None, protocol="alf"), {}, OFF_CENTRE, (49, 40)),
+        (robot(None, protocol="alf"), {"map_origin": (-2.0, -3.0)}, OFF_CENTRE, (19, 20)),
+    ],
+)
+def test_a_map_lies_where_the_programs_of_its_robot_see_it(view, options, grid, cell) -> None:
+    (frame,) = joined(view=view, udp=True, **options).shown(topics.MAP, grid)
+    shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
+    assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
+
+
+def test_clients_that_came_at_different_times_each_get_what_they_were_announced() -> None:
+    view = RobotView()
+    early = joined(view=view, udp=True, slam_map_size=20, slam_map_interval=10)
+    knowing(CORNER, view=view)
+    late = joined(listener=early.listener, udp=True, number=3)
+    assert [cells_of(frame).hex() for frame in early.shown(topics.MAP, CORNER)] == ["01000202"]
+    assert [cells_of(frame).hex() for frame in late.shown(topics.MAP, CORNER)] == [CORNER_CELLS]
+
+
 # The first programs of 1.1 have no handlers for 53 and 55: who asks (52, 54) has
 
 
-ASK_MAP, ASK_POSE = bytes.fromhex("02000000 02 34"), bytes.fromhex("02000000 02 36")
+def unasked(version: str = "1.1", **options: Any) -> Client:
+    """A client that never asked, of a robot whose map and position are known."""
+    return joined(version, knowing(CORNER, POSE, robot("1.1", "lidar", "joystick")), asks=False, **options)
 
 
-def seen() -> RobotView:
-    """A robot whose map and position are known."""
-    view = robot("1.1", "lidar", "joystick")
-    view.note(topics.MAP, CORNER)
-    view.note(topics.POSE, POSE)
-    return view
-
-
-def kinds_shown(listener: TcpUdpHq, client: Timed) -> list[int]:
+def kinds_shown(client: Client) -> list[int]:
     """Which packets a client gets of a new map and a new position."""
-    client.sent.clear()
-    show(listener, topics.MAP, CORNER, client)
-    show(listener, topics.POSE, POSE, client)
-    return [sent.frame[5] for sent in client.sent]
+    return ids(client.shown(topics.MAP, CORNER) + client.shown(topics.POSE, POSE))
 
 
-@pytest.mark.parametrize("udp", [False, True])
+@by_either
 @pytest.mark.parametrize("versions", [("1.1",), ("1.1", "1.2", "1.3")])
 def test_a_client_of_1_1_that_never_asked_gets_no_map_and_no_position(versions: tuple[str, ...], udp: bool) -> None:
-    listener = side(seen(), versions=versions)
-    client = joined(listener, "1.1", udp=udp, asks=False)
-    begin(listener, client)
-    assert client.sent == []
-    assert kinds_shown(listener, client) == []
+    client = unasked(udp=udp, versions=versions)
+    assert client.begun() == []
+    assert kinds_shown(client) == []
     assert client.session.left_out["servertSLAMMap (53) unasked"] == 2
     assert client.session.left_out["serverPosition (55) unasked"] == 2
 
@@ -738,72 +622,40 @@ def test_a_client_of_1_1_that_never_asked_gets_no_map_and_no_position(versions: 
     ("asked", "topic", "shown"), [(ASK_MAP, topics.RPC_MAP, [53]), (ASK_POSE, topics.RPC_POSE, [55])]
 )
 def test_a_client_of_1_1_that_asked_for_one_gets_that_one_from_then_on(asked, topic, shown) -> None:
-    listener = side(seen())
-    client = joined(listener, "1.1", asks=False)
-    assert said(listener, client, asked) == [(topic, Query())]
-    answer(listener, client, topic, None)
-    assert [sent.frame[5] for sent in client.sent] == shown
-    assert kinds_shown(listener, client) == shown
-    other = joined(listener, "1.1", number=3, asks=False)
-    assert kinds_shown(listener, other) == [], "each for itself"
+    client = unasked()
+    assert client.said(asked) == [(topic, Query())]
+    assert ids(client.answered(topic)) == shown
+    assert kinds_shown(client) == shown
+    other = joined("1.1", listener=client.listener, number=3, asks=False)
+    assert kinds_shown(other) == [], "each for itself"
+    client.said(ASK_POSE + ASK_MAP)
+    assert kinds_shown(client) == [53, 55], "who asked for both gets both"
 
 
-def test_a_client_of_1_1_that_asked_for_both_gets_both() -> None:
-    listener = side(seen())
-    client = joined(listener, "1.1", asks=False)
-    said(listener, client, ASK_POSE + ASK_MAP)
-    assert kinds_shown(listener, client) == [53, 55]
-
-
-def test_a_listener_may_be_told_that_its_clients_of_1_1_take_them_unasked() -> None:
-    listener = side(seen(), unasked=True)
-    client = joined(listener, "1.1", asks=False)
-    begin(listener, client)
-    assert [sent.frame[5] for sent in client.sent] == [53, 55]
-    assert kinds_shown(listener, client) == [53, 55]
-
-
-@pytest.mark.parametrize("version", ["1.2", "1.3"])
-def test_clients_of_later_versions_need_not_ask(version: str) -> None:
-    listener = side(seen())
-    client = joined(listener, version, asks=False)
-    begin(listener, client)
-    assert [sent.frame[5] for sent in client.sent] == [53, 55]
-    assert kinds_shown(listener, client) == [53, 55]
+@pytest.mark.parametrize(("version", "options"), [("1.1", {"unasked": True}), ("1.2", {}), ("1.3", {})])
+def test_clients_of_later_versions_and_those_said_to_take_them_need_not_ask(version, options) -> None:
+    client = unasked(version, **options)
+    assert ids(client.begun()) == [53, 55]
+    assert kinds_shown(client) == [53, 55]
 
 
 # Questions
 
 
-def test_questions_are_passed_on() -> None:
-    listener = side()
-    client = joined(listener)
-    assert said(listener, client, bytes.fromhex("02000000 02 34")) == [(topics.RPC_MAP, Query())]
-    assert said(listener, client, bytes.fromhex("02000000 02 36")) == [(topics.RPC_POSE, Query())]
-
-
 def test_questions_are_answered_with_what_the_robot_says_else_with_what_it_said_last() -> None:
     view = RobotView()
-    listener = side(view, slam_map_size=30, slam_map_interval=10)
-    client = joined(listener)
-    answer(listener, client, topics.RPC_POSE, POSE)
-    answer(listener, client, topics.RPC_MAP, CORNER)
-    asked = [POSITION, bytes.fromhex("0f000000 01 35 09000000" + CORNER_CELLS)]
-    assert client.frames("tcp") == asked
-    view.note(topics.POSE, POSE)
-    view.note(topics.MAP, CORNER)
-    answer(listener, client, topics.RPC_POSE, None)
-    answer(listener, client, topics.RPC_MAP, None)
-    assert client.frames("tcp") == asked * 2
+    client = joined(view=view, slam_map_size=30, slam_map_interval=10)
+    assert client.answered(topics.RPC_POSE, POSE) == [POSITION]
+    assert client.answered(topics.RPC_MAP, CORNER) == [CORNER_FRAME]
+    knowing(CORNER, POSE, view)
+    assert client.answered(topics.RPC_POSE) == [POSITION]
+    assert client.answered(topics.RPC_MAP) == [CORNER_FRAME]
 
 
 def test_a_map_that_nobody_has_is_answered_with_an_empty_one_and_a_position_with_a_text() -> None:
-    listener = side()
-    client = joined(listener, "1.1")
-    answer(listener, client, topics.RPC_MAP, None)
-    answer(listener, client, topics.RPC_POSE, None)
-    empty, text = client.frames("tcp")
-    assert empty == EMPTY_MAP
+    client = joined("1.1")
+    assert client.answered(topics.RPC_MAP) == [EMPTY_MAP]
+    (text,) = client.answered(topics.RPC_POSE)
     assert text[4:6] == b"\x01\x01"
     assert b"position" in text
 
@@ -837,163 +689,130 @@ def test_a_map_that_nobody_has_is_answered_with_an_empty_one_and_a_position_with
     ],
 )
 def test_a_stick_drives(packet: str, drive: Drive | None, sender: int) -> None:
-    listener = side()
-    client = joined(listener)
-    head, body = bytes.fromhex(packet)[0], bytes.fromhex(packet)[1:]
+    client = joined()
+    frame = framed(sender, bytes.fromhex(packet)[0], bytes.fromhex(packet)[1:])
     if drive is None:
         with pytest.raises(ProtocolError):
-            said(listener, client, framed(sender, head, body))
+            client.said(frame)
     else:
-        assert said(listener, client, framed(sender, head, body)) == [(topics.CMD_DRIVE, drive)]
+        assert client.said(frame) == [(topics.CMD_DRIVE, drive)]
 
 
 def test_a_direction_longer_than_one_keeps_its_direction() -> None:
-    listener = side()
-    ((_, drive),) = said(listener, joined(listener), bytes.fromhex("0e000000 02 0b 00004040 00008040 0000803f"))
+    ((_, drive),) = joined().said("0e000000 02 0b 00004040 00008040 0000803f")
     assert isinstance(drive, Drive)
     assert (drive.forward, drive.left, drive.turn) == pytest.approx((0.8, -0.6, 0.0))
 
 
 def test_full_scale_is_what_the_listener_says() -> None:
-    listener = side(speed_full=2.0, turn_full=4.0)
-    client = joined(listener)
-    move = bytes.fromhex("0e000000 02 0b 00000000 0000803f 0000803f")
-    assert said(listener, client, move) == [(topics.CMD_DRIVE, Drive(forward=0.5))]
-    assert said(listener, client, bytes.fromhex("06000000 02 0c 0000803f")) == [(topics.CMD_DRIVE, Drive(turn=-0.25))]
+    client = joined(speed_full=2.0, turn_full=4.0)
+    assert client.said("0e000000 02 0b 00000000 0000803f 0000803f") == [(topics.CMD_DRIVE, Drive(forward=0.5))]
+    assert client.said("06000000 02 0c 0000803f") == [(topics.CMD_DRIVE, Drive(turn=-0.25))]
 
 
 @given(st.binary(min_size=12, max_size=12), st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
 @example(bytes.fromhex("ffff7f7f ffff7fff ffff7f7f"), 1.0, 1.0)
 @example(bytes.fromhex("01000000 01000000 01000000"), 1000.0, 1000.0)
 def test_whatever_a_stick_says_the_bus_takes_the_drive_or_there_is_none(body, speed_full, turn_full) -> None:
-    listener = side(speed_full=speed_full, turn_full=turn_full)
-    client = joined(listener)
+    client = joined(speed_full=speed_full, turn_full=turn_full)
     for packet in (framed(2, 11, body), framed(2, 12, body[:4])):
         try:
-            ((topic, drive),) = said(listener, client, packet)
+            ((topic, drive),) = client.said(packet)
         except ProtocolError:
             continue
         assert topic is topics.CMD_DRIVE
         assert payloads_codec.decode(Drive, payloads_codec.encode(drive)) == drive
 
 
-@pytest.mark.parametrize(("mode", "meant"), [(1, "none"), (2, "manual"), (3, "autonomous")])
-def test_control_modes_are_understood(mode: int, meant: str) -> None:
-    listener = side()
-    expected = [(topics.CMD_MODE, msgspec.convert({"mode": meant}, Mode))]
-    assert said(listener, joined(listener), framed(2, 10, bytes([mode, 0, 0, 0]))) == expected
-
-
-def test_the_lidar_is_switched() -> None:
-    listener = side()
-    client = joined(listener)
-    assert said(listener, client, bytes.fromhex("06000000 02 32 01000000")) == [(topics.CMD_LIDAR, Switch(True))]
-    assert said(listener, client, bytes.fromhex("06000000 02 32 02000000")) == [(topics.CMD_LIDAR, Switch(False))]
-
-
-def test_texts_carry_the_name_of_the_session_and_empty_ones_are_nothing() -> None:
-    listener = side()
-    client = joined(listener)
+@pytest.mark.parametrize(
+    ("packet", "expected"),
+    [
+        ("06000000 02 0a 01000000", [(topics.CMD_MODE, Mode("none"))]),
+        ("06000000 02 0a 02000000", [(topics.CMD_MODE, Mode("manual"))]),
+        ("06000000 02 0a 03000000", [(topics.CMD_MODE, Mode("autonomous"))]),
+        ("06000000 02 32 01000000", [(topics.CMD_LIDAR, Switch(True))]),
+        ("06000000 02 32 02000000", [(topics.CMD_LIDAR, Switch(False))]),
+        ("02000000 02 34", [(topics.RPC_MAP, Query())]),
+        ("02000000 02 36", [(topics.RPC_POSE, Query())]),
+        # texts carry the name of the session, and empty ones are nothing
+        ("0e000000 01 01 08000000 6869207468657265", [(topics.CMD_TEXT, Text("hi there", sender="hq.2"))]),
+        ("07000000 02 01 01000000 fc", [(topics.CMD_TEXT, Text("\\xfc", sender="hq.2"))]),
+        ("06000000 02 01 00000000", []),
+    ],
+)
+def test_a_packet_becomes_its_command(packet: str, expected: list[tuple[Topic, FleetMessage]]) -> None:
+    client = joined()
     client.session.name = "hq.2"
-    hello = bytes.fromhex("0e000000 01 01 08000000 6869207468657265")
-    assert said(listener, client, hello) == [(topics.CMD_TEXT, Text("hi there", sender="hq.2"))]
-    assert said(listener, client, bytes.fromhex("06000000 02 01 00000000")) == []
-    ((_, odd),) = said(listener, client, bytes.fromhex("07000000 02 01 01000000 fc"))
-    assert odd == Text("\\xfc", sender="hq.2")
+    assert client.said(packet) == expected
 
 
 @pytest.mark.parametrize("packet_id", [21, 40, *range(70, 80), 99, 255])
-@pytest.mark.parametrize("body", ["", "00", "0102030405060708"])
-def test_packets_that_no_fleet_message_holds_are_raw(packet_id: int, body: str) -> None:
-    listener = side()
-    content = bytes.fromhex(body)
-    raw = said(listener, joined(listener), framed(2, packet_id, content))
-    assert raw == [(topics.CMD_RAW("tcpudp"), Raw(packet_id, content))]
+@pytest.mark.parametrize("body", [b"", b"\x00", b"\x01\x02\x03\x04\x05\x06\x07\x08"])
+def test_packets_that_no_fleet_message_holds_are_raw(packet_id: int, body: bytes) -> None:
+    assert joined().said(framed(2, packet_id, body)) == [(topics.CMD_RAW("tcpudp"), Raw(packet_id, body))]
 
 
-def scan_of(listener: TcpUdpHq, ranges: str, count: int) -> Scan:
-    body = count.to_bytes(4, "little") + bytes.fromhex(ranges)
-    ((topic, scan),) = said(listener, joined(listener), framed(2, 61, body))
+def scan_of(ranges: str, count: int, **options: Any) -> Scan:
+    ((topic, scan),) = joined(**options).said(framed(2, 61, count.to_bytes(4, "little") + bytes.fromhex(ranges)))
     assert topic is topics.CMD_SCAN
     assert isinstance(scan, Scan)
     return scan
 
 
 def test_simulated_lidar_data_is_a_turn_of_ranges_in_metres() -> None:
-    scan = scan_of(side(), "0000c842" * 359 + "00004843", 360)
+    scan = scan_of("0000c842" * 359 + "00004843", 360)
     assert (scan.angle_min, scan.angle_increment, scan.range_min) == pytest.approx((0.0, math.radians(1.0), 0.0))
     assert scan.range_max == pytest.approx(2.0)
     assert scan.ranges.tolist() == pytest.approx([1.0] * 359 + [2.0])
 
 
-def test_a_range_of_nothing_is_none() -> None:
-    # 0, -1, NaN, a signalling NaN, infinity, 100 cm
-    scan = scan_of(side(), "00000000 000080bf 0000c07f 0100807f 0000807f 0000c842", 6)
-    assert [math.isnan(value) for value in scan.ranges.tolist()] == [True] * 5 + [False]
-    assert scan.range_max == pytest.approx(1.0)
-    nothing = scan_of(side(), "00000000", 1)
-    assert math.isnan(nothing.ranges[0])
-    assert nothing.range_max == 0.0
-    absurd = scan_of(side(length_unit_m=1e6), "ffff7f7f 0000803f", 2)
-    assert absurd.ranges.tolist()[1] == 1e6
-    assert math.isnan(absurd.ranges[0])
+@pytest.mark.parametrize(
+    ("ranges", "unit_m", "expected", "range_max"),
+    [
+        # 0, -1, NaN, a signalling NaN, infinity, 100 cm
+        ("00000000 000080bf 0000c07f 0100807f 0000807f 0000c842", 0.01, [math.nan] * 5 + [1.0], 1.0),
+        ("00000000", 0.01, [math.nan], 0.0),
+        ("ffff7f7f 0000803f", 1e6, [math.nan, 1e6], 1e6),
+    ],
+)
+def test_a_range_of_nothing_is_none(ranges, unit_m, expected, range_max) -> None:
+    scan = scan_of(ranges, len(expected), length_unit_m=unit_m)
+    assert scan.ranges.tolist() == pytest.approx(expected, nan_ok=True)
+    assert scan.range_max == pytest.approx(range_max)
 
 
 MALFORMED = {
     "a mode of nobody": "06000000 02 0a 04000000",
     "mode 0": "06000000 02 0a 00000000",
-    "a mode cut short": "05000000 02 0a 020000",
-    "a move with a float too few": "0a000000 02 0b 00000000 00000000",
-    "a move with a byte too many": "0f000000 02 0b 00000000 00000000 00000000 00",
-    "a rotation without speed": "02000000 02 0c",
     "a stop with a body": "03000000 02 0d 00",
     "lidar mode 3": "06000000 02 32 03000000",
-    "a text that is shorter than it says": "08000000 02 01 05000000 6869",
-    "a text of negative length": "06000000 02 01 ffffffff",
     "simulated lidar data without a range": "06000000 02 3d 00000000",
-    "simulated lidar data that is shorter than it says": "0a000000 02 3d 68010000 0000c842",
-    "a question with a body": "03000000 02 34 00",
     "a second answer to the settings": "18000000 02 03 0b000000" + LISTED.hex() + "00000000000100",
-    "a status nobody waits for": "03000000 02 07 01",
     "the datagram of the probe by TCP": "02000000 02 05",
     "a packet that robots send": "0e000000 01 37 0000c03f 000010c0 0000b442",
 }
 
 
-@pytest.mark.parametrize("name", MALFORMED)
-def test_a_malformed_packet_is_no_command_and_the_next_one_is(name: str) -> None:
-    listener = side()
-    client = joined(listener)
-    assert isinstance(client.session, HqClient)
-    stop = bytes.fromhex("02000000 02 0d")
-    got: list[tuple[Topic, FleetMessage]] = []
+@pytest.mark.parametrize("packet", MALFORMED.values(), ids=MALFORMED)
+def test_a_malformed_packet_is_no_command_and_the_next_one_is(packet: str) -> None:
+    client = joined()
     refused = 0
-    for message in client.stream(bytes.fromhex(MALFORMED[name]) + stop, client.now):
-        try:
-            got += listener.take(client.session, message)
-        except ProtocolError:
-            refused += 1
-    assert got == [(topics.CMD_DRIVE, Drive())]
+    try:
+        assert client.said(packet) == []
+    except ProtocolError:
+        refused += 1
     assert refused + client.session.traffic.malformed == 1
+    assert client.said("02000000 02 0d") == [(topics.CMD_DRIVE, Drive())]
     assert client.session.state is State.ESTABLISHED
     assert client.sent == []
 
 
-@pytest.mark.parametrize("length", ["00000000", "01000000", "ffffffff", "ffffff7f"])
-def test_a_length_that_cannot_be_ends_the_session(length: str) -> None:
-    client = joined(side())
-    client.stream(bytes.fromhex(length + "020d"), client.now)
-    assert client.session.state is State.CLOSED
-    assert "broken stream" in str(client.session.reason)
-
-
 @given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.booleans())
 def test_whatever_a_client_sends_gives_commands_the_bus_takes_or_counts_as_malformed(sent, by_datagram) -> None:
-    listener = side()
-    client = joined(listener, udp=by_datagram)
+    client = joined(udp=by_datagram)
     for packet_id, body in sent:
         try:
-            commands = said(listener, client, framed(2, packet_id, body), datagram=by_datagram)
+            commands = client.said(framed(2, packet_id, body), datagram=by_datagram)
         except ProtocolError:
             continue
         for topic, command in commands:
@@ -1004,10 +823,13 @@ def test_whatever_a_client_sends_gives_commands_the_bus_takes_or_counts_as_malfo
 # Each message is encoded once
 
 
-class Counts:
-    """How often the code under test encodes a packet, and makes a map of another size."""
+class Crowd:
+    """Five clients of each version by each channel, and how often the code under test encodes for them."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, view: RobotView | None = None, **options: Any) -> None:
+        self.listener = side(view, **options)
+        kinds = [(version, udp) for version in VERSIONS for udp in (False, True)] * 5
+        self.clients = [joined(version, listener=self.listener, udp=udp) for version, udp in kinds]
         self.packets: list[str] = []
         self.maps = 0
 
@@ -1028,185 +850,148 @@ class Counts:
         monkeypatch.setattr(display, "resampled", count_resampled)
         monkeypatch.setattr(display, "squared", count_squared)
 
-
-def crowd(listener: TcpUdpHq, of_each: int = 5) -> list[Timed]:
-    kinds: Iterable[tuple[str, bool]] = [(version, udp) for version in LISTS for udp in (False, True)]
-    return [joined(listener, version, udp=udp) for version, udp in kinds for _ in range(of_each)]
+    def shown(self, topic: Topic, message: FleetMessage) -> int:
+        """Show news of the robot to all; give how many frames they got."""
+        send = self.listener.show(topic, message)
+        assert send is not None
+        for client in self.clients:
+            send(client.session, client.now)
+        return sum(len(client.left()) for client in self.clients)
 
 
 @pytest.mark.parametrize(
-    ("topic", "message"),
+    ("topic", "message", "encoded", "sent"),
     [
-        (topics.POSE, POSE),
-        (topics.LIDAR, Switch(True)),
-        (topics.CAMERA, Switch(True)),
-        (topics.TEXT, Text("bye")),
-        (topics.RAW("tcpudp"), Raw(40, b"chat")),
-        (topics.RAW("tcpudp"), Raw(70, b"led")),
+        (topics.POSE, POSE, 1, 30),
+        (topics.LIDAR, Switch(True), 1, 30),
+        (topics.CAMERA, Switch(True), 1, 30),
+        (topics.TEXT, Text("bye"), 1, 30),
+        (topics.RAW("tcpudp"), Raw(40, b"chat"), 1, 30),
+        (topics.RAW("tcpudp"), Raw(70, b"led"), 1, 30),
+        (topics.TEXT, REQUEST, 0, 20),  # it is always the same
+        # squares for what was told no size, by TCP and by UDP (the one by TCP also for 1.3), and the size announced
+        (topics.MAP, wall(100), 3, 30),
     ],
 )
-def test_a_message_is_encoded_once_for_clients_of_all_versions(topic, message, monkeypatch: pytest.MonkeyPatch) -> None:
-    listener = side(known=(31, 40, 70))
-    clients = crowd(listener)
-    counts = Counts(monkeypatch)
-    show(listener, topic, message, *clients)
-    assert len(counts.packets) == 1
-    assert [len(client.sent) for client in clients] == [1] * 30
-
-
-def test_a_request_is_not_encoded_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    listener = side()
-    clients = crowd(listener)
-    counts = Counts(monkeypatch)
-    show(listener, topics.TEXT, Text("simulated lidar data", "request"), *clients)
-    assert counts.packets == []
-    assert sum(len(client.sent) for client in clients) == 20
-
-
-def test_a_map_is_made_once_for_each_size_that_it_is_shown_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(100))
-    listener = side(view)
-    clients = crowd(listener)
-    counts = Counts(monkeypatch)
-    show(listener, topics.MAP, wall(100), *clients)
-    # squares for what was told no size, by TCP and by UDP (the one by TCP also for 1.3), and the size announced to 1.3
-    assert counts.maps == len(counts.packets) == 3
-    assert [len(client.sent) for client in clients] == [1] * 30
+def test_a_message_is_encoded_once_for_clients_of_all_versions(topic, message, encoded, sent, monkeypatch) -> None:
+    crowd = Crowd(monkeypatch, knowing(wall(100)), known=(31, 40, 70))
+    assert crowd.shown(topic, message) == sent
+    assert len(crowd.packets) == encoded
+    assert crowd.maps == (encoded if topic is topics.MAP else 0)
 
 
 def test_a_map_is_not_made_where_there_is_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    counts = Counts(monkeypatch)
-    assert side().show(topics.MAP, wall(244)) is not None
-    assert counts.maps == 0
+    crowd = Crowd(monkeypatch)
+    assert crowd.listener.show(topics.MAP, wall(244)) is not None
+    assert crowd.maps == 0
 
 
 def test_clients_that_come_or_ask_later_are_shown_what_was_encoded_already(monkeypatch: pytest.MonkeyPatch) -> None:
-    view = RobotView()
-    view.note(topics.MAP, wall(100))
-    view.note(topics.POSE, POSE)
-    listener = side(view)
-    clients = crowd(listener)
-    counts = Counts(monkeypatch)
-    for client in clients:
-        begin(listener, client)
-    assert counts.maps == 3
-    assert sorted(counts.packets) == ["ServerPosition", *["ServerSLAMMap"] * 3]
-    fresh, pose = wall(100), Pose(1.0, 2.0, 0.0)
-    for client in clients:
-        answer(listener, client, topics.RPC_MAP, fresh)
-        answer(listener, client, topics.RPC_POSE, pose)
-    assert counts.maps == 6
-    assert len(counts.packets) == 8
-    assert [len(client.sent) for client in clients] == [4] * 30
+    crowd = Crowd(monkeypatch, knowing(wall(100), POSE))
+    assert [len(client.begun()) for client in crowd.clients] == [2] * 30
+    assert crowd.maps == 3
+    assert sorted(crowd.packets) == ["ServerPosition", *["ServerSLAMMap"] * 3]
+    for topic, message in ((topics.RPC_MAP, wall(100)), (topics.RPC_POSE, Pose(1.0, 2.0, 0.0))):
+        assert [len(client.answered(topic, message)) for client in crowd.clients] == [1] * 30
+    assert (crowd.maps, len(crowd.packets)) == (6, 8)
 
 
 # The captured HQ programs
 
+Commands = list[tuple[float, Topic, FleetMessage]]
 
-def replay(listener: TcpUdpHq, client: Timed, name: str, late: float = 0.0) -> list[tuple[float, Topic, FleetMessage]]:
+
+def replay(client: Client, name: str, late: float = 0.0) -> Commands:
     """Feed what the HQ of a capture sent, ``late`` seconds after it did; the handshake of one that is done is left out.
 
     Return what it commanded, and when.
     """
-    assert isinstance(client.session, HqClient)
     client.session.name = "hq.2"
-    commands: list[tuple[float, Topic, FleetMessage]] = []
+    commands: Commands = []
     done = client.session.state is State.ESTABLISHED
     for record in payloads(name, destination=11001):
-        at = record.seconds + late
-        if done and record.payload[5] < 10 and record.payload[5] != 1:
+        at, packet_id = record.seconds + late, record.payload[5]
+        if done and packet_id < 10 and packet_id != 1:
             continue
-        if record.transport == "UDP" and record.payload[5] == 5:
-            assert record.payload[5] != 5 or client.session.claims(record.payload, record.source)
+        if record.transport == "UDP" and packet_id == 5:
+            assert client.session.claims(record.payload, record.source)
         receive = client.datagram if record.transport == "UDP" else client.stream
         for message in receive(record.payload, at):
-            commands += [(at, topic, command) for topic, command in listener.take(client.session, message)]
+            commands += [(at, topic, command) for topic, command in client.listener.take(client.session, message)]
     assert client.session.traffic.malformed == 0
     return commands
 
 
-DOCUMENTED = [topics.CMD_TEXT, topics.CMD_MODE, *[topics.CMD_DRIVE] * 3, topics.RPC_POSE, topics.RPC_MAP]
-"""The captures: a text, control mode 2, move, rotate, stop, position, map; 1.3 also simulated lidar data."""
-
-
-def check_documented(commands: list[tuple[float, Topic, FleetMessage]]) -> None:
+def check_documented(commands: Commands, *more: Topic) -> None:
+    """A text, control mode 2, move, rotate, stop, position, map, and ``more``."""
+    motion = [topics.CMD_DRIVE] * 3
+    expected = [topics.CMD_TEXT, topics.CMD_MODE, *motion, topics.RPC_POSE, topics.RPC_MAP, *more]
+    assert [topic for _, topic, _ in commands] == expected
     text, mode, move, rotate, stop, *_ = (command for _, _, command in commands)
-    assert text == Text("hi there", sender="hq.2")
-    assert mode == Mode("manual")
+    assert (text, mode) == (Text("hi there", sender="hq.2"), Mode("manual"))
     assert isinstance(move, Drive)
     # x 0.6, y 0.8 at 1.5: half more than full scale
     assert (move.forward, move.left, move.turn) == pytest.approx((0.8, -0.6, 0.0))
     assert math.hypot(move.forward, move.left) <= 1.0
-    assert rotate == Drive(turn=0.75)
-    assert stop == Drive()
+    assert (rotate, stop) == (Drive(turn=0.75), Drive())
 
 
-def captured(name: str) -> tuple[TcpUdpHq, Timed]:
-    """The listener that each captured HQ meets, and its session."""
+def captured(name: str) -> Client:
+    """A captured HQ that has just connected to the listener it meets."""
     if name == OLD:
-        listener = side(robot("1.1", "joystick"), versions=("1.1",), udp=False)
-    else:
-        listener = side(robot("1.3", "udp", "lidar_sim", "slam_map"), slam_map_size=2048, slam_map_interval=16)
-    return listener, connected(listener)
+        return Client(side(robot("1.1", "joystick"), versions=("1.1",), udp=False))
+    return Client(side(robot("1.3", "udp", "lidar_sim", "slam_map"), slam_map_size=2048, slam_map_interval=16))
 
 
-def test_the_captured_hq_of_1_1_commands_what_is_documented() -> None:
-    listener, client = captured(OLD)
-    commands = replay(listener, client, OLD)
-    assert client.frames("tcp") == [bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000010000")]
-    assert client.session.version == "1.1"
-    assert [topic for _, topic, _ in commands] == DOCUMENTED
-    check_documented(commands)
+@pytest.mark.parametrize("anew", [False, True], ids=["its own listener", "a listener of all versions"])
+def test_the_captured_hq_of_1_1_commands_what_is_documented(anew: bool) -> None:
+    client = Client(side()) if anew else captured(OLD)
+    check_documented(replay(client, OLD))
+    greeted, *more = client.frames("tcp")
+    assert anew or greeted == bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000010000")
+    assert more == [START] * anew, "it announces datagrams and sends none: nothing it says is lost"
+    assert client.frames("udp") == []
+    client.until(10.0)
+    assert (client.session.state, client.session.version) == (State.ESTABLISHED, "1.1")
 
 
 def test_the_captured_hq_of_1_3_commands_what_is_documented() -> None:
-    listener, client = captured(NEW)
-    commands = replay(listener, client, NEW)
+    client = captured(NEW)
+    commands = replay(client, NEW)
+    check_documented(commands, topics.CMD_SCAN)
     greeted = "21000000 01 02 02 0b000000" + LISTED.hex() + "01000000000101 00080000 10000000"
     assert client.frames("tcp") == [bytes.fromhex(greeted), START]
     assert client.frames("udp") == [ANSWER_TRUE]
     assert (client.session.version, client.session.transport) == ("1.3", "udp")
-    assert [topic for _, topic, _ in commands] == [*DOCUMENTED, topics.CMD_SCAN]
-    check_documented(commands)
     scan = commands[-1][2]
     assert isinstance(scan, Scan)
     assert scan.ranges.tolist() == pytest.approx([1.0 + degree * 0.005 for degree in range(360)])
     assert scan.range_max == pytest.approx(2.795)
 
 
-def test_the_captured_hq_of_1_1_is_served_by_a_listener_of_all_versions_too() -> None:
-    listener = side()
-    client = connected(listener)
-    commands = replay(listener, client, OLD)
-    # It announces datagrams and sends none: nothing it says is lost.
-    assert client.frames("tcp", 0.01)[0] == START
-    assert 6 not in [sent.frame[5] for sent in client.sent]
-    assert [topic for _, topic, _ in commands] == DOCUMENTED
-    check_documented(commands)
-    client.until(10.0)
-    assert (client.session.state, client.session.version) == (State.ESTABLISHED, "1.1")
+each_capture = pytest.mark.parametrize("name", [OLD, NEW])
 
 
-@pytest.mark.parametrize("name", [OLD, NEW])
+@each_capture
 def test_the_shown_robot_is_what_the_captured_one_showed(name: str) -> None:
-    listener, client = captured(name)
-    replay(listener, client, name)
+    client = captured(name)
+    replay(client, name)
     client.sent.clear()
-    show(listener, topics.POSE, POSE, client)
-    show(listener, topics.TEXT, Text("bye"), client)
-    show(listener, topics.TEXT, Text("simulated lidar data", "request"), client)
-    empty = Map(0, 0, 0.01, (0.0, 0.0), np.zeros((0, 0), np.uint8))
-    show(listener, topics.MAP, empty, client)
+    for topic, message in (
+        (topics.POSE, POSE),
+        (topics.TEXT, Text("bye")),
+        (topics.TEXT, REQUEST),
+        (topics.MAP, NO_MAP),
+    ):
+        client.shown(topic, message)
     from_robot = [record for record in payloads(name, source=11001) if record.payload[5] not in (2, 4, 6)]
     recorded = {(record.transport.lower(), record.payload) for record in from_robot if len(record.payload) < 400}
     if name == OLD:  # whose robot leaves out the int that HQ programs need
         recorded = recorded - {("tcp", bytes.fromhex("02000000 01 35"))} | {("tcp", EMPTY_MAP)}
-    shown = {(sent.by, sent.frame) for sent in client.sent}
-    assert recorded <= shown
+    assert recorded <= {(sent.by, sent.frame) for sent in client.sent}
 
 
-def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]]) -> list[Action | str]:
+def carry_out(intent: Intent, commands: Commands) -> list[Action | str]:
     """What the intent makes of motion and modes; a refusal by its reason."""
     done: list[Action | str] = []
     for at, _, command in commands:
@@ -1221,39 +1006,19 @@ def carry_out(intent: Intent, commands: list[tuple[float, Topic, FleetMessage]])
     return done
 
 
-def intent_of(listener: TcpUdpHq) -> Intent:
-    """The intent of a client that has just connected."""
-    intent = Intent(listener.deadman_s)
-    for topic, command in listener.initial_commands():
-        assert (topic, command) == (topics.CMD_MODE, Mode("none"))
-        assert intent.choose("none", 0.0) is Action.NOTHING
-    return intent
-
-
-@pytest.mark.parametrize("name", [OLD, NEW])
+@each_capture
 def test_a_captured_hq_drives_only_after_it_has_said_neutral_once(name: str) -> None:
-    listener, client = captured(name)
-    assert listener.deadman_s == 1.3
-    intent = intent_of(listener)
+    client = captured(name)
+    assert client.listener.deadman_s == 1.3
+    assert client.listener.initial_commands() == ((topics.CMD_MODE, Mode("none")),)
+    intent = Intent(client.listener.deadman_s)
+    assert intent.choose("none", 0.0) is Action.NOTHING
     owed = "connected: release the stick first"
-    assert carry_out(intent, replay(listener, client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
-    again = replay(listener, client, name, late=10.0)
+    assert carry_out(intent, replay(client, name)) == [Action.NOTHING, owed, owed, Action.NOTHING]
+    again = replay(client, name, late=10.0)
     assert carry_out(intent, again) == [Action.NOTHING, Action.ACQUIRE, Action.WAIT, Action.WAIT]
     intent.granted(3.0)
-    third = replay(listener, client, name, late=20.0)
-    assert carry_out(intent, third) == [Action.SEND] * 4
-
-
-@pytest.mark.parametrize("name", [OLD, NEW])
-def test_a_captured_hq_does_not_drive_without_its_control_mode(name: str) -> None:
-    listener, client = captured(name)
-    intent = intent_of(listener)
-    intent.neutral(0.0)
-    commands = [entry for entry in replay(listener, client, name) if not isinstance(entry[2], Mode)]
-    moved, rotated, stopped = carry_out(intent, commands)
-    assert moved == "control mode is none"
-    assert str(rotated).startswith("control mode is none")
-    assert stopped is Action.NOTHING
+    assert carry_out(intent, replay(client, name, late=20.0)) == [Action.SEND] * 4
 
 
 def test_ids_are_those_of_clients() -> None:
@@ -1263,4 +1028,4 @@ def test_ids_are_those_of_clients() -> None:
     numbers.release(9, 100.0)
     assert [numbers.take(now) for now in (106.9, 107.0)] == [None, 9]
     assert HqOptions().quiet_s == 2.0
-    assert connected(listener, 255).frames("tcp")[0][6] == 255
+    assert Client(listener, 255).frames("tcp")[0][6] == 255

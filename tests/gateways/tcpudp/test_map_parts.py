@@ -15,6 +15,7 @@ from tests.robot.test_device import serving
 from zbridge.errors import ProtocolError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Map
+from zbridge.fleet.topics import Topic
 from zbridge.protocol.session import State
 
 pytestmark = pytest.mark.jumping
@@ -89,18 +90,38 @@ class Drawn:
 
     def __init__(self, settings: bytes = SETTINGS) -> None:
         self.robot = TcpUdpRobot(Options())
+        self.connect(settings)
+
+    def connect(self, settings: bytes = SETTINGS) -> None:
         self.session = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(0.0)
         self.session.receive(settings, 0.1)
+        self.session.outgoing(0.1)
 
-    def take(self, frame: bytes) -> Map | None:
-        (message,) = self.session.receive(frame, 1.0)
-        for topic, shown in self.robot.telemetry(message, 7):
-            assert topic is topics.MAP
-            assert isinstance(shown, Map)
-            assert shown.stamp_ns == 7
-            return shown
-        return None
+    def take(self, *frames: bytes) -> Map | None:
+        """Take parts; give the map that the last of them makes."""
+        drawn = None
+        for frame in frames:
+            (message,) = self.session.receive(frame, 1.0)
+            drawn = None
+            for topic, shown in self.robot.telemetry(message, 7):
+                assert topic is topics.MAP
+                assert isinstance(shown, Map)
+                assert shown.stamp_ns == 7
+                drawn = shown
+        return drawn
+
+    def known(self) -> Map | None:
+        shown = self.robot.known(topics.MAP)
+        assert shown is None or isinstance(shown, Map)
+        return shown
+
+    def asked(self, *questions: Topic) -> list[bytes | None]:
+        """What leaves because of questions, and the nothing behind it."""
+        for topic in questions:
+            self.robot.ask(topic)
+        frames = [self.session.outgoing(now) for now in (2.0, 3.0, 4.0)]
+        return frames[: frames.index(None) + 1]
 
 
 def rows(shown: Map | None) -> list[list[int]]:
@@ -110,151 +131,96 @@ def rows(shown: Map | None) -> list[list[int]]:
 
 
 WHOLE = [[0, 0, 0], [0, 2, 0], [1, 2, 1]]
+FIRST_ONLY = [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
 
 
-def test_the_last_part_makes_a_map_index_x_times_side_plus_y() -> None:
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        pytest.param([FIRST, SECOND, LAST], WHOLE, id="index x times side plus y"),
+        pytest.param([SECOND, FIRST, LAST], WHOLE, id="in any order"),
+        pytest.param([FIRST, LAST], [[0, 0, 0], [0, 0, 0], [1, 0, 1]], id="one did not come"),
+        pytest.param([FIRST, part(3, ()), LAST], [[0, 0, 0], [0, 0, 0], [1, 0, 1]], id="one is empty"),
+        pytest.param([part(7, (1, 2, 1, 1, 1, 1))], [[0, 0, 0], [0, 0, 1], [0, 0, 2]], id="it runs past the end"),
+        pytest.param([part(0, [0, 0, 1, 0, 2, 2, 0, 0, 1] + [2] * 100)], WHOLE, id="the whole map and more"),
+        *(
+            pytest.param([FIRST, part(start, (2, 2))], FIRST_ONLY, id=f"behind the map: {start}")
+            for start in (9, 10, 1000, 2**31 - 3)
+        ),
+        pytest.param([part(0, (3, 255, 1, 0, 4, 0, 0, 0, 128))], FIRST_ONLY, id="cells that are none"),
+    ],
+)
+def test_the_last_part_makes_a_map_of_what_came(parts: list[bytes], expected: list[list[int]]) -> None:
     drawn = Drawn()
-    assert drawn.take(FIRST) is None
-    assert drawn.take(SECOND) is None
-    shown = drawn.take(LAST)
-    assert rows(shown) == WHOLE
+    for frame in parts[:-1]:
+        assert drawn.take(frame) is None
+    shown = drawn.take(parts[-1])
+    assert rows(shown) == expected
     assert shown is not None
     assert shown.cell == pytest.approx(0.1)
-
-
-def test_a_part_that_did_not_come_is_unknown() -> None:
-    drawn = Drawn()
-    drawn.take(FIRST)
-    assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [1, 0, 1]]
-
-
-def test_parts_before_the_last_may_come_in_any_order() -> None:
-    drawn = Drawn()
-    drawn.take(SECOND)
-    drawn.take(FIRST)
-    assert rows(drawn.take(LAST)) == WHOLE
-
-
-def test_a_part_that_runs_past_the_end_is_cut() -> None:
-    drawn = Drawn()
-    assert rows(drawn.take(part(7, (1, 2, 1, 1, 1, 1)))) == [[0, 0, 0], [0, 0, 1], [0, 0, 2]]
-
-
-def test_one_part_may_be_the_whole_map_and_more() -> None:
-    assert rows(Drawn().take(part(0, [0, 0, 1, 0, 2, 2, 0, 0, 1] + [2] * 100))) == WHOLE
-
-
-@pytest.mark.parametrize("start", [9, 10, 1000, 2**31 - 3])
-def test_a_part_that_begins_behind_the_map_changes_nothing_in_it(start: int) -> None:
-    drawn = Drawn()
-    drawn.take(FIRST)
-    assert rows(drawn.take(part(start, (2, 2)))) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
-
-
-def test_an_empty_part_changes_nothing() -> None:
-    drawn = Drawn()
-    drawn.take(FIRST)
-    assert drawn.take(part(3, ())) is None
-    assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [1, 0, 1]]
-
-
-def test_cells_that_are_none_are_unknown() -> None:
-    assert rows(Drawn().take(part(0, (3, 255, 1, 0, 4, 0, 0, 0, 128)))) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
 
 
 def test_parts_of_a_robot_that_announces_no_size_have_no_place() -> None:
     drawn = Drawn(UNSIZED)
     with pytest.raises(ProtocolError, match="announces no map size"):
         drawn.take(FIRST)
-    assert drawn.robot.known(topics.MAP) is None
+    assert drawn.known() is None
 
 
 def test_a_shown_map_does_not_change_with_later_parts() -> None:
     drawn = Drawn()
-    drawn.take(FIRST)
-    drawn.take(SECOND)
-    shown = drawn.take(LAST)
-    drawn.take(part(0, (2, 2, 2)))
+    shown = drawn.take(FIRST, SECOND, LAST)
+    later = drawn.take(part(0, (2, 2, 2)), LAST)
     assert rows(shown) == WHOLE
-    assert rows(drawn.take(LAST)) == [[2, 0, 0], [2, 2, 0], [2, 2, 1]]
+    assert rows(later) == [[2, 0, 0], [2, 2, 0], [2, 2, 1]]
 
 
 def test_a_new_connection_begins_with_an_empty_map() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    drawn.session = drawn.robot.session("robot", "tcp://robot.test:1")
-    drawn.session.open(0.0)
-    drawn.session.receive(SETTINGS, 0.1)
+    drawn.connect()
     assert rows(drawn.take(LAST)) == [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
 
 
 # Queries: a robot that sends parts is never asked
 
-GET_MAP = bytes.fromhex("02000000 05 34")
+GET_MAP, GET_POSE = bytes.fromhex("02000000 05 34"), bytes.fromhex("02000000 05 36")
 
 
-def known(drawn: Drawn) -> Map | None:
-    shown = drawn.robot.known(topics.MAP)
-    assert shown is None or isinstance(shown, Map)
-    return shown
-
-
-def test_nothing_is_known_before_the_first_part_and_the_robot_is_asked() -> None:
+def test_nothing_is_known_before_the_first_part_and_the_robot_is_asked_and_the_part_answers() -> None:
     drawn = Drawn()
-    assert known(drawn) is None
-    drawn.session.outgoing(1.0)
-    drawn.robot.ask(topics.MAP)
-    assert drawn.session.outgoing(2.0) == GET_MAP
+    assert drawn.known() is None
+    assert drawn.asked(topics.MAP) == [GET_MAP, None]
+    assert rows(drawn.take(FIRST)) == FIRST_ONLY
+    assert drawn.take(SECOND) is None
 
 
 def test_a_map_is_known_as_far_as_its_parts_have_come() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    assert rows(known(drawn)) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
-    drawn.take(SECOND)
-    drawn.take(LAST)
-    assert rows(known(drawn)) == WHOLE
+    assert rows(drawn.known()) == FIRST_ONLY
+    drawn.take(SECOND, LAST)
+    assert rows(drawn.known()) == WHOLE
     drawn.take(part(0, (2, 2, 2)))
-    assert rows(known(drawn)) == [[2, 0, 0], [2, 2, 0], [2, 2, 1]], "what was seen later replaces what was before"
+    assert rows(drawn.known()) == [[2, 0, 0], [2, 2, 0], [2, 2, 1]], "what was seen later replaces what was before"
     assert drawn.robot.known(topics.POSE) is None
-
-
-def test_the_part_after_a_question_answers_it() -> None:
-    drawn = Drawn()
-    drawn.robot.ask(topics.MAP)
-    assert rows(drawn.take(FIRST)) == [[0, 0, 0], [0, 0, 0], [1, 0, 0]]
-    assert drawn.take(SECOND) is None
 
 
 def test_a_robot_that_sends_parts_is_never_asked_for_its_map_on_no_later_connection_either() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    asked_for_all(drawn)
-    drawn.session = drawn.robot.session("robot", "tcp://robot.test:1")
-    drawn.session.open(0.0)
-    drawn.session.receive(SETTINGS, 0.1)
-    assert known(drawn) is None, "the map of a new connection is another one"
-    asked_for_all(drawn)
+    assert drawn.asked(topics.MAP, topics.POSE) == [GET_POSE, None]
+    drawn.connect()
+    assert drawn.known() is None, "the map of a new connection is another one"
+    assert drawn.asked(topics.MAP, topics.POSE) == [GET_POSE, None]
     assert rows(drawn.take(SECOND)) == [[0, 0, 0], [0, 2, 0], [0, 2, 0]]
-
-
-def asked_for_all(drawn: Drawn) -> None:
-    """Ask for map and pose: one packet less than there are questions leaves."""
-    drawn.session.outgoing(0.2)
-    drawn.robot.ask(topics.MAP)
-    drawn.robot.ask(topics.POSE)
-    assert [drawn.session.outgoing(now) for now in (1.0, 2.0)] == [bytes.fromhex("02000000 05 36"), None]
 
 
 def test_a_robot_that_is_another_one_after_a_reconnection_is_asked() -> None:
     drawn = Drawn()
     drawn.take(FIRST)
-    session = drawn.robot.session("robot", "tcp://robot.test:1")
-    session.open(0.0)
-    session.receive(server_settings(b"1.1,1.2,1.3", "00010101010101" + SIZE_30_10), 0.1)
-    session.outgoing(0.1)
-    drawn.robot.ask(topics.MAP)
-    assert session.outgoing(1.0) == GET_MAP
+    drawn.connect(server_settings(b"1.1,1.2,1.3", "00010101010101" + SIZE_30_10))
+    assert drawn.asked(topics.MAP) == [GET_MAP, None]
 
 
 # The device: a robot that sends parts all the time is driven like any other

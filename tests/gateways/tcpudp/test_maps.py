@@ -44,37 +44,52 @@ def maps(draw: st.DrawFn, most: int = 60) -> Map:
 # Squares, for those who were told no size
 
 
-def test_a_square_map_stays_as_it_is_with_columns_for_rows() -> None:
-    assert columns(squared(drawn("012", "120", "201"), 100)) == ("012", "120", "201")
-    assert columns(squared(drawn("01", "22"), 100)) == ("02", "12")
-    assert squared(drawn("2"), 100) == b"\x02"
-
-
-def test_a_map_that_is_no_square_is_filled_with_unknown_cells() -> None:
-    assert columns(squared(drawn("120", "002"), 100)) == ("100", "200", "020")
-    assert columns(squared(drawn("1", "2", "1"), 100)) == ("121", "000", "000")
-
-
-def test_a_map_that_is_too_large_is_pooled_obstacles_first_then_free_cells() -> None:
-    grid = drawn("1100", "1200", "0000", "1001")
-    assert columns(squared(grid, 2)) == ("21", "01")
-    assert columns(squared(grid, 1)) == ("2",)
-    assert columns(squared(drawn("112", "111", "111"), 2)) == ("11", "21")
-
-
-def test_a_long_corridor_is_shown_whole() -> None:
-    assert columns(squared(drawn("1" * 99 + "2"), 10)) == ("1" + "0" * 9,) * 9 + ("2" + "0" * 9,)
+@pytest.mark.parametrize(
+    ("rows", "most", "expected"),
+    [
+        # a square map stays as it is, with columns for rows
+        (("012", "120", "201"), 100, ("012", "120", "201")),
+        (("01", "22"), 100, ("02", "12")),
+        (("2",), 100, ("2",)),
+        # one that is no square is filled with unknown cells
+        (("120", "002"), 100, ("100", "200", "020")),
+        (("1", "2", "1"), 100, ("121", "000", "000")),
+        # one that is too large is pooled, obstacles first, then free cells
+        (("1100", "1200", "0000", "1001"), 2, ("21", "01")),
+        (("1100", "1200", "0000", "1001"), 1, ("2",)),
+        (("112", "111", "111"), 2, ("11", "21")),
+        # a long corridor is shown whole
+        (("1" * 99 + "2",), 10, ("1" + "0" * 9,) * 9 + ("2" + "0" * 9,)),
+        # cells that are none of the three are unknown and hide no obstacle
+        (("39", "12"), 2, ("01", "02")),
+        (("39", "12"), 1, ("2",)),
+        (("9",), 1, ("0",)),
+    ],
+)
+def test_a_map_is_squared(rows: tuple[str, ...], most: int, expected: tuple[str, ...]) -> None:
+    grid = drawn(*rows)
+    grid.cells.flags.writeable = False
+    assert columns(squared(grid, most)) == expected
 
 
 # Cells of another size
 
 
-def test_cells_of_twice_the_size_hold_four() -> None:
-    assert columns(resampled(drawn("1000", "0000", "0012", "0010"), 2, 0.2)) == ("10", "02")
-
-
-def test_cells_of_half_the_size_repeat_one() -> None:
-    assert columns(resampled(drawn("12", "01", cell=0.2), 4, 0.1)) == ("1100", "1100", "2211", "2211")
+@pytest.mark.parametrize(
+    ("grid", "side", "cell_m", "expected"),
+    [
+        (drawn("1000", "0000", "0012", "0010"), 2, 0.2, ("10", "02")),  # twice the size holds four
+        (drawn("12", "01", cell=0.2), 4, 0.1, ("1100", "1100", "2211", "2211")),  # half the size repeats one
+        # what lies beyond the square is cut and what lies beyond the map is unknown
+        (drawn("12", "21"), 3, 0.1, ("120", "210", "000")),
+        (drawn("112", "112", "222"), 2, 0.1, ("11", "11")),
+        (Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), 2, 0.1, ("00", "00")),
+    ],
+)
+def test_a_map_is_shown_in_cells_of_another_size(
+    grid: Map, side: int, cell_m: float, expected: tuple[str, ...]
+) -> None:
+    assert columns(resampled(grid, side, cell_m)) == expected
 
 
 def test_cells_of_half_as_much_again_lose_no_obstacle() -> None:
@@ -84,32 +99,11 @@ def test_cells_of_half_as_much_again_lose_no_obstacle() -> None:
             assert resampled(grid, 4, 0.15).count(2) == 1
 
 
-def test_what_lies_beyond_the_square_is_cut_and_what_lies_beyond_the_map_is_unknown() -> None:
-    assert columns(resampled(drawn("12", "21"), 3, 0.1)) == ("120", "210", "000")
-    assert columns(resampled(drawn("112", "112", "222"), 2, 0.1)) == ("11", "11")
-
-
 def test_a_step_that_is_no_binary_fraction_moves_no_cell() -> None:
     grid = Map(300, 300, 0.1, (0.0, 0.0), np.arange(90_000, dtype=np.uint32).reshape(300, 300).astype(np.uint8) % 3)
     assert resampled(grid, 300, 10 * 0.01) == grid.cells.T.tobytes()
     finer = resampled(grid, 900, 0.1 / 3)
     assert np.array_equal(np.frombuffer(finer, np.uint8).reshape(900, 900)[::3, ::3], grid.cells.T)
-
-
-def test_an_empty_map_is_unknown_everywhere() -> None:
-    assert resampled(Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), 2, 0.1) == bytes(4)
-
-
-def test_cells_that_are_none_of_the_three_are_unknown_and_hide_no_obstacle() -> None:
-    assert columns(squared(drawn("39", "12"), 2)) == ("01", "02")
-    assert columns(squared(drawn("39", "12"), 1)) == ("2",)
-    grid = Map(1, 1, 0.1, (0.0, 0.0), np.array([[255]], np.uint8))
-    assert squared(grid, 1) == b"\x00"
-
-
-def test_a_map_that_is_read_only_is_taken() -> None:
-    cells = np.frombuffer(bytes((1, 2, 0, 7)), np.uint8).reshape(2, 2)
-    assert columns(squared(Map(2, 2, 0.1, (0.0, 0.0), cells), 2)) == ("10", "20")
 
 
 @pytest.mark.parametrize("cell", [0.0, -1.0, math.nan, math.inf, -math.inf, 5e-324, 1e300])

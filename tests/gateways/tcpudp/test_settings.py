@@ -15,22 +15,17 @@ from gateways.tcpudp.settings import (
 )
 from zbridge.errors import ProtocolError
 
-ALL = (*Feature,)
 
-
-@pytest.mark.parametrize("position", range(7))
-def test_each_flag_has_its_own_place(position: int) -> None:
+@pytest.mark.parametrize(
+    ("position", "name"), [*enumerate(["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"])]
+)
+def test_each_flag_has_its_own_place_in_the_order_of_the_document(position: int, name: str) -> None:
     flags = bytes(number == position for number in range(7))
     robot = read_settings("1.1,1.2,1.3", flags + bytes.fromhex("1400000005000000"), ROBOT_BLOCKS)
     hq = read_settings("1.1,1.2,1.3", flags, HQ_BLOCKS)
-    assert robot.features == hq.features == (ALL[position],)
+    assert robot.features == hq.features == (Feature(name),)
     assert isinstance(robot, RobotSettings13)
     assert (robot.slam_map_size, robot.slam_map_interval) == (20, 5)
-
-
-def test_flags_stand_in_the_order_of_the_document() -> None:
-    names = ["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"]
-    assert [feature.value for feature in ALL] == names
 
 
 @pytest.mark.parametrize(

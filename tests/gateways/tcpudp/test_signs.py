@@ -50,33 +50,35 @@ class Link:
         timed.stream(settings(client_id, versions=versions), 0.1)
         return timed
 
+    def talk(self, *, asked: bool = False) -> None:
+        """Make a first connection on which telemetry comes, unasked or not, and lose it."""
+        timed = self.connect(2)
+        for second in range(1, 10):
+            if asked:
+                self.robot.ask(topics.POSE)
+            timed.stream(POSITION, float(second))
+        timed.session.lost("closed by peer")
 
-def probed(client_id: int, answer: bytes | None) -> Timed:
-    """A connection with UDP, established at second 2.6; ``answer`` came by UDP, or never."""
-    timed = Timed(HqRole(limits(0.01)))
-    timed.stream(settings(client_id, udp=True) + START, 0.1)
-    if answer is not None:
-        timed.datagram(answer, 0.2)
-    return timed
+
+def doubts(timed: Timed, until: float) -> tuple[str, ...]:
+    """The doubts at a time; only a client id above 2 together with another sign is a reason not to drive."""
+    timed.until(until)
+    named = timed.session.doubts
+    reason = f"connection in doubt: {'; '.join(named)}" if len(named) > 1 and LATER in named else None
+    assert timed.session.doubtful == reason
+    return named
 
 
 # A client id above 2 is only a hint
 
 
-@pytest.mark.parametrize("client_id", [0, 1, 2])
-def test_the_first_client_after_a_start_has_no_doubts(client_id: int) -> None:
-    timed = Link().connect(client_id)
-    timed.until(100.0)
-    assert timed.session.doubts == ()
-
-
-@pytest.mark.parametrize("client_id", [3, 4, 255])
+@pytest.mark.parametrize("client_id", [0, 1, 2, 3, 4, 255])
 @pytest.mark.parametrize("versions", [b"1.1", b"1.2", LISTED])
 def test_a_client_id_above_2_is_named_and_alone_no_reason_not_to_drive(client_id: int, versions: bytes) -> None:
+    """A robot without datagrams may be silent until it is asked."""
     timed = Link().connect(client_id, versions=versions)
     timed.until(100.0)
-    (doubt,) = timed.session.doubts
-    assert doubt == LATER.replace("3", str(client_id))
+    assert timed.session.doubts == ((LATER.replace("3", str(client_id)),) if client_id > 2 else ())
     assert timed.session.doubtful is None
 
 
@@ -86,125 +88,78 @@ def test_a_client_id_above_2_is_named_and_alone_no_reason_not_to_drive(client_id
 def test_a_few_malformed_packets_are_no_sign() -> None:
     timed = Link().connect(3)
     timed.stream(MALFORMED * 2, 1.0)
-    timed.until(10.0)
-    assert timed.session.doubts == (LATER,)
+    assert doubts(timed, 10.0) == (LATER,)
     timed.stream(POSITION * 1000, 11.0)
     timed.stream(MALFORMED * 20, 12.0)
-    assert timed.session.doubts == (LATER,)
+    assert doubts(timed, 12.0) == (LATER,)
 
 
 def test_three_malformed_packets_and_more_than_a_twentieth_are_one() -> None:
     timed = Link().connect(3)
     timed.stream(POSITION * 5 + MALFORMED * 3, 1.0)
-    assert timed.session.doubts == (LATER, GARBLED)
-    assert timed.session.doubtful == f"connection in doubt: {LATER}; {GARBLED}"
+    assert doubts(timed, 1.0) == (LATER, GARBLED)
     timed.stream(POSITION * 100, 2.0)
-    timed.until(8.0)
-    assert timed.session.doubts == (LATER,), "most of what came could be read after all"
-    assert timed.session.doubtful is None
+    assert doubts(timed, 8.0) == (LATER,), "most of what came could be read after all"
 
 
 def test_malformed_datagrams_count_too() -> None:
     timed = Link().connect(3)
     for _ in range(3):
         timed.datagram(POSITION[:-1], 1.0)
-    assert GARBLED in timed.session.doubts
+    assert doubts(timed, 1.0) == (LATER, GARBLED)
 
 
 def test_malformed_packets_on_the_first_connection_are_named_and_alone_no_reason() -> None:
     timed = Link().connect(2)
     timed.stream(MALFORMED * 10, 1.0)
-    assert timed.session.doubts == (GARBLED,)
-    assert timed.session.doubtful is None
+    assert doubts(timed, 1.0) == (GARBLED,)
 
 
 # No telemetry, and no answer to the probe
 
 
-def test_neither_telemetry_nor_an_answer_to_the_probe_within_five_seconds_is_a_sign() -> None:
-    timed = probed(3, None)
-    timed.until(7.59)
-    assert timed.session.doubts == (LATER,)
-    timed.until(7.61)
-    assert timed.session.doubts == (LATER, UNANSWERED)
-    assert timed.session.doubtful is not None
-    timed.stream(POSITION, 9.0)
-    timed.until(10.1)
-    assert timed.session.doubts == (LATER,), "a robot that was asked has answered"
-
-
-def test_texts_are_no_telemetry_every_client_gets_them() -> None:
-    timed = probed(3, None)
-    for second in range(3, 8):
-        timed.stream(TEXT, float(second))
-    timed.until(8.0)
-    assert timed.session.doubts == (LATER, UNANSWERED)
-
-
-def test_a_probe_that_did_not_arrive_was_not_answered() -> None:
-    timed = probed(3, None)
-    timed.stream(ANSWER_FALSE, 1.0)
-    timed.until(8.0)
-    assert timed.session.doubts == (LATER, UNANSWERED)
-
-
-def test_an_answer_that_came_late_was_one() -> None:
-    timed = probed(3, None)
-    timed.datagram(ANSWER_TRUE, 4.0)
-    timed.until(8.0)
-    assert timed.session.doubts == (LATER,)
-
-
-def test_a_robot_that_is_silent_until_it_is_asked_is_driven_if_it_answered_the_probe() -> None:
-    timed = probed(3, ANSWER_TRUE)
-    timed.until(100.0)
-    assert timed.session.doubts == (LATER,)
+@pytest.mark.parametrize(
+    ("client_id", "coming", "until", "expected"),
+    [
+        pytest.param(3, [], 7.59, (LATER,), id="not yet five seconds"),
+        pytest.param(3, [], 7.61, (LATER, UNANSWERED), id="neither within five seconds"),
+        pytest.param(3, [(9.0, "tcp", POSITION)], 10.1, (LATER,), id="it has answered a question"),
+        pytest.param(
+            3, [(float(at), "tcp", TEXT) for at in range(3, 8)], 8.0, (LATER, UNANSWERED), id="texts, that all get"
+        ),
+        pytest.param(3, [(1.0, "tcp", ANSWER_FALSE)], 8.0, (LATER, UNANSWERED), id="a probe that did not arrive"),
+        pytest.param(3, [(4.0, "udp", ANSWER_TRUE)], 8.0, (LATER,), id="an answer that came late"),
+        pytest.param(3, [(0.2, "udp", ANSWER_TRUE)], 100.0, (LATER,), id="silent until it is asked"),
+        pytest.param(2, [], 100.0, (UNANSWERED,), id="a first connection, which is driven"),
+    ],
+)
+def test_neither_telemetry_nor_an_answer_to_the_probe_within_five_seconds_is_a_sign(
+    client_id: int, coming: list[tuple[float, str, bytes]], until: float, expected: tuple[str, ...]
+) -> None:
+    timed = Timed(HqRole(limits(0.01)))
+    timed.stream(settings(client_id, udp=True) + START, 0.1)  # established at second 2.6
+    for at, by, data in coming:
+        (timed.stream if by == "tcp" else timed.datagram)(data, at)
+    assert doubts(timed, until) == expected
 
 
 def test_no_answer_to_a_probe_that_was_never_sent_is_no_sign() -> None:
     """The robot sends 4 although nobody offered it datagrams: it gets its 7, and no 5."""
     timed = Link().connect(3)
     timed.stream(START, 0.2)
-    timed.until(100.0)
+    assert doubts(timed, 100.0) == (LATER,)
     assert timed.frames("udp") == []
-    assert timed.session.doubts == (LATER,)
-
-
-def test_a_silent_first_connection_is_named_and_driven() -> None:
-    timed = probed(2, None)
-    timed.until(100.0)
-    assert timed.session.doubts == (UNANSWERED,)
-    assert timed.session.doubtful is None
-
-
-@pytest.mark.parametrize("versions", [b"1.1", b"1.2", LISTED])
-def test_a_robot_without_datagrams_that_is_silent_until_it_is_asked_is_driven(versions: bytes) -> None:
-    timed = Link().connect(3, versions=versions)
-    timed.until(100.0)
-    assert timed.session.doubts == (LATER,)
 
 
 # No telemetry, unlike before
 
 
-def talking(link: Link, *, asked: bool = False) -> None:
-    """A first connection on which telemetry comes, unasked or not."""
-    timed = link.connect(2)
-    for second in range(1, 10):
-        if asked:
-            link.robot.ask(topics.POSE)
-        timed.stream(POSITION, float(second))
-    timed.session.lost("closed by peer")
-
-
 def test_a_robot_that_sent_telemetry_before_and_sends_none_now_is_named() -> None:
     link = Link()
-    talking(link)
+    link.talk()
     timed = link.connect(3)
-    timed.until(5.09)
-    assert timed.session.doubts == (LATER,)
-    timed.until(5.11)
-    assert timed.session.doubts == (LATER, MUTE)
+    assert doubts(timed, 5.09) == (LATER,)
+    assert doubts(timed, 5.11) == (LATER, MUTE)
     timed.session.lost("closed by peer")
     assert timed.session.doubts == ()
     timed = link.connect(4)
@@ -217,32 +172,26 @@ def test_a_robot_that_sent_telemetry_before_and_sends_none_now_is_named() -> Non
 
 def test_answers_and_texts_are_no_telemetry_of_its_own() -> None:
     link = Link()
-    talking(link)
+    link.talk()
     timed = link.connect(3)
     timed.stream(TEXT * 5, 1.0)
     link.robot.ask(topics.POSE)
     timed.stream(POSITION, 2.0)
-    timed.until(6.0)
-    assert timed.session.doubts == (LATER, MUTE)
+    assert doubts(timed, 6.0) == (LATER, MUTE)
 
 
-def test_a_robot_that_only_ever_answered_is_not_expected_to_do_more() -> None:
+def test_a_robot_that_only_ever_answered_or_falls_silent_later_is_not_named() -> None:
     link = Link()
-    talking(link, asked=True)
-    timed = link.connect(3)
-    timed.until(100.0)
-    assert timed.session.doubts == (LATER,)
-
-
-def test_a_robot_that_falls_silent_later_is_not_named() -> None:
+    link.talk(asked=True)
+    assert doubts(link.connect(3), 100.0) == (LATER,)
     link = Link()
-    talking(link)
+    link.talk()
     timed = link.connect(3)
     timed.stream(POSITION, 1.0)
     for second in range(10, 50):
         link.robot.ask(topics.POSE)
         timed.until(float(second))
-    assert timed.session.doubts == (LATER,)
+    assert doubts(timed, 50.0) == (LATER,)
 
 
 # The device
@@ -334,11 +283,16 @@ async def test_when_a_sign_passes_the_robot_is_driven_after_a_neutral() -> None:
         assert rig.written()[-1] == MOVE_3
 
 
-async def test_a_healthy_second_hq_is_driven() -> None:
+async def test_a_healthy_second_hq_is_named_once_and_driven() -> None:
     async with serving() as rig:
-        await rig.establish(settings(3))
+        await rig.settle()
+        shown = len(rig.values("status"))
+        rig.sends(settings(3))
+        states = [(status["state"], status["reason"]) for status in rig.values("status")[shown:]]
+        assert states == [("established", LATER)]
         await asyncio.sleep(10.0)
         assert rig.last("status")["reason"] == LATER
+        rig.forget_written()
         rig.command("drive", DRIVE_LEFT)
         assert rig.written() == [MOVE_3]
         assert await rig.refusals() == []
@@ -353,13 +307,3 @@ async def test_a_lost_robot_shows_why_it_was_lost_and_no_doubts() -> None:
         await rig.settle()
         (lost,) = rig.values("status")[shown:]
         assert (lost["state"], lost["reason"]) == ("offline", "closed by peer")
-
-
-async def test_the_states_of_a_connection_are_shown_once_each_though_it_has_a_sign() -> None:
-    async with serving() as rig:
-        await rig.settle()
-        shown = len(rig.values("status"))
-        rig.sends(settings(3))
-        assert [(status["state"], status["reason"]) for status in rig.values("status")[shown:]] == [
-            ("established", LATER)
-        ]

@@ -75,26 +75,28 @@ def test_a_robot_begins_in_free_space(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("packet", "x", "y"),
+    ("packet", "x", "y", "turned"),
     [
-        (ClientJoystickMove(0.0, 1.0, 1.0), 0.0, SPEED_M_S),
-        (ClientJoystickMove(0.0, -1.0, 0.5), 0.0, -SPEED_M_S / 2),
-        (ClientJoystickMove(1.0, 0.0, 1.0), SPEED_M_S, 0.0),  # x is to the right: heading along y, that is along x
-        (ClientJoystickMove(-0.6, 0.8, 1.0), -0.6 * SPEED_M_S, 0.8 * SPEED_M_S),
+        # x is to the right: heading along y, that is along x
+        (ClientJoystickMove(0.0, 1.0, 1.0), 0.0, SPEED_M_S, 0.0),
+        (ClientJoystickMove(0.0, -1.0, 0.5), 0.0, -SPEED_M_S / 2, 0.0),
+        (ClientJoystickMove(1.0, 0.0, 1.0), SPEED_M_S, 0.0, 0.0),
+        (ClientJoystickMove(-0.6, 0.8, 1.0), -0.6 * SPEED_M_S, 0.8 * SPEED_M_S, 0.0),
+        # a positive rotation turns to the right
+        (ClientJoystickRotate(0.5), 0.0, 0.0, -0.5 * TURN_RAD_S),
+        # the motors go no faster than full speed
+        *((ClientJoystickMove(0.0, 1.0, speed), 0.0, SPEED_M_S, 0.0) for speed in (1.5, 1e4, 3e38)),
+        *((ClientJoystickRotate(-speed), 0.0, 0.0, TURN_RAD_S) for speed in (1.0, 1.5, 1e4, 3e38)),
+        # a direction longer than it may be is kept
+        (ClientJoystickMove(30.0, 40.0, 1.0), 0.6 * SPEED_M_S, 0.8 * SPEED_M_S, 0.0),
     ],
 )
-def test_a_move_goes_along_x_right_and_y_forward(packet: Packet, x: float, y: float) -> None:
+def test_a_second_of_motion_goes_along_x_right_and_y_forward_at_most_at_full_speed(packet, x, y, turned) -> None:
     moved = vehicle()
     live(moved, 1.0, packet)
     assert (moved.body.x, moved.body.y) == pytest.approx((x, y), abs=1e-6)
+    assert moved.body.heading == pytest.approx(math.pi / 2 + turned)
     assert moved.moving
-
-
-def test_a_positive_rotation_turns_to_the_right() -> None:
-    moved = vehicle()
-    live(moved, 1.0, ClientJoystickRotate(0.5))
-    assert moved.body.heading == pytest.approx(math.pi / 2 - 0.5 * TURN_RAD_S)
-    assert (moved.body.x, moved.body.y) == (0.0, 0.0)
 
 
 def test_a_stop_stops_it() -> None:
@@ -107,25 +109,15 @@ def test_a_stop_stops_it() -> None:
     assert moved.body.y == y
 
 
-def test_it_stops_by_itself_after_a_second_of_silence() -> None:
+def test_it_stops_by_itself_after_a_second_of_silence_which_only_motion_breaks() -> None:
     moved = vehicle()
     moved.take(FORWARD)
-    live(moved, SILENCE_S - STEP_S)
+    live(moved, SILENCE_S - STEP_S, ClientGetPosition())
     assert moved.moving
-    live(moved, 2 * STEP_S)
+    live(moved, 2 * STEP_S, ClientGetPosition())
     assert not moved.moving
     assert moved.body.y == pytest.approx(SPEED_M_S * SILENCE_S, abs=2 * STEP_S)
-
-
-def test_other_packets_do_not_break_the_silence() -> None:
-    moved = vehicle()
-    moved.take(FORWARD)
-    live(moved, SILENCE_S + 2 * STEP_S, ClientGetPosition())
-    assert not moved.moving
-
-
-def test_repeated_motion_breaks_the_silence() -> None:
-    moved = vehicle(y=-4.0, x=0.0)
+    moved = vehicle(y=-4.0)
     live(moved, 5.0, FORWARD)
     assert moved.moving
 
@@ -137,22 +129,6 @@ def test_walls_and_boxes_stop_it(heading: float) -> None:
     assert moved.body.blocked
     assert max(abs(moved.body.x), abs(moved.body.y)) <= HALF_SIDE_M - moved.body.radius + 1e-9
     assert not any(box.near(moved.body.x, moved.body.y, moved.body.radius) for box in BOXES)
-
-
-@pytest.mark.parametrize("speed", [1.0, 1.5, 1e4, 3e38])
-def test_its_motors_go_no_faster_than_full_speed(speed: float) -> None:
-    moved = vehicle()
-    live(moved, 1.0, ClientJoystickMove(0.0, 1.0, speed))
-    assert (moved.body.x, moved.body.y) == pytest.approx((0.0, SPEED_M_S), abs=1e-6)
-    turned = vehicle()
-    live(turned, 1.0, ClientJoystickRotate(-speed))
-    assert turned.body.heading == pytest.approx(math.pi / 2 + TURN_RAD_S)
-
-
-def test_a_direction_longer_than_it_may_be_is_kept_at_full_speed() -> None:
-    moved = vehicle()
-    live(moved, 1.0, ClientJoystickMove(30.0, 40.0, 1.0))
-    assert (moved.body.x, moved.body.y) == pytest.approx((0.6 * SPEED_M_S, 0.8 * SPEED_M_S), abs=1e-6)
 
 
 @pytest.mark.parametrize("speed", [1e4, 1e38, 3e38])
@@ -186,33 +162,30 @@ def test_the_position_is_in_centimetres_and_degrees_from_y() -> None:
     assert turned.heading_deg == pytest.approx(90.0)
 
 
-@pytest.mark.parametrize(("mode", "status"), [(1, 1), (2, 2), (7, 2)])
-def test_the_lidar_is_switched_and_says_so(mode: int, status: int) -> None:
-    told = vehicle()
-    assert told.take(ClientLidarMode(mode)) == (ServerLidarStatus(status),)
-    assert told.lidar is (status == 1)
-
-
-def test_questions_are_answered() -> None:
+@pytest.mark.parametrize(
+    ("packet", "answers"),
+    [
+        *((ClientLidarMode(mode), (ServerLidarStatus(status),)) for mode, status in ((1, 1), (2, 2), (7, 2))),
+        (ClientGetPosition(), (ServerPosition(100.0, 200.0, 0.0),)),
+        (DebugMessage("hi"), (DebugMessage("echo: hi"),)),
+        (ChatMessage(b"\x01"), (ChatMessage(b"\x01"),)),
+        (ClientMoveAI(b"\x01"), (DebugMessage("clientMoveAI taken"),)),
+        (ClientControllMode(3), ()),
+    ],
+)
+def test_packets_are_answered(packet: Packet, answers: tuple[Packet, ...]) -> None:
     told = vehicle(1.0, 2.0)
-    assert told.take(ClientGetPosition()) == (told.position(),)
-    (shown,) = told.take(ClientGetSLAMMap())
+    assert told.take(packet) == answers
+    if isinstance(packet, ClientLidarMode):
+        assert told.lidar is (packet.mode == 1)
+    if isinstance(packet, ClientControllMode):
+        assert told.mode == 3
+
+
+def test_the_question_for_the_map_is_answered_with_all_its_cells() -> None:
+    (shown,) = vehicle().take(ClientGetSLAMMap())
     assert isinstance(shown, ServerSLAMMap)
-    assert shown.cells is not None
-    assert len(shown.cells) == SIDE * SIDE
-
-
-def test_texts_and_opaque_packets_are_answered() -> None:
-    told = vehicle()
-    assert told.take(DebugMessage("hi")) == (DebugMessage("echo: hi"),)
-    assert told.take(ChatMessage(b"\x01")) == (ChatMessage(b"\x01"),)
-    assert told.take(ClientMoveAI(b"\x01")) == (DebugMessage("clientMoveAI taken"),)
-
-
-def test_the_control_mode_is_remembered() -> None:
-    told = vehicle()
-    assert told.take(ClientControllMode(3)) == ()
-    assert told.mode == 3
+    assert len(shown.cells or b"") == SIDE * SIDE
 
 
 def test_every_packet_of_the_table_and_every_other_is_taken() -> None:
@@ -249,18 +222,14 @@ def test_simulated_lidar_data_are_entered_into_the_map() -> None:
     assert (x, y) == pytest.approx((-2.0, 0.0), abs=0.11)
 
 
-@pytest.mark.parametrize("count", [0, 1, 359, 361])
-def test_simulated_lidar_data_of_another_length_are_ignored(count: int) -> None:
+@pytest.mark.parametrize(
+    "ranges", [*([100.0] * count for count in (0, 1, 359, 361)), [math.nan, math.inf, -math.inf, -1.0, 3e38] * 72]
+)
+def test_simulated_lidar_data_of_another_length_or_that_are_no_numbers_are_ignored(ranges: list[float]) -> None:
     told = vehicle()
-    told.take(ClientSimulatedLidarData(np.full(count, 100.0, np.float32)))
-    assert not told.grid.cells.any()
-
-
-def test_simulated_lidar_data_that_are_no_numbers_are_ignored() -> None:
-    told = vehicle()
-    values = np.array([math.nan, math.inf, -math.inf, -1.0, 3e38] * 72, np.float32)
-    told.take(ClientSimulatedLidarData(values))
+    told.take(ClientSimulatedLidarData(np.array(ranges, np.float32)))
     assert 2 not in told.grid.cells
+    assert len(ranges) == 360 or not told.grid.cells.any()
 
 
 def test_a_vehicle_prints_where_it_is() -> None:

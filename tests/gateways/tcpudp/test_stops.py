@@ -33,19 +33,23 @@ SETTINGS = {
     "1.4": server_settings(LISTED + b",1.4", "00010101010101" + SIZE_100_10, 2),
 }
 NO_JOYSTICK = server_settings(LISTED, "00010001010101" + SIZE_100_10, 2)
-MISREADING, SURE = ["1.1", "1.2"], ["1.3", "1.4"]
+each_version = pytest.mark.parametrize("version", SETTINGS)
+misreading = pytest.mark.parametrize("version", ["1.1", "1.2"])
 
 
 class Stage:
-    """A robot with an established session since second 0, and what leaves it when."""
+    """A robot with an established session since second 0, and what leaves it when; acts may be chained."""
 
-    def __init__(self, version: str = "1.3", options: Options | None = None, settings: bytes | None = None) -> None:
+    def __init__(self, version: str = "1.3", options: Options | None = None) -> None:
         self.robot = TcpUdpRobot(options or Options())
         self.now = 0.0
         self.sent: list[tuple[float, bytes]] = []
-        self.connect(settings or SETTINGS[version])
+        self.connect(SETTINGS[version])
 
     def connect(self, settings: bytes) -> None:
+        """Connect, again if it was connected."""
+        if self.now:
+            self.session.lost("closed by peer")
         self.session: HqRole = self.robot.session("robot", "tcp://robot.test:1")
         self.session.open(self.now)
         self.session.receive(settings, self.now)
@@ -71,20 +75,32 @@ class Stage:
     def after(self, seconds: float) -> list[bytes]:
         return self.until(self.now + seconds)
 
-    def command(self, topic: Topic, command: FleetMessage) -> None:
+    def command(self, topic: Topic, command: FleetMessage) -> Stage:
         self.robot.command(topic, command, self.now)
+        return self
 
-    def mode(self, mode: str) -> None:
-        self.command(topics.CMD_MODE, Mode(mode=mode))  # type: ignore[arg-type]
+    def mode(self, mode: str) -> Stage:
+        return self.command(topics.CMD_MODE, Mode(mode=mode))  # type: ignore[arg-type]
 
-    def lidar(self, on: bool) -> None:
-        self.command(topics.CMD_LIDAR, Switch(on=on))
+    def lidar(self, on: bool) -> Stage:
+        return self.command(topics.CMD_LIDAR, Switch(on=on))
 
-    def drive(self, left: float = 0.0) -> None:
-        self.command(topics.CMD_DRIVE, Drive(left=left))
+    def drive(self, left: float = 0.0) -> Stage:
+        return self.command(topics.CMD_DRIVE, Drive(left=left))
 
-    def stop(self, for_s: float = 1.0) -> None:
+    def text(self) -> Stage:
+        return self.command(topics.CMD_TEXT, Text(text="hi"))
+
+    def stop(self, for_s: float = 1.0) -> Stage:
         self.robot.stop(self.now, self.now + for_s)
+        return self
+
+
+def in_3(version: str = "1.3", seconds: float = 0.1, options: Options | None = None) -> Stage:
+    """A robot that was sent mode 3 so many seconds ago."""
+    stage = Stage(version, options).mode("autonomous")
+    stage.after(seconds)
+    return stage
 
 
 def pairs(frames: list[bytes]) -> int:
@@ -96,7 +112,7 @@ def pairs(frames: list[bytes]) -> int:
 # Mode 3: every stop is the pair, until another mode is commanded
 
 
-@pytest.mark.parametrize("version", SETTINGS)
+@each_version
 def test_a_robot_that_was_never_in_mode_3_is_never_sent_a_1(version: str) -> None:
     stage = Stage(version)
     for act in (
@@ -111,183 +127,109 @@ def test_a_robot_that_was_never_in_mode_3_is_never_sent_a_1(version: str) -> Non
         assert NONE not in stage.after(1.5)
 
 
-@pytest.mark.parametrize("version", SETTINGS)
-def test_a_stop_in_mode_3_is_the_pair_quick_and_repeated(version: str) -> None:
-    stage = Stage(version)
-    stage.mode("autonomous")
+@each_version
+def test_a_stop_in_mode_3_is_the_pair_quick_and_repeated_until_another_mode_is_sent(version: str) -> None:
+    stage = Stage(version).mode("autonomous")
     assert set(stage.after(1.0)) == {AUTONOMOUS}
-    stage.stop()
     start = stage.now
-    assert 9 <= pairs(stage.after(3.0)) <= 11
+    assert 9 <= pairs(stage.stop().after(3.0)) <= 11
     times = [at for at, frame in stage.sent if at >= start]
-    assert times[0] == start
+    assert times[:2] == [start, pytest.approx(start + 0.01)]
     assert all(second - first >= 0.00999 for first, second in itertools.pairwise(times))
-    assert times[1] == pytest.approx(start + 0.01)
-    stage.stop()
-    assert pairs(stage.after(3.0)) >= 9, "until another mode is sent"
+    assert pairs(stage.stop().after(0.35)) == 4, "the 1 of a stop is no other mode"
+    assert pairs(stage.stop().after(3.0)) >= 9
 
 
-@pytest.mark.parametrize(("version", "stop"), [(version, stop) for version in SETTINGS for stop in ("pair", "stop")])
-def test_a_routine_stop_is_sent_exactly_once(version: str, stop: str) -> None:
-    stage = Stage(version)
-    if stop == "pair":
-        stage.mode("autonomous")
-    stage.after(1.0)
-    for _ in range(3):
-        stage.stop(0.0)
-        assert stage.after(1.0) == (PAIR if stop == "pair" else [STOP])
-
-
-def test_a_routine_stop_ends_motion_that_still_stood() -> None:
-    stage = Stage()
-    stage.drive(1.0)
+@each_version
+def test_a_routine_stop_is_sent_exactly_once_and_ends_motion_that_still_stood(version: str) -> None:
+    for stage, stop in ((in_3(version, 1.0), PAIR), (Stage(version), [STOP])):
+        for _ in range(3):
+            assert stage.stop(0.0).after(1.0) == stop
+    stage = Stage(version).drive(1.0)
     stage.after(0.1)
-    stage.stop(0.0)
-    assert stage.after(3.0) == [STOP]
+    assert stage.stop(0.0).after(3.0) == [STOP]
 
 
-@pytest.mark.parametrize(("mode", "frame"), [("none", NONE), ("manual", MANUAL)])
-def test_after_another_mode_a_stop_is_13_alone_again(mode: str, frame: bytes) -> None:
+def test_after_another_mode_a_stop_is_13_alone_again_and_mode_3_that_comes_again_is_mode_3_again() -> None:
     stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
-    stage.mode(mode)
-    assert stage.after(0.1) == [frame]
-    stage.stop()
-    assert set(stage.after(2.0)) == {STOP}
-
-
-def test_the_1_of_a_stop_is_no_other_mode() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
-    for _ in range(3):
-        stage.stop()
-        assert pairs(stage.after(0.35)) == 4
-
-
-def test_mode_3_that_comes_again_is_mode_3_again() -> None:
-    stage = Stage()
-    for _ in range(3):
-        stage.mode("autonomous")
-        assert stage.after(0.1) == [AUTONOMOUS]
-        stage.stop()
-        assert pairs(stage.after(2.0)) >= 9
-        stage.mode("manual")
-        assert stage.after(0.1) == [MANUAL]
-        stage.stop()
-        assert set(stage.after(2.0)) == {STOP}
+    for mode, frame in (("none", NONE), ("manual", MANUAL)):
+        assert stage.mode("autonomous").after(0.1) == [AUTONOMOUS]
+        assert pairs(stage.stop().after(2.0)) >= 9
+        assert stage.mode(mode).after(0.1) == [frame]
+        assert set(stage.stop().after(2.0)) == {STOP}
+        assert stage.mode("autonomous").after(0.1) == [AUTONOMOUS]
+        assert stage.mode(mode).after(0.1) == [frame]
+        assert set(stage.stop().after(2.0)) == {STOP}
 
 
 def test_after_a_reconnection_it_is_the_pair_and_never_a_3() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
+    stage = in_3()
     for _ in range(3):
-        stage.session.lost("closed by peer")
         stage.connect(SETTINGS["1.3"])
-        stage.stop()
-        assert pairs(stage.after(3.0)) >= 9
+        assert pairs(stage.stop().after(3.0)) >= 9
     stage.mode("none")
-    stage.session.lost("closed by peer")
     stage.connect(SETTINGS["1.3"])
-    stage.stop()
-    assert pairs(stage.after(3.0)) >= 9, "the other mode did not leave before the connection ended"
+    assert pairs(stage.stop().after(3.0)) >= 9, "the other mode did not leave before the connection ended"
     assert [frame for _, frame in stage.sent].count(AUTONOMOUS) == 1
 
 
 def test_a_3_that_still_waits_when_the_stop_comes_never_leaves_and_no_1_either() -> None:
-    stage = Stage()
-    stage.command(topics.CMD_TEXT, Text(text="hi"))
-    assert len(stage.until(stage.now)) == 1
-    stage.mode("autonomous")
-    stage.stop()
-    assert set(stage.after(3.0)) == {STOP}
+    stage = Stage().text()
+    assert len(stage.after(0.0)) == 1
+    assert set(stage.mode("autonomous").stop().after(3.0)) == {STOP}
 
 
 def test_another_mode_that_still_waits_when_the_stop_comes_leaves_behind_the_pair() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.until(stage.now)
-    stage.mode("manual")
-    stage.stop()
-    assert stage.after(0.05) == [*PAIR, MANUAL]
+    assert in_3(seconds=0.0).mode("manual").stop().after(0.05) == [*PAIR, MANUAL]
 
 
 def test_the_mode_of_the_next_holder_is_not_undone_by_the_stop_before_it() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
-    stage.stop()
-    assert pairs(stage.after(0.05)) == 1
-    stage.mode("manual")
-    assert sorted(stage.after(0.02)) == sorted([MANUAL, STOP])
+    stage = in_3()
+    assert pairs(stage.stop().after(0.05)) == 1
+    assert sorted(stage.mode("manual").after(0.02)) == sorted([MANUAL, STOP])
     rest = stage.after(3.0)
     assert set(rest) == {STOP}
     assert 8 <= len(rest) <= 10, "for the rest of the second"
 
 
 def test_a_stop_ends_where_the_next_holder_lets_the_robot_move_by_itself() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
-    stage.stop()
-    assert pairs(stage.after(0.05)) == 1
-    stage.mode("autonomous")
-    assert stage.after(3.0) == [AUTONOMOUS]
+    stage = in_3()
+    assert pairs(stage.stop().after(0.05)) == 1
+    assert stage.mode("autonomous").after(3.0) == [AUTONOMOUS]
 
 
-def test_the_mode_of_a_holder_who_drives_does_not_end_its_drive() -> None:
-    for mode, frame in (("manual", MANUAL), ("autonomous", AUTONOMOUS)):
-        stage = Stage()
-        stage.stop()
-        stage.after(0.05)
-        stage.drive(1.0)
-        stage.after(0.05)
-        stage.mode(mode)
-        assert set(stage.after(1.0)) == {frame, MOVE_LEFT}
+@pytest.mark.parametrize(("mode", "frame"), [("manual", MANUAL), ("autonomous", AUTONOMOUS)])
+def test_the_mode_of_a_holder_who_drives_does_not_end_its_drive(mode: str, frame: bytes) -> None:
+    stage = Stage().stop()
+    stage.after(0.05)
+    stage.drive(1.0).after(0.05)
+    assert set(stage.mode(mode).after(1.0)) == {frame, MOVE_LEFT}
 
 
 def test_neutral_in_mode_3_is_a_stop() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
-    stage.drive()
-    assert stage.after(0.02) == PAIR
+    stage = in_3()
+    assert stage.drive().after(0.02) == PAIR
     assert pairs(stage.after(3.0)) in (3, 4)
-    stage.drive()
-    stage.drive(1.0)
-    assert stage.after(0.05) == [*PAIR, MOVE_LEFT]
+    assert stage.drive().drive(1.0).after(0.05) == [*PAIR, MOVE_LEFT]
 
 
 def test_neutral_after_another_mode_was_commanded_is_13_alone_although_that_mode_still_waits() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.until(stage.now)
-    stage.mode("manual")
-    stage.drive()
+    stage = in_3(seconds=0.0).mode("manual").drive()
     assert sorted(stage.after(0.1)) == sorted([MANUAL, STOP])
-    stage.stop()
-    assert set(stage.after(2.0)) == {STOP}
+    assert set(stage.stop().after(2.0)) == {STOP}
 
 
 @pytest.mark.parametrize(
     ("force", "sent"), [((13,), [STOP]), ((10,), [NONE]), (("joystick",), PAIR)], ids=["13", "10", "both"]
 )
 def test_of_the_pair_only_what_the_robot_may_be_sent(force: tuple[str | int, ...], sent: list[bytes]) -> None:
-    stage = Stage(options=Options(force=force))  # type: ignore[arg-type]
-    stage.mode("autonomous")
-    stage.after(0.1)
-    stage.session.lost("another robot program")
+    stage = in_3(options=Options(force=force))  # type: ignore[arg-type]
     stage.connect(NO_JOYSTICK)
-    stage.stop(0.0)
-    assert stage.after(1.0) == sent
+    assert stage.stop(0.0).after(1.0) == sent
 
 
 def test_a_robot_that_may_be_sent_neither_refuses_the_stop() -> None:
-    stage = Stage()
-    stage.mode("autonomous")
-    stage.after(0.1)
+    stage = in_3()
     stage.connect(NO_JOYSTICK)
     with pytest.raises(Refused, match="does not announce joystick"):
         stage.stop()
@@ -432,8 +374,7 @@ def test_a_stop_in_a_silence_that_comes_late_is_kept_too() -> None:
     assert stage.session.busy == "handshaking"
     start = stage.now
     stage.after(0.1)
-    stage.stop()
-    stage.until(start + 4.0)
+    stage.stop().until(start + 4.0)
     assert [(at >= start + 2.5, frame[5]) for at, frame in stage.sent][:2] == [(False, 7), (True, 13)]
     assert stage.session.state is State.ESTABLISHED
 
@@ -441,115 +382,85 @@ def test_a_stop_in_a_silence_that_comes_late_is_kept_too() -> None:
 # What is sent once and matters is sent again to robots that misread a tenth
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 @pytest.mark.parametrize(
-    ("name", "frame"),
-    [("none", NONE), ("manual", MANUAL), ("autonomous", AUTONOMOUS), ("on", LIDAR_ON), ("off", LIDAR_OFF)],
+    ("topic", "command", "frame"),
+    [
+        (topics.CMD_MODE, Mode("none"), NONE),
+        (topics.CMD_MODE, Mode("manual"), MANUAL),
+        (topics.CMD_MODE, Mode("autonomous"), AUTONOMOUS),
+        (topics.CMD_LIDAR, Switch(True), LIDAR_ON),
+        (topics.CMD_LIDAR, Switch(False), LIDAR_OFF),
+    ],
 )
-def test_mode_and_lidar_are_sent_again_after_three_tenths_of_a_second(version: str, name: str, frame: bytes) -> None:
+def test_mode_and_lidar_are_sent_again_after_three_tenths_of_a_second(version, topic, command, frame) -> None:
     stage = Stage(version)
     start = stage.now
-    if name in ("on", "off"):
-        stage.lidar(name == "on")
-    else:
-        stage.mode(name)
-    stage.after(5.0)
+    stage.command(topic, command).after(5.0)
     assert stage.sent == [(start, frame), (pytest.approx(start + 0.3), frame)]
 
 
-@pytest.mark.parametrize("version", SURE)
+@pytest.mark.parametrize("version", ["1.3", "1.4"])
 def test_robots_that_read_well_are_sent_them_once(version: str) -> None:
-    stage = Stage(version)
-    stage.mode("manual")
-    stage.lidar(True)
-    assert stage.after(5.0) == [MANUAL, LIDAR_ON]
+    assert Stage(version).mode("manual").lidar(True).after(5.0) == [MANUAL, LIDAR_ON]
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 def test_a_newer_one_replaces_the_repetition_of_the_older(version: str) -> None:
-    stage = Stage(version)
-    stage.mode("autonomous")
-    stage.lidar(True)
+    stage = Stage(version).mode("autonomous").lidar(True)
     stage.after(0.2)
-    stage.mode("manual")
-    stage.lidar(False)
-    assert stage.after(5.0) == [MANUAL, LIDAR_OFF, MANUAL, LIDAR_OFF]
+    assert stage.mode("manual").lidar(False).after(5.0) == [MANUAL, LIDAR_OFF, MANUAL, LIDAR_OFF]
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 @pytest.mark.parametrize("mode", ["none", "manual", "autonomous"])
 def test_a_stop_drops_what_was_to_be_sent_again(version: str, mode: str) -> None:
-    stage = Stage(version)
-    stage.mode(mode)
-    stage.lidar(True)
+    stage = Stage(version).mode(mode).lidar(True)
     stage.after(0.2)
-    stage.stop()
-    sent = stage.after(5.0)
-    assert LIDAR_ON not in sent
+    sent = stage.stop().after(5.0)
     if mode == "autonomous":
         assert pairs(sent) >= 9
     else:
         assert set(sent) == {STOP}
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 def test_a_routine_stop_drops_no_repetition_but_that_of_a_3(version: str) -> None:
     """Else one in three would be lost to the stop that comes once a second."""
-    stage = Stage(version)
-    stage.mode("manual")
-    stage.lidar(True)
+    stage = Stage(version).mode("manual").lidar(True)
     stage.after(0.2)
-    stage.stop(0.0)
-    assert stage.after(0.5) == [STOP, MANUAL, LIDAR_ON]
-    stage.mode("autonomous")
-    stage.after(0.2)
-    stage.stop(0.0)
-    assert stage.after(5.0) == PAIR
+    assert stage.stop(0.0).after(0.5) == [STOP, MANUAL, LIDAR_ON]
+    stage.mode("autonomous").after(0.2)
+    assert stage.stop(0.0).after(5.0) == PAIR
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 def test_a_neutral_lets_a_mode_be_sent_again_but_never_a_3(version: str) -> None:
-    stage = Stage(version)
-    stage.mode("manual")
+    stage = Stage(version).mode("manual")
     stage.after(0.2)
-    stage.drive()
-    assert MANUAL in stage.after(0.2)
-    stage.mode("autonomous")
-    stage.after(0.2)
-    stage.drive()
-    assert pairs(stage.after(5.0)) >= 4
+    assert MANUAL in stage.drive().after(0.2)
+    stage.mode("autonomous").after(0.2)
+    assert pairs(stage.drive().after(5.0)) >= 4
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 def test_a_robot_that_may_have_misread_another_mode_is_stopped_by_the_pair(version: str) -> None:
-    stage = Stage(version)
-    stage.mode("autonomous")
-    stage.after(1.0)
-    stage.mode("manual")
-    stage.after(0.2)
-    stage.stop()
-    assert pairs(stage.after(2.0)) >= 9
-    stage.mode("manual")
-    stage.after(1.0)
-    stage.stop()
-    assert set(stage.after(2.0)) == {STOP}
+    stage = in_3(version, 1.0)
+    stage.mode("manual").after(0.2)
+    assert pairs(stage.stop().after(2.0)) >= 9
+    stage.mode("manual").after(1.0)
+    assert set(stage.stop().after(2.0)) == {STOP}
 
 
-@pytest.mark.parametrize("version", MISREADING)
+@misreading
 def test_a_lidar_mode_that_still_waits_when_the_stop_comes_is_sent(version: str) -> None:
-    stage = Stage(version)
-    stage.command(topics.CMD_TEXT, Text(text="hi"))
-    stage.until(stage.now)
-    stage.lidar(True)
-    stage.stop()
-    assert stage.after(5.0).count(LIDAR_ON) == 1
+    stage = Stage(version).text()
+    stage.after(0.0)
+    assert stage.lidar(True).stop().after(5.0).count(LIDAR_ON) == 1
 
 
 def test_what_was_to_be_sent_again_is_not_sent_on_the_next_connection() -> None:
-    stage = Stage("1.1")
-    stage.mode("manual")
-    stage.lidar(True)
+    stage = Stage("1.1").mode("manual").lidar(True)
     stage.after(0.1)
-    stage.session.lost("closed by peer")
     stage.connect(SETTINGS["1.1"])
     assert stage.after(5.0) == []

@@ -3,6 +3,7 @@
 import contextlib
 
 import msgspec
+import numpy as np
 import pytest
 
 from gateways.tcpudp.messages import (
@@ -19,6 +20,7 @@ from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp.frames import (
     ALL,
     LISTED,
+    NO_UDP,
     SIZE_100_10,
     Timed,
     client_settings,
@@ -72,25 +74,18 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("listed", "block", "answer", "answered", "version", "features"), ROWS)
-def test_a_robot_is_answered_with_what_it_understands(listed, block, answer, answered, version, features) -> None:
-    timed = hq(listed, block)
-    assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-    assert timed.session.state is State.ESTABLISHED
-    assert timed.session.version == version
-    assert timed.session.features == tuple(features.split())
-    assert timed.session.traffic.malformed == 0
-
-
-@pytest.mark.parametrize(("listed", "block", "answer", "answered", "version", "features"), ROWS)
-def test_a_robot_that_announces_udp_is_answered_with_udp_unless_it_is_switched_off(
+def test_a_robot_is_answered_with_what_it_understands_and_with_udp_unless_either_switches_it_off(
     listed: bytes, block: str, answer: bytes, answered: str, version: str, features: str
 ) -> None:
-    block = "01" + block[2:]
-    assert hq(listed, block).frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex("01" + answered[2:]))]
-    without = hq(listed, block, udp=False)
-    assert without.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-    assert without.session.state is State.ESTABLISHED
-    assert without.session.features == ("udp", *features.split())
+    plain = framed(5, 3, counted(answer) + bytes.fromhex(answered))
+    with_udp = framed(5, 3, counted(answer) + bytes.fromhex("01" + answered[2:]))
+    neither, ours_off = hq(listed, block), hq(listed, "01" + block[2:], udp=False)
+    for timed, announced in ((neither, features.split()), (ours_off, ["udp", *features.split()])):
+        assert timed.frames("tcp") == [plain]
+        assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, version)
+        assert timed.session.features == tuple(announced)
+        assert timed.session.traffic.malformed == 0
+    assert hq(listed, "01" + block[2:]).frames("tcp") == [with_udp]
 
 
 @pytest.mark.parametrize("listed", [b"", b"2.0", b"1.0", b"1", b"1.10", b"1.1.0", b"v1.1", b"1,1", b"1.1;1.2", b",,"])
@@ -125,38 +120,32 @@ def test_a_settings_block_that_is_too_short_for_its_version_is_malformed(listed:
 
 
 @pytest.mark.parametrize(
-    ("announce", "listed", "answered"),
+    ("announce", "listed", "block", "answered"),
     [
-        ((), LISTED, "00000000000000"),
-        (("udp",), LISTED, "01000000000000"),
-        (("lidar_sim",), LISTED, "00000000000100"),
-        (("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"), LISTED, "01010101010101"),
-        (("cam", "slam_map"), LISTED_14, "00010000000001"),
-        (("cam", "lidar_sim", "slam_map"), b"1.2", "000100000001"),
-        (("chat", "lidar_sim", "slam_map"), b"1.1", "0000000100"),
+        ((), LISTED, ALL + SIZE_100_10, "00000000000000"),
+        (("udp",), LISTED, ALL + SIZE_100_10, "01000000000000"),
+        (("lidar_sim",), LISTED, ALL + SIZE_100_10, "00000000000100"),
+        (
+            ("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"),
+            LISTED,
+            ALL + SIZE_100_10,
+            "01010101010101",
+        ),
+        (("cam", "slam_map"), LISTED_14, ALL + SIZE_100_10, "00010000000001"),
+        (("cam", "lidar_sim", "slam_map"), b"1.2", ALL[:12], "000100000001"),
+        (("chat", "lidar_sim", "slam_map"), b"1.1", ALL[:10], "0000000100"),
+        (("udp", "chat"), LISTED, NO_UDP + SIZE_100_10, "00000001000000"),  # a robot without datagrams: none of ours
     ],
 )
-def test_the_gateway_announces_what_it_is_told(announce: tuple[str, ...], listed: bytes, answered: str) -> None:
-    session = TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", "")
-    timed = Timed(session)
-    block = {b"1.1": ALL[:10], b"1.2": ALL[:12]}.get(listed, ALL + SIZE_100_10)
+def test_the_gateway_announces_what_it_is_told(announce, listed, block, answered) -> None:
+    timed = Timed(TcpUdpRobot(msgspec.convert({"announce": announce}, Options)).session("robot", ""))
     timed.stream(server_settings(listed, block), 0.1)
     answer = LISTED if listed == LISTED_14 else listed
     assert timed.frames("tcp") == [framed(5, 3, counted(answer) + bytes.fromhex(answered))]
-
-
-def test_a_gateway_that_does_not_announce_datagrams_neither_waits_for_them_nor_sends_any() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("lidar_sim",))).session("robot", ""))
-    timed.stream(server_settings(LISTED, ALL + SIZE_100_10), 0.1)
-    assert timed.session.state is State.ESTABLISHED
-    timed.until(10.0)
-    assert timed.frames("udp") == []
-
-
-def test_a_robot_without_datagrams_is_not_told_of_ours() -> None:
-    timed = Timed(TcpUdpRobot(Options(announce=("udp", "chat"))).session("robot", ""))
-    timed.stream(server_settings(LISTED, "00" + ALL[2:] + SIZE_100_10), 0.1)
-    assert timed.frames("tcp") == [framed(5, 3, counted(LISTED) + bytes.fromhex("00000001000000"))]
+    if "udp" not in announce or block[:2] == "00":
+        assert timed.session.state is State.ESTABLISHED
+        timed.until(10.0)
+        assert timed.frames("udp") == [], "it neither waits for datagrams nor sends any"
 
 
 @pytest.mark.parametrize("announce", [["lidarsim"], [50], "udp"])
@@ -168,47 +157,36 @@ def test_a_feature_nobody_knows_cannot_be_announced(announce: object) -> None:
 # 52 and 54 go by SLAMMap where the version has the flag, else by Lidar; 61 by LidarSim, which 1.1 has not
 
 
-@pytest.mark.parametrize("question", [ClientGetSLAMMap(), ClientGetPosition()])
-@pytest.mark.parametrize(
-    ("listed", "block", "sent"),
-    [
-        (b"1.1", "0000000001", True),
-        (b"1.1", "0001010100", False),
-        (b"1.2", "000000000100", True),
-        (b"1.2", "000101010001", False),
-        (LISTED, "00000000000001" + SIZE_100_10, True),
-        (LISTED, "00010101010100" + SIZE_100_10, False),
-        (LISTED_14, "00000000000001" + SIZE_100_10, True),
-        (LISTED_14, "00010101010100" + SIZE_100_10, False),
-    ],
-)
-def test_map_and_position_are_asked_of_robots_that_know_the_question(listed, block, sent, question) -> None:
-    timed = hq(listed, block)
-    if sent:
-        timed.session.send(question)
-        timed.until(1.0)
-        assert timed.frames("tcp")[1:] == [framed(5, question.spec.id)]
-    else:
-        with pytest.raises(Refused, match="does not announce"):
-            timed.session.send(question)
+MAP, POSITION = ClientGetSLAMMap(), ClientGetPosition()
+SCAN = ClientSimulatedLidarData(np.zeros(360, np.float32))
 
 
 @pytest.mark.parametrize(
-    ("listed", "block", "reason"),
+    ("listed", "block", "messages", "reason"),
     [
-        (b"1.1", "0101010101", r"version 1\.1 has no lidar_sim"),
-        (b"1.2", "000101010100", "does not announce lidar_sim"),
-        (b"1.2", "000000000001", None),
+        (b"1.1", "0000000001", (MAP, POSITION), None),
+        (b"1.1", "0001010100", (MAP, POSITION), "does not announce"),
+        (b"1.2", "000000000100", (MAP, POSITION), None),
+        (b"1.2", "000101010001", (MAP, POSITION), "does not announce"),
+        (LISTED, "00000000000001" + SIZE_100_10, (MAP, POSITION), None),
+        (LISTED, "00010101010100" + SIZE_100_10, (MAP, POSITION), "does not announce"),
+        (LISTED_14, "00000000000001" + SIZE_100_10, (MAP, POSITION), None),
+        (LISTED_14, "00010101010100" + SIZE_100_10, (MAP, POSITION), "does not announce"),
+        (b"1.1", "0101010101", (SCAN,), r"version 1\.1 has no lidar_sim"),
+        (b"1.2", "000101010100", (SCAN,), "does not announce lidar_sim"),
+        (b"1.2", "000000000001", (SCAN,), None),
     ],
 )
-def test_simulated_lidar_data_go_to_robots_that_take_them(listed: bytes, block: str, reason: str | None) -> None:
-    session = hq(listed, block, udp=False).session
-    scan = ClientSimulatedLidarData([0.0] * 360)  # type: ignore[arg-type]
-    if reason is None:
-        session.send(scan)
-    else:
-        with pytest.raises(Refused, match=reason):
-            session.send(scan)
+def test_questions_and_simulated_lidar_data_go_to_robots_that_know_them(listed, block, messages, reason) -> None:
+    for message in messages:
+        timed = hq(listed, block, udp=False)
+        if reason is None:
+            timed.session.send(message)
+            timed.until(1.0)
+            assert [frame[5] for frame in timed.frames("tcp")] == [3, message.spec.id]
+        else:
+            with pytest.raises(Refused, match=reason):
+                timed.session.send(message)
 
 
 # The gateway as robot
@@ -242,28 +220,26 @@ def test_a_robot_lists_its_versions_to_the_letter_and_announces_their_block(vers
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "agreed", "features"),
+    ("ours", "theirs", "agreed"),
     [
-        ("1.1", "1.1", "1.1", ("udp",)),
-        ("1.1", "1.3", "1.1", ("udp", "lidar_sim")),
-        ("1.2", "1.2", "1.2", ("udp", "lidar_sim")),
-        ("1.2", "1.3", "1.2", ("udp", "lidar_sim")),
-        ("1.3", "1.1", "1.1", ("udp",)),
-        ("1.3", "1.2", "1.2", ("udp", "lidar_sim")),
-        ("1.3", "1.3", "1.3", ("udp", "lidar_sim")),
-        ("1.4", "1.1", "1.1", ("udp",)),
-        ("1.4", "1.2", "1.2", ("udp", "lidar_sim")),
-        ("1.4", "1.3", "1.3", ("udp", "lidar_sim")),
+        ("1.1", HQS["1.1"], "1.1"),
+        ("1.1", HQS["1.3"], "1.1"),
+        ("1.2", HQS["1.2"], "1.2"),
+        ("1.2", HQS["1.3"], "1.2"),
+        *((ours, theirs, agreed) for ours in ("1.3", "1.4") for agreed, theirs in HQS.items()),
+        # odd lists
+        ("1.3", (b" 1.2 , 1.1", "010000000001"), "1.2"),
+        ("1.3", (b"1.1,1.1", "0100000000"), "1.1"),
+        ("1.3", (b"2.0,1.3", "01000000000100"), "1.3"),
+        ("1.3", (b"1.2,1.2.9", "010000000001"), "1.2"),
     ],
 )
-def test_an_hq_of_any_version_and_a_robot_of_any_version_agree_on_the_highest_common_one(
-    ours: str, theirs: str, agreed: str, features: tuple[str, ...]
-) -> None:
+def test_an_hq_of_any_version_and_a_robot_of_any_version_agree_on_the_highest_common_one(ours, theirs, agreed) -> None:
     timed = robot(ours)
-    timed.stream(client_settings(*HQS[theirs]), 0.1)
-    assert timed.session.state is State.ESTABLISHED
-    assert timed.session.version == agreed
-    assert timed.session.features == features
+    timed.stream(client_settings(*theirs), 0.1)
+    assert (timed.session.state, timed.session.version) == (State.ESTABLISHED, agreed)
+    five_flags = len(theirs[1]) == 10
+    assert timed.session.features == (("udp",) if five_flags else ("udp", "lidar_sim"))
     assert len(timed.sent) == 1
     assert timed.session.traffic.malformed == 0
 
@@ -280,15 +256,6 @@ def test_an_hq_without_a_common_version_is_told_reported_and_left(ours: str, the
     assert timed.frames("tcp")[1:] == [framed(1, 1, counted(text.encode()))]
     assert timed.session.state is State.CLOSED
     assert timed.session.reason == text
-
-
-@pytest.mark.parametrize(
-    ("listed", "agreed"), [(b" 1.2 , 1.1", "1.2"), (b"1.1,1.1", "1.1"), (b"2.0,1.3", "1.3"), (b"1.2,1.2.9", "1.2")]
-)
-def test_odd_lists_of_an_hq_are_read(listed: bytes, agreed: str) -> None:
-    timed = robot("1.3")
-    timed.stream(client_settings(listed, "01000000000100"), 0.1)
-    assert timed.session.version == agreed
 
 
 KNOWN = {

@@ -1,6 +1,7 @@
 """The messages of both dialects, by hand from the tables of the protocol page."""
 
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -80,3 +81,18 @@ def _side(dialect: Dialect, sender: Sender) -> Side:
 
 
 SIDES = [_side(*side) for side in GOLDEN]
+
+DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
+NODE_TYPES = {"distance": DISTANCE, "linear": LINEAR, "rotational": ROTATIONAL}
+
+
+def registration(kind: int, number: int, name: bytes) -> bytes:
+    return bytes((0, kind, number, len(name))) + name
+
+
+def data(number: int, value: float, kind: int = DISTANCE, command: int = 1) -> bytes:
+    return struct.pack("<BBBd", command, kind, number, value)
+
+
+def light(number: int, value: float) -> bytes:
+    return data(number, value, 0, 0)

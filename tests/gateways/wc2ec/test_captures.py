@@ -3,11 +3,12 @@
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData, Wc2EcMessage
+from gateways.wc2ec.messages import Dialect, RegisterSensor, SensorData
 from gateways.wc2ec.session import ControllerRole, ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads, stream
+from tests.gateways.wc2ec.golden import NODE_TYPES
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Device, Devices, FleetMessage, Reading
 from zbridge.fleet.topics import Topic
@@ -16,31 +17,20 @@ from zbridge.protocol.session import State
 
 NAME, PORT = "wc2ec-deployed.hex", 27515
 BEGAN_NS = 1_700_000_000_000_000_000
-REGISTRATIONS = [
-    RegisterSensor(53, 0, b"wheel1"),
-    RegisterSensor(53, 1, b"wheel2"),
-    RegisterSensor(53, 2, b"wheel3"),
-    RegisterSensor(53, 3, b"wheel4"),
-    RegisterSensor(46, 4, b"slider_curb_lf"),
-    RegisterSensor(46, 5, b"slider_curb_lf2"),
-    RegisterSensor(37, 6, b"dist_c"),
-    RegisterSensor(37, 7, b"dist_ir_c"),
-    RegisterSensor(37, 8, b"inf_left"),
-    RegisterSensor(37, 9, b"inf_cent"),
-    RegisterSensor(37, 10, b"inf_right"),
-    RegisterSensor(37, 11, b"curb_lf"),
-]
+RECORDED = (
+    *(Device(f"wheel{number + 1}", number, "rotational") for number in range(4)),
+    Device("slider_curb_lf", 4, "linear"),
+    Device("slider_curb_lf2", 5, "linear"),
+    *(
+        Device(name, 6 + at, "distance")
+        for at, name in enumerate(("dist_c", "dist_ir_c", "inf_left", "inf_cent", "inf_right", "curb_lf"))
+    ),
+)
+REGISTRATIONS = [RegisterSensor(NODE_TYPES[each.kind], each.number, each.name.encode()) for each in RECORDED]
 VALUES = {6: 1000.0, 7: 750.5, 8: 123.456, 9: 0.0, 10: -1.0, 11: 0.001}
 ROUND = [SensorData(37, number, value) for number, value in VALUES.items()]
 ROUNDS = 20
 READINGS = ROUND * ROUNDS + [SensorData(37, 6, 1000.0)]
-
-
-def delivered(session: ExternalRole, data: bytes) -> list[Wc2EcMessage]:
-    session.open(0.0)
-    messages = session.receive(data, 0.0)
-    assert session.traffic.malformed == 0
-    return messages
 
 
 def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
@@ -49,60 +39,32 @@ def told(robot: Wc2EcRobot) -> list[tuple[Topic, FleetMessage]]:
     session.open(0.0)
     telemetry: list[tuple[Topic, FleetMessage]] = []
     for record in payloads(NAME, source=PORT):
+        assert (session.state is State.ESTABLISHED) == (record.seconds > 0.0220 or session.traffic.frames_in > 12)
         for message in session.receive(record.payload, record.seconds):
             telemetry += robot.telemetry(message, BEGAN_NS + round(record.seconds * 1e9))
     assert (session.state, session.traffic.malformed) == (State.ESTABLISHED, 0)
     return telemetry
 
 
-def test_the_recorded_session_gives_the_registrations_and_the_readings() -> None:
-    messages = delivered(ExternalRole(Dialect.DEPLOYED), stream(NAME, source=PORT))
-    assert messages[:12] == REGISTRATIONS
-    assert messages[12:] == READINGS
-    assert len(messages) == 133
-
-
 def test_what_is_read_as_external_controller_is_written_as_controller_to_the_same_bytes() -> None:
-    recorded = stream(NAME, source=PORT)
-    writer, written = ControllerRole(Dialect.DEPLOYED), b""
+    reader, writer, written = ExternalRole(Dialect.DEPLOYED), ControllerRole(Dialect.DEPLOYED), b""
+    reader.open(0.0)
     writer.open(0.0)
-    for message in delivered(ExternalRole(Dialect.DEPLOYED), recorded):
+    recorded = stream(NAME, source=PORT)
+    messages = reader.receive(recorded, 0.0)
+    assert messages == [*REGISTRATIONS, *READINGS]
+    assert (len(messages), reader.traffic.malformed) == (133, 0)
+    for message in messages:
         writer.send(message)
         written += writer.outgoing(0.0) or b""
     assert written == recorded
-
-
-def test_the_recorded_controller_is_established_with_its_first_data() -> None:
-    session = ExternalRole(Dialect.DEPLOYED)
-    session.open(0.0)
-    for record in payloads(NAME, source=PORT):
-        assert (session.state is State.ESTABLISHED) == (record.seconds > 0.0220 or session.traffic.frames_in > 12)
-        session.receive(record.payload, record.seconds)
-        if record.seconds <= 0.0018:
-            assert session.state is State.HANDSHAKING
-
-
-def test_the_recorded_external_controller_sent_nothing() -> None:
-    assert stream(NAME, destination=PORT) == b""
+    assert stream(NAME, destination=PORT) == b"", "the recorded external controller sent nothing"
 
 
 def test_the_recorded_devices_are_the_device_table() -> None:
     tables = [message for topic, message in told(Wc2EcRobot(Options())) if topic is topics.DEVICES]
     assert isinstance(tables[-1], Devices)
-    assert tables[-1].devices == (
-        Device("wheel1", 0, "rotational"),
-        Device("wheel2", 1, "rotational"),
-        Device("wheel3", 2, "rotational"),
-        Device("wheel4", 3, "rotational"),
-        Device("slider_curb_lf", 4, "linear"),
-        Device("slider_curb_lf2", 5, "linear"),
-        Device("dist_c", 6, "distance"),
-        Device("dist_ir_c", 7, "distance"),
-        Device("inf_left", 8, "distance"),
-        Device("inf_cent", 9, "distance"),
-        Device("inf_right", 10, "distance"),
-        Device("curb_lf", 11, "distance"),
-    )
+    assert tables[-1].devices == RECORDED
     assert tables[-1].stamp_ns == BEGAN_NS + 1_800_000
 
 

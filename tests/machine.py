@@ -2,12 +2,15 @@
 
 import contextlib
 import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 _STEAL = 8
 """The place of it in the first line of ``/proc/stat``."""
+_PUT_OFF = 5
+"""How many times the limit a wait may be put off by."""
 
 
 class Withheld:
@@ -36,6 +39,19 @@ def contended_s() -> float:
     with contextlib.suppress(OSError, ValueError, IndexError), open("/proc/pressure/cpu") as file:
         return int(file.readline().rpartition("total=")[2]) / 1e6
     return 0.0
+
+
+class Patience:
+    """The longest wait for something, put off by what a busy machine withheld; on an idle one it is ``limit_s``."""
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s, self._began, self._contended = limit_s, time.monotonic(), contended_s()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has waited long enough; at most :data:`_PUT_OFF` times the limit more."""
+        late_s = time.monotonic() - self._began - self._limit_s
+        return late_s >= 0 and late_s >= min(contended_s() - self._contended, _PUT_OFF * self._limit_s)
 
 
 def _waited_s(pid: int) -> float:

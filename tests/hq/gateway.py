@@ -1,0 +1,100 @@
+"""The robot's end of the bus in scenes of HQ programs. Times are made up."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from tests.proofs import numbered
+from zbridge.bus.fake import FakeBus
+from zbridge.bus.interface import Handle, IncomingQuery, Sample
+from zbridge.control.authority import Authority
+from zbridge.control.proof import read
+from zbridge.errors import Refused
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.topics import KeySpace
+from zbridge.hq.intent import LEASE_S
+
+KEYS = KeySpace("fleet", "r1")
+
+
+class Clock(Protocol):
+    """A scene that says what time it is."""
+
+    @property
+    def now(self) -> float: ...
+
+
+class Gateway:
+    """The robot's end of the bus: the lease as it is, and every command with what became of it."""
+
+    def __init__(self, bus: FakeBus, scene: Clock) -> None:
+        self.bus = bus
+        self.scene = scene
+        self.authority = Authority(LEASE_S, 2.0, numbered())
+        self.commands: list[tuple[str, FleetMessage]] = []
+        self.refused: list[str] = []
+        self.asked: list[str] = []
+        self.requests: list[Acquire] = []
+        self.control = bus.publisher(KEYS.key("control"), topics.CONTROL)
+        bus.subscribe(KEYS.key("@cmd/**"), self._take)
+        self.serving: list[Handle] = []
+        self.serve()
+        bus.watch_alive(KEYS.alive("*"), self._on_alive)
+
+    def serve(self) -> None:
+        rpc = ("acquire/*", "takeover/*", "renew", "release")
+        self.serving = [self.bus.answer(KEYS.key(f"@rpc/control/{name}"), self._decide) for name in rpc]
+
+    def vanish(self) -> None:
+        for handle in self.serving:
+            handle.close()
+
+    def _decide(self, question: IncomingQuery) -> None:
+        what, _, name = KEYS.path(question.key).removeprefix("@rpc/control/").partition("/")
+        self.asked.append(what)
+        now = self.scene.now
+        if what == "acquire":
+            self.requests.append(request := payloads.decode(Acquire, question.payload))
+            assert request.who.startswith(f"{name}."), "asked in the name of the listener"
+            lease = self.authority.acquire(request, now)
+        else:
+            decide = self.authority.renew if what == "renew" else self.authority.release
+            lease = decide(read(question.payload), question.asked, now)
+        question.answer(payloads.encode(lease))
+
+    def _take(self, sample: Sample) -> None:
+        topic = topics.find(KEYS.path(sample.key))
+        assert topic is not None
+        message = payloads.decode(topic.message, sample.payload)
+        if isinstance(message, Drive | Motor | Mode | Raw):
+            who = None
+            try:
+                who = self.authority.admit(sample.attachment, sample.key, sample.payload, self.scene.now)
+                moving = isinstance(message, Drive | Motor) and message.moving
+                if moving:
+                    self.authority.require_motion()
+                if isinstance(message, Drive | Motor):
+                    self.authority.applied(topic.path, self.scene.now, moving=moving)
+            except Refused as refusal:
+                self.refused.append(str(refusal))
+                command = topic.path.removeprefix("@cmd/")
+                self.authority.refuse(command, refusal, refusal.who or who)
+                return
+        else:
+            assert sample.attachment is None
+        self.commands.append((topic.path.removeprefix("@cmd/"), message))
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        if not alive:
+            self.authority.vanished(key.removeprefix(KEYS.alive("")))
+
+    def report(self) -> Control:
+        self.authority.expire(self.scene.now)
+        return self.authority.report(self.scene.now)
+
+    def taken(self) -> list[tuple[str, FleetMessage]]:
+        """What was carried out since the last call."""
+        commands, self.commands = self.commands, []
+        return commands

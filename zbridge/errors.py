@@ -19,8 +19,19 @@ ZbridgeError
 
 from __future__ import annotations
 
+import traceback
 from enum import StrEnum
 from typing import ClassVar
+
+FAULT = "a fault of the protocol: "
+"""Begins the reason where the code of a protocol raised what it must not."""
+
+
+def describe(error: BaseException) -> str:
+    """Say what was raised, and in which line: ``KeyError: 1 (session.py:36)``."""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{where}"
 
 
 class Code(StrEnum):

@@ -2083,3 +2083,34 @@ async def test_a_gateway_that_ends_leaves_the_robots_keys_to_others_and_writes_n
 
 async def test_a_device_prints_its_robot_and_state(rig: Rig) -> None:
     assert repr(rig.device) == "<Device r1 established>"
+
+
+# Faults of the protocol's own code
+
+
+@pytest.mark.parametrize(("name", "fields"), [("drive", DRIVE_LEFT), ("light", {"on": True})])
+async def test_a_fault_of_the_protocol_in_a_command_is_a_refusal_and_is_logged_once(
+    rig: Rig, name: str, fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def command(*arguments: object) -> None:
+        raise KeyError(1)
+
+    monkeypatch.setattr(TcpUdpRobot, "command", command)
+    for _ in range(3):
+        rig.command(name, fields)
+    ((refused, reason, count),) = await rig.refusals()
+    assert (refused, count) == (name, 3)
+    assert re.fullmatch(r"a fault of the protocol: KeyError: 1 \(test_device.py:\d+\)", reason)
+    assert rig.last("control")["refusals"][0]["code"] == "unsupported"
+    assert len([record for record in caplog.records if record.exc_info]) == 1
+
+
+async def test_a_fault_of_the_translation_is_the_reason_of_the_end(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def translator(self: TcpUdpRobot, kind: type) -> None:
+        raise KeyError(1)
+
+    monkeypatch.setattr(TcpUdpRobot, "translator", translator)
+    rig.sends(POSITION)
+    await rig.settle()
+    assert rig.last("status")["state"] == "offline"
+    assert rig.last("status")["reason"].startswith("a fault of the protocol: KeyError: 1 (test_device.py:")

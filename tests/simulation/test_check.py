@@ -23,6 +23,7 @@ from zbridge.simulation import check as kit
 from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages, example
 from zbridge.simulation.check_motion import check_motion
+from zbridge.simulation.check_plugin import check_plugin
 from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
 from zbridge.simulation.check_stage import Recording, record
@@ -341,7 +342,7 @@ def test_a_simulation_that_cannot_start_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         raise ConfigError("no")
 
-    (*_, last) = kit.check(broken(simulate=simulate))
+    (*_, last) = kit.check(broken(simulate=simulate), "toy")
     assert (last.claim, last.problem is not None and "ConfigError: no" in last.problem) == (ESTABLISHED, True)
 
 
@@ -359,7 +360,7 @@ def test_the_whole_check_passes_for_a_sound_protocol(monkeypatch, capsys) -> Non
 def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsys) -> None:
     findings = [Finding("one"), Finding("two", "it does not"), Finding.of("three", ["a", "b", "c", "d"], "tried")]
     monkeypatch.setattr(kit, "find_protocol", lambda name: TOY)
-    monkeypatch.setattr(kit, "check", lambda protocol: findings)
+    monkeypatch.setattr(kit, "check", lambda protocol, name: findings)
     assert kit.main(["toy"]) == 1
     assert capsys.readouterr().out.splitlines() == [
         *("ok    one", "FAIL  two", "      it does not"),
@@ -372,3 +373,86 @@ def test_a_protocol_that_is_not_installed_is_a_clear_error(capsys: pytest.Captur
     assert "expected one of" in capsys.readouterr().err
     assert kit.main([]) == 2
     assert "usage" in capsys.readouterr().err
+    assert kit.main(["--help"]) == 0
+    assert "NAME" in capsys.readouterr().out
+
+
+# The protocol object
+
+
+class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a robot that knows its full scale."""
+
+    speed_full_m_s: float = 1.0
+    turn_full_rad_s: float = 1.0
+
+
+def test_a_sound_protocol_object_passes() -> None:
+    assert failed(check_plugin(TOY, "toy")) == {}
+
+
+@pytest.mark.parametrize(
+    ("protocol", "name", "problem"),
+    [
+        (TOY, "toys", "the entry point is 'toys', Protocol.name is 'toy'"),
+        (broken(template=""), "toy", "it has no table [device]"),
+        (broken(template=toy.TEMPLATE.replace("toy", "tom")), "toy", "its protocol is 'tom', not 'toy'"),
+        (broken(template='[device]\nprotocol = "toy"\n'), "toy", "it has no connect"),
+        (broken(template=toy.TEMPLATE + "[device.options]\nx = 1\n"), "toy", "unknown field `x`"),
+        (with_session(role=None), "toy", "role is None, not Role.HQ"),
+        (with_session(version=property(lambda self: 1 / 0)), "toy", "Error"),
+    ],
+)
+def test_a_broken_protocol_object_is_found(protocol: Protocol, name: str, problem: str) -> None:
+    (found,) = failed(check_plugin(protocol, name)).values()
+    assert problem in found
+
+
+def test_requests_without_an_answer_are_found(heard: Recording) -> None:
+    claims = failed(check_sessions(TOY, msgspec.structs.replace(heard, unanswered=3)))
+    assert "3 had no answer" in claims["the simulated robot answers every request"]
+
+
+def test_a_stamp_that_was_not_given_is_found(heard: Recording) -> None:
+    def at(self: Robot, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
+        return toy.ToyRobot._at(self, message, 0)
+
+    assert "pose has the stamp 0, given was" in str(failed(check_sessions(with_robot(_at=at), heard)))
+
+
+def test_a_stop_that_is_not_repeated_is_found(heard: Recording) -> None:
+    def stop(self: Any, now: float, until: float) -> None:
+        self._session.outbox.set("motion", (b"go 0.000000 0.000000\n",), now, urgent=True)
+
+    assert "a stop is repeated until its time is over" in failed(check_stop(with_robot(stop=stop), heard))
+
+
+def test_a_stop_that_waits_for_what_was_queued_is_found(heard: Recording) -> None:
+    def stop(self: Any, now: float, until: float) -> None:
+        self._session.outbox.set("motion", (b"go 0.000000 0.000000\n",), now, period_s=0.1, until=until)
+
+    problem, *_ = failed(check_stop(with_robot(stop=stop), heard)).values()
+    assert "b'what waits' is written before the stop" in problem
+
+
+def test_a_drive_at_full_scale_that_raises_is_found(heard: Recording) -> None:
+    def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
+        assert forward + turn < 2, 1 / 0
+        toy.ToyRobot._go(self, forward, turn, now, **more)
+
+    (problem,) = failed(check_commands(with_robot(_go=go), heard)).values()
+    assert "ZeroDivisionError" in problem
+    assert "test_check.py:" in problem
+
+
+def test_ways_and_turns_that_are_not_what_the_options_say_are_found() -> None:
+    assert failed(check_motion(broken(options=Sized), 5.0)) == {}
+    protocol = broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0})
+    drives, turns = failed(check_motion(protocol, 5.0)).values()
+    assert "m, but the options say" in drives
+    assert "rad, but the options say" in turns
+
+
+def test_a_session_that_raises_when_it_opens_is_found_with_the_place() -> None:
+    recording = asyncio.run(record(with_session(opened=lambda self, now: {}[1]), 5.0))
+    assert "KeyError: 1 (test_check.py:" in (recording.reason or "")

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import re
 
 import pytest
 
@@ -286,3 +287,33 @@ async def test_a_timer_that_does_not_tell_when_it_is_due_is_replaced(up: Rig, mo
     up.session.send(b"three")
     up.conversation.pump()
     assert up.session.state is State.ESTABLISHED
+
+
+# Faults of the protocol's own code
+
+
+def raises(*arguments: object) -> None:
+    raise KeyError(1)
+
+
+FAULT = r"a fault of the protocol: KeyError: 1 \(test_conversation.py:\d+\)"
+
+
+@pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "_deliver"])
+async def test_a_fault_of_the_protocol_ends_the_session_and_its_link_with_the_place(
+    method: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = Rig()
+    owner: object = rig.conversation if method.startswith("_") else rig.session
+    monkeypatch.setattr(owner, method, raises)
+    if method == "on_timer":
+        monkeypatch.setattr(rig.session, "timers", lambda: 1.0)
+    rig.conversation.attached(rig.link)
+    await asyncio.sleep(1.1)
+    rig.conversation.received(WELCOME + b"\x01a")
+    assert rig.conversation.ended.done()
+    assert rig.link.closed
+    assert re.fullmatch(FAULT, rig.session.reason or "")
+    (record,) = caplog.records
+    assert record.exc_info is not None
+    assert re.search(FAULT, record.getMessage())

@@ -228,3 +228,11 @@ def test_a_message_of_fixed_width_can_be_big_endian() -> None:
     codec = BinaryCodec(BigEndian)
     assert codec.encode(BigEndian(-200, 500)) == bytes.fromhex("ff38 01f4")
     assert codec.decode(bytes.fromhex("ff38 01f4"), 0) == BigEndian(-200, 500)
+
+
+def test_fields_that_cannot_be_given_by_position_are_refused() -> None:
+    class ByName(Message, frozen=True, kw_only=True):
+        value: U8
+
+    with pytest.raises(TypeError, match="ByName: fields are given by position"):
+        BinaryCodec(ByName)

@@ -1,8 +1,9 @@
 """The conformance kit: ``python -m zbridge.simulation.check NAME`` checks an installed protocol.
 
 It prints one line for each thing that holds or does not, and exits with 0 where all hold and with 1 otherwise. The
-checks are in ``check_messages`` (what is read and written), ``check_sessions`` (handshake, garbage, silence, end),
-``check_commands`` (stop, commands) and ``check_motion`` (the simulated robot drives and stands). Knows no protocol.
+checks are in ``check_plugin`` (name, template), ``check_messages`` (what is read and written), ``check_sessions``
+(handshake, garbage, silence, end), ``check_commands`` (stop, commands) and ``check_motion`` (the simulated robot drives
+and stands). Knows no protocol.
 """
 
 from __future__ import annotations
@@ -17,16 +18,19 @@ from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.simulation.check_commands import check_commands, check_stop
 from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
+from zbridge.simulation.check_plugin import check_plugin
 from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
 from zbridge.simulation.check_stage import Recording, record
 
+USAGE = "usage: python -m zbridge.simulation.check NAME\n"
 ESTABLISH_S = 10.0
 """Seconds that a session with the simulated robot has to be established."""
 
 
-def check(protocol: Protocol, *, establish_s: float = ESTABLISH_S) -> Iterator[Finding]:
-    """Check a protocol; yield what holds and what does not, in the order of the checks."""
+def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) -> Iterator[Finding]:
+    """Check a protocol, installed as ``name``; yield what holds and what does not, in the order of the checks."""
+    yield from check_plugin(protocol, name)
     yield from check_messages(protocol)
     recording = Recording()
     try:
@@ -44,8 +48,11 @@ def check(protocol: Protocol, *, establish_s: float = ESTABLISH_S) -> Iterator[F
 
 def main(arguments: list[str]) -> int:
     """Check the protocol that the command line names; give the exit status."""
-    if len(arguments) != 1:
-        sys.stderr.write("usage: python -m zbridge.simulation.check NAME\n")
+    if arguments in (["--help"], ["-h"]):
+        sys.stdout.write(f"{USAGE}\n{__doc__}")
+        return 0
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        sys.stderr.write(USAGE)
         return 2
     try:
         protocol = find_protocol(arguments[0])
@@ -53,7 +60,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write(f"{error}\n")
         return 2
     failed = held = 0
-    for finding in check(protocol):
+    for finding in check(protocol, arguments[0]):
         failed, held = failed + (finding.problem is not None), held + (finding.problem is None)
         sys.stdout.write(f"{finding}\n")
         sys.stdout.flush()

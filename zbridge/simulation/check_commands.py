@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
-from zbridge.errors import EncodeError, Refused
+from zbridge.errors import EncodeError, Refused, describe
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, SensorSetting, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
 from zbridge.simulation.check_report import Finding
-from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
+from zbridge.simulation.check_stage import STEP_S, Recording, Rehearsal, robot_of
 
 STOP_S = 0.5
 """Seconds for which the stop is repeated."""
 WATCHED_S = 0.4
 """Virtual seconds in which a command has to have an effect."""
+LATE_S = 0.1
+WAITING = b"what waits"
 MORE_FRAMES = 20
 """Frames of the robot after the handshake."""
 
@@ -29,6 +33,11 @@ def check_stop(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
     try:
         yield Finding.of(claim, _stop(protocol, recording))
     except Exception as error:  # whatever the protocol's own code raises is a finding
+        yield Finding.broken(claim, error)
+    claim = "a stop is repeated until its time is over"
+    try:
+        yield Finding(claim, _repeated(protocol, recording))
+    except Exception as error:
         yield Finding.broken(claim, error)
     claim = "a stop before the first connection is refused or ignored"
     try:
@@ -53,15 +62,41 @@ def _stop(protocol: Protocol, recording: Recording) -> list[str]:
     motion = set(driven.run(WATCHED_S)) - idle - stop
     if not motion:
         return ["a drive writes nothing that a stop does not write: nothing can be told from it"]
+    return [problem for taken in (0, 1) for problem in _crowded(_crowd(protocol, recording, idle, taken), stop, motion)]
+
+
+def _crowd(protocol: Protocol, recording: Recording, idle: set[bytes], taken: int) -> Rehearsal:
+    """Let commands, a request and polls wait. taken: how many are written then, as slots and the queue take turns."""
     queued = _established(protocol, recording)
     for topic, commands in _commands(protocol):
         for command in commands if topic is not topics.CMD_MODE else ():
             _give(queued, topic, command)
     _give(queued, topics.CMD_DRIVE, FORWARD)
+    for _ in range(2):
+        queued.session.outbox.put(next(iter(idle), WAITING))
+    queued.now += LATE_S  # a poll is due too
+    for _ in range(taken):
+        queued.session.outgoing(queued.now)
+        queued.session.outbox.written(queued.now)
+    return queued
+
+
+def _crowded(queued: Rehearsal, stop: set[bytes], motion: set[bytes]) -> list[str]:
     queued.robot.stop(queued.now, queued.now + STOP_S)
     first, *later = queued.run(WATCHED_S) or [b""]
     problems = [] if first in stop else [f"{first!r} is written before the stop"]
     return problems + [f"{frame!r} moves the robot after its stop" for frame in later if frame in motion]
+
+
+def _repeated(protocol: Protocol, recording: Recording) -> str | None:
+    standing, stopped = _established(protocol, recording), _established(protocol, recording)
+    idle = set(standing.run(WATCHED_S))
+    standing.robot.stop(standing.now, standing.now)
+    stop = set(standing.run(WATCHED_S)) - idle
+    stopped.robot.stop(stopped.now, stopped.now + STOP_S)
+    stopped.run(STOP_S / 2)
+    again = stop.intersection(stopped.run(STOP_S / 2))
+    return None if again or not stop else f"it is not written again in the second half of {STOP_S:g} s"
 
 
 def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
@@ -76,7 +111,22 @@ def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding
             continue
         silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
         yield Finding(claim, silent, next(filter(None, results), ""))
+    yield _corners(protocol, recording)
     yield from (_question(protocol, recording, topic) for topic in (topics.MAP, topics.POSE))
+
+
+def _corners(protocol: Protocol, recording: Recording) -> Finding:
+    claim, problems = "drives at full scale are carried out or refused", []
+    for forward, left, turn in itertools.product((-1.0, 0.0, 1.0), repeat=3):
+        drive = Drive(forward=forward, left=left, turn=turn)
+        try:
+            rehearsal = _established(protocol, recording)
+            with contextlib.suppress(Refused):
+                rehearsal.robot.command(topics.CMD_DRIVE, drive, rehearsal.now)
+            rehearsal.run(STEP_S)
+        except Exception as error:
+            problems.append(f"{drive}: {describe(error)}")
+    return Finding.of(claim, problems)
 
 
 def _commands(protocol: Protocol) -> tuple[tuple[Topic, tuple[FleetMessage, ...]], ...]:

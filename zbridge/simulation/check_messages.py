@@ -10,10 +10,10 @@ from typing import Annotated, Any, get_args, get_origin
 import msgspec
 import numpy as np
 
-from zbridge.errors import EncodeError, ProtocolError
+from zbridge.errors import EncodeError, ProtocolError, describe
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_report import Finding
 from zbridge.wire import Whole
 from zbridge.wire.frames import FrameBuffer
 
@@ -83,7 +83,7 @@ def _frames(codec: Codec, messages: list[Any], problems: list[str]) -> list[byte
             elif codec.write(again) != frame:
                 problems.append(f"{message} is written as {frame!r}, and as {codec.write(again)!r} once read")
         except Exception as error:  # whatever the protocol's own code raises is a finding
-            problems.append(f"{message}: {raised(error)}")
+            problems.append(f"{message}: {describe(error)}")
     return frames
 
 
@@ -114,7 +114,7 @@ def _try(problems: list[str], what: str, cut: Callable[[], list[bytes]], expecte
     try:
         found = cut()
     except Exception as error:
-        problems.append(f"{what}: {raised(error)}")
+        problems.append(f"{what}: {describe(error)}")
         return
     if found != expected:
         problems.append(f"{what} is cut to {found!r}, expected {expected!r}")
@@ -146,7 +146,7 @@ def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
         except ProtocolError:
             pass
         except Exception as error:
-            problems.setdefault(raised(error), f"{stream!r}: {raised(error)}")
+            problems.setdefault(describe(error), f"{stream!r}: {describe(error)}")
     return list(problems.values())
 
 

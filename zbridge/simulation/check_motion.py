@@ -7,6 +7,8 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 
+import msgspec
+
 from zbridge.errors import Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motion, Pose
@@ -21,6 +23,9 @@ STAND_S = 0.7
 """Seconds after a stop in which the robot has to come to rest."""
 WATCHED_S = 1.2
 TURN_S = 0.6
+FORWARD, TURN = 0.4, 0.5
+FACTOR = 3.0
+"""A way or a turn is at most so much more, or less, than the options say."""
 TURNED_RAD = 0.02
 MOVED_M = 0.02
 MOVING = 0.05
@@ -44,33 +49,56 @@ async def _drive_and_stop(protocol: Protocol, establish_s: float) -> list[Findin
         with contextlib.suppress(Refused):  # where a mode is needed or known
             scene.robot.command(topics.CMD_MODE, Mode(mode="manual"), clock())
         idle = await _watch(scene, IDLE_S)
+        begun = clock()
         for _ in range(round(DRIVE_S / AGAIN_S)):
-            scene.robot.command(topics.CMD_DRIVE, Drive(forward=0.4), clock())
+            scene.robot.command(topics.CMD_DRIVE, Drive(forward=FORWARD), clock())
             await _watch(scene, AGAIN_S, keep=True)
         drive = _Seen(scene)
+        expected_m = _full(protocol, "speed_full_m_s") * FORWARD * (clock() - begun)
         scene.robot.stop(clock(), clock() + STAND_S / 2)
         stop = await _watch(scene, STAND_S)
         stand = await _watch(scene, WATCHED_S)
-        return [drive.moves(idle), stand.stands(stop, drive), await _turn(scene, clock)]
+        return [
+            drive.moves(idle, expected_m),
+            stand.stands(stop, drive),
+            await _turn(scene, clock, _full(protocol, "turn_full_rad_s")),
+        ]
 
 
-async def _turn(scene: Live, clock: Callable[[], float]) -> Finding:
-    """Turn to the left where the robot shows its heading."""
+async def _turn(scene: Live, clock: Callable[[], float], full_rad_s: float) -> Finding:
+    """Turn to the left where the robot shows its heading; ``full_rad_s`` as in the options, 0 if unknown."""
     claim = "a turn of the simulated robot is counter-clockwise"
     before = _Seen(scene).poses
     if not before:
         return Finding(claim, None, "not checked: it shows no pose")
+    begun = clock()
     for _ in range(round(TURN_S / AGAIN_S)):
         try:
-            scene.robot.command(topics.CMD_DRIVE, Drive(turn=0.5), clock())
+            scene.robot.command(topics.CMD_DRIVE, Drive(turn=TURN), clock())
         except Refused as refusal:
             return Finding(claim, None, refusal.code)
         await _watch(scene, AGAIN_S)
     after = _Seen(scene).poses
+    expected_rad = full_rad_s * TURN * (clock() - begun)
     scene.robot.stop(clock(), clock() + STAND_S / 2)
     await _watch(scene, STAND_S / 2)
     turned = math.remainder(after[-1].heading - before[-1].heading, 2 * math.pi) if after else 0.0
-    return Finding(claim, None if turned > TURNED_RAD else f"its heading changed by {turned:.3f} rad")
+    if turned < TURNED_RAD:
+        return Finding(claim, f"its heading changed by {turned:.3f} rad")
+    return Finding(claim, _unlike(turned, expected_rad, "rad"))
+
+
+def _full(protocol: Protocol, option: str) -> float:
+    """Give what the options say of full scale; 0 where they do not."""
+    value = getattr(msgspec.convert(protocol.simulated, protocol.options), option, 0.0)
+    return value if isinstance(value, float) else 0.0
+
+
+def _unlike(seen: float, expected: float, unit: str) -> str | None:
+    """Tell whether a way or a turn is not what the options promise; ``expected`` 0: they promise nothing."""
+    if not expected or expected / FACTOR <= seen <= expected * FACTOR:
+        return None
+    return f"{seen:.3f} {unit}, but the options say {expected:.3f} {unit}"
 
 
 async def _watch(scene: Live, seconds: float, *, keep: bool = False) -> _Seen:
@@ -100,7 +128,7 @@ class _Seen:
         first, last = self.poses[0], self.poses[-1]
         return (last.x - first.x) * math.cos(first.heading) + (last.y - first.y) * math.sin(first.heading)
 
-    def moves(self, idle: _Seen) -> Finding:
+    def moves(self, idle: _Seen, expected_m: float) -> Finding:
         """Tell whether it moved, or at least was told so."""
         claim = "the simulated robot drives"
         if not self.poses and not self.speeds:
@@ -108,6 +136,8 @@ class _Seen:
             return Finding(claim, None if told else "nothing is written for a drive", "seen on the wire only")
         if self.poses and self.way_m < MOVED_M:
             return Finding(claim, f"it moved {self.way_m:.3f} m ahead in {DRIVE_S:g} s")
+        if self.poses and (unlike := _unlike(self.way_m, expected_m, "m")):
+            return Finding(claim, unlike)
         if self.speeds and max(map(abs, self.speeds)) < MOVING:
             return Finding(claim, f"it shows a speed of {max(map(abs, self.speeds)):g}")
         return Finding(claim, None, f"{self.way_m:.2f} m" if self.poses else "by its speed")

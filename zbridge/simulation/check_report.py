@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import traceback
-
 import msgspec
+
+from zbridge.errors import describe
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -25,20 +25,13 @@ class Finding(msgspec.Struct, frozen=True):
     @classmethod
     def broken(cls, claim: str, error: BaseException) -> Finding:
         """Make the finding of a claim whose check ended with an exception."""
-        return cls(claim, raised(error))
+        return cls(claim, describe(error))
 
     def __str__(self) -> str:
         note = f" ({self.note})" if self.note else ""
         return (
             f"ok    {self.claim}{note}" if self.problem is None else f"FAIL  {self.claim}{note}\n      {self.problem}"
         )
-
-
-def raised(error: BaseException) -> str:
-    """Say what was raised, and where."""
-    frames = traceback.extract_tb(error.__traceback__)
-    where = f" at {frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno}" if frames else ""
-    return f"{type(error).__name__}: {error}{where}"
 
 
 _SHOWN = 3

@@ -5,17 +5,19 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import ProtocolError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding, raised
+from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
 
 STEPS = 12
 """Steps of a long handshake at which something goes wrong."""
 SEEDS = 4
 GARBAGE_BYTES = 80
+STAMP_NS, STAMP_WITHIN_NS = 10**18, 10**10
+"""When the robot's messages come, and how far a stamp may be from it: a robot may have a clock of its own."""
 
 
 def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
@@ -26,6 +28,9 @@ def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding
     yield Finding.of(
         f"{len(recording.messages)} messages of the robot are translated", _translated(protocol, recording)
     )
+    count = recording.unanswered
+    without = f"{count} had no answer in time: see expects, answers and frame_end" if count else None
+    yield Finding("the simulated robot answers every request", without)
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
@@ -60,7 +65,7 @@ def _at(
             for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield f"after {step} frames: {raised(error)}"
+        yield f"after {step} frames: {describe(error)}"
 
 
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -98,12 +103,15 @@ def _translated(protocol: Protocol, recording: Recording) -> list[str]:
         robot.session(name, "tcp://robot.test:1")
     if not recording.messages:
         problems.append("the simulated robot sent none")
-    for message in recording.messages:
+    for stamp_ns, message in enumerate(recording.messages, STAMP_NS):
         try:
-            for topic, shown in robot.telemetry(message, 1):
+            for topic, shown in robot.telemetry(message, stamp_ns):
                 payloads.decode(topic.message, payloads.encode(shown))
+                stamped = getattr(shown, "stamp_ns", None)
+                if stamped is not None and abs(stamped - stamp_ns) > STAMP_WITHIN_NS:
+                    problems.append(f"{topic.path} has the stamp {stamped}, given was {stamp_ns}")
         except ProtocolError:
             continue
         except Exception as error:
-            problems.append(f"{message}: {raised(error)}")
+            problems.append(f"{message}: {describe(error)}")
     return problems

@@ -43,6 +43,7 @@ class Recording(msgspec.Struct):
     messages: list[Any] = []
     established: bool = False
     reason: str | None = None
+    unanswered: int = 0
 
 
 def robot_of(protocol: Protocol) -> Robot:
@@ -136,6 +137,7 @@ async def record(protocol: Protocol, establish_s: float) -> Recording:
             list(scene.messages),
             established,
             None if established else f"{'; '.join(reasons)} after {establish_s:g} s",
+            sum(session.traffic.unanswered for session in scene.sessions),
         )
 
 

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable
 from typing import Any
 
-from zbridge.errors import Refused
+from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.link import STALLED_S, Link, Receiver
@@ -81,18 +81,27 @@ class Conversation:
         """Begin: the link is up."""
         self._link = link
         self.session.peer = link.peer
-        self.session.open(self._clock())
-        self.pump()
+        try:
+            self.session.open(self._clock())
+            self.pump()
+        except Exception as error:  # of the protocol's own code
+            self._fault(error)
 
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        session = self.session
-        messages = session.receive(data, self._clock())
-        self._hand_on(messages)
+        try:
+            self._hand_on(self.session.receive(data, self._clock()))
+            self.pump()
+        except Exception as error:  # of the protocol's own code
+            self._fault(error)
 
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        self._hand_on(self.session.receive_datagram(datagram, self._clock()))
+        try:
+            self._hand_on(self.session.receive_datagram(datagram, self._clock()))
+            self.pump()
+        except Exception as error:  # of the protocol's own code
+            self._fault(error)
 
     def claims(self, datagram: bytes, port: int) -> bool:
         """Ask the session whether this datagram is from its peer."""
@@ -119,14 +128,19 @@ class Conversation:
         self._foreign.value += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
-        session = self.session
-        if not session.over:
+        if not self.session.over:
             self._notify()
         if messages:  # the messages before the end of a session are delivered before the end is reported
             self._deliver(messages)
-        if session.traffic.malformed != self._malformed_logged:
+        if self.session.traffic.malformed != self._malformed_logged:
             self._report_malformed()
-        self.pump()
+
+    def _fault(self, error: Exception) -> None:
+        """End the session, and show where the code of its protocol is wrong."""
+        log.error("%s: %s%s", self.session.name, FAULT, describe(error), exc_info=error)
+        self.session.fail(f"{FAULT}{describe(error)}")
+        self._end()
+        self._notify()
 
     def lost(self, reason: str) -> None:
         """End: the link is gone."""
@@ -205,8 +219,11 @@ class Conversation:
 
     def _tick(self) -> None:
         self._timer = None
-        self.session.expire(self._clock())
-        self.pump()
+        try:
+            self.session.expire(self._clock())
+            self.pump()
+        except Exception as error:  # of the protocol's own code
+            self._fault(error)
 
     def _takes(self, link: Link) -> bool:
         """True if the link is not stalled. A stall ends when the last byte is acknowledged."""

@@ -44,6 +44,8 @@ class BinaryCodec(Generic[M]):
     def __init__(self, message: type[M]) -> None:
         self.message = message
         fields = declared_fields(message)
+        if message.__match_args__ != message.__struct_fields__:
+            raise TypeError(f"{message.__name__}: fields are given by position, so kw_only is not possible")
         widths = [struct.calcsize("<" + field.wire.code) for field in fields if isinstance(field.wire, Scalar)]
         self.fixed_size = sum(widths)
         """Bytes of the fields of fixed width."""

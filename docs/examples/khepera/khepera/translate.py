@@ -70,8 +70,7 @@ class KheperaRobot(protocol.Robot):
 
     def command(self, topic: Topic, command: FleetMessage, now: float) -> protocol.Outcome:
         if isinstance(command, Drive):
-            left_m_s, right_m_s = self.options.sides_m_s(command)
-            self._drive(SetSpeeds(_units(left_m_s), _units(right_m_s)), now, period_s=AGAIN_S)
+            self._drive(_speeds(*self.options.sides_m_s(command)), now, period_s=AGAIN_S)
             light, left_out = command.light, "left: it does not move sideways" if command.left else None
         elif topic is topics.CMD_LIGHT and isinstance(command, Switch):
             light, left_out = command.on, None
@@ -97,5 +96,6 @@ class KheperaRobot(protocol.Robot):
         return self._session
 
 
-def _units(speed_m_s: float) -> int:
-    return max(-MOST_UNITS, min(MOST_UNITS, round(speed_m_s / UNIT_M_S)))
+def _speeds(left_m_s: float, right_m_s: float) -> SetSpeeds:
+    unit_m_s = max(UNIT_M_S, abs(left_m_s) / MOST_UNITS, abs(right_m_s) / MOST_UNITS)  # both slower: the curve stays
+    return SetSpeeds(round(left_m_s / unit_m_s), round(right_m_s / unit_m_s))

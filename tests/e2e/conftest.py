@@ -75,11 +75,11 @@ def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
     )
 
 
-def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> str:
-    """End a process by its id, within 5 s unless the machine is busy; give what it printed."""
+def end(process: subprocess.Popen[str], number: int = signal.SIGTERM, within_s: float = 5.0) -> str:
+    """End a process by its id, within so many seconds unless the machine is busy; give what it printed."""
     if process.poll() is None:
         process.send_signal(number)
-    patience = Patience(5.0)
+    patience = Patience(within_s)
     while True:
         try:
             return process.communicate(timeout=0.2)[0]

@@ -12,7 +12,7 @@ import socket
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -37,6 +37,8 @@ from zbridge.text import shown
 REFRESH_S = 0.5
 START_S = 20.0
 """Longest time a simulator may take to start."""
+END_S = 3.0
+"""Longest time processes are given to end by themselves."""
 REALM = "fleet"
 FIGURE_S = 2.0
 """Seconds that the robots drive straight on, then turn, and so on."""
@@ -105,7 +107,7 @@ async def run_demo(seconds: float) -> None:
         bus, endpoint = await _router()
         stack.push_async_callback(bus.close)
         listeners = {robot: f"tcp://127.0.0.1:{_free_port()}" for robot in robots}
-        gateways = [
+        processes = [
             await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint, listeners[robot]))
             for robot, protocol in robots.items()
         ]
@@ -116,9 +118,9 @@ async def run_demo(seconds: float) -> None:
         for robot, protocol in robots.items():
             print(f"  {robot}: {_how_to_connect(find_protocol(protocol), listeners[robot])}")  # noqa: T201
         await until_signal(_show(bus, watch, seconds))
-        for gateway in gateways:  # all at once: each needs about a second to stop its robot
-            with contextlib.suppress(ProcessLookupError):
-                gateway.terminate()
+        simulators, gateways = zip(*processes, strict=True)
+        await _end(gateways)  # all at once: each needs about a second to stop its robot
+        await _end(simulators)
         silent = [robot for robot, row in watch.rows.items() if not row.heard]
         if seconds and silent:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
@@ -157,8 +159,8 @@ def _free_port() -> int:
 @contextlib.asynccontextmanager
 async def _robot(
     folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str, listener: str
-) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a simulator and its gateway with a listener, one process each; yield the gateway's."""
+) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.subprocess.Process]]:
+    """Run a simulator and its gateway with a listener; yield both processes."""
     found = find_protocol(protocol)
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
@@ -176,7 +178,7 @@ async def _robot(
             f'{serving}[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
         )
         async with _process(log, "run", str(file)) as gateway:
-            yield gateway
+            yield simulator, gateway
 
 
 def _inline(value: object) -> str:
@@ -201,14 +203,23 @@ async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> Async
     try:
         yield process
     finally:
+        await _end((process,))
+
+
+async def _end(processes: Sequence[asyncio.subprocess.Process]) -> None:
+    """End processes together; kill those that still run after :data:`END_S`."""
+    for process in processes:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
-        try:
-            async with asyncio.timeout(3.0):
-                await process.wait()
-        except TimeoutError:
-            process.kill()
-            await process.wait()
+    ended = asyncio.gather(*(process.wait() for process in processes))
+    try:
+        async with asyncio.timeout(END_S):
+            await asyncio.shield(ended)
+    except TimeoutError:
+        for process in processes:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+        await ended
 
 
 async def _show(bus: Bus, watch: Watch, seconds: float) -> None:

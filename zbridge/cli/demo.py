@@ -113,11 +113,12 @@ async def run_demo(seconds: float) -> None:
         ]
         for key_expr in ("*", "sensor/*"):
             bus.subscribe(f"{REALM}/*/{key_expr}", watch.take)
-        print(f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}")  # noqa: T201
-        print("HQ programs connect to the robots here; to simulate one:")  # noqa: T201
-        for robot, protocol in robots.items():
-            print(f"  {robot}: {_how_to_connect(find_protocol(protocol), listeners[robot])}")  # noqa: T201
-        await until_signal(_show(bus, watch, seconds))
+        how = [
+            f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}",
+            "HQ programs connect to the robots here; to simulate one:",
+            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in robots),
+        ]
+        await until_signal(_show(bus, watch, seconds, how))
         simulators, gateways = zip(*processes, strict=True)
         await _end(gateways)  # all at once: each needs about a second to stop its robot
         await _end(simulators)
@@ -222,8 +223,10 @@ async def _end(processes: Sequence[asyncio.subprocess.Process]) -> None:
         await ended
 
 
-async def _show(bus: Bus, watch: Watch, seconds: float) -> None:
-    """Draw the table, and drive each robot until somebody else does."""
+async def _show(bus: Bus, watch: Watch, seconds: float, how: list[str]) -> None:
+    """Say how to take part, draw the table, and drive each robot until somebody else does."""
+    for line in how:
+        print(line, flush=True)  # noqa: T201
     fleet = Fleet(bus, REALM)
     loop = asyncio.get_running_loop()
     started = loop.time()

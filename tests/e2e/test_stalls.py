@@ -14,10 +14,20 @@ from tests.e2e.loss import NotHereError, apart
 from tests.e2e.stalls import LIMIT_S, Case, measure
 
 STALLED = ("tcpudp-1.3", "alf", "wc2ec")
+ATTEMPTS = 3
+UNDRIVEN = "RuntimeError: the robot was never driven"
+"""A robot that is late itself, on a busy machine, may lose a packet of its handshake: nothing was disturbed yet."""
 
 
 def test_robots_that_stall_while_they_are_driven_are_at_rest_after_it() -> None:
-    outcomes = asyncio.run(measure([Case(robot, "stall", 2.5) for robot in STALLED], repetitions=1))
+    cases, outcomes = [Case(robot, "stall", 2.5) for robot in STALLED], []
+    for _ in range(ATTEMPTS):
+        outcomes += asyncio.run(measure(cases, repetitions=1))
+        undriven = [outcome for outcome in outcomes if any(fault.startswith(UNDRIVEN) for fault in outcome.faults)]
+        cases = [outcome.case for outcome in undriven]
+        if not cases:
+            break
+        outcomes = [outcome for outcome in outcomes if outcome not in undriven]
     assert sorted(outcome.case.robot for outcome in outcomes) == sorted(STALLED)
     for outcome in outcomes:
         assert outcome.faults == []

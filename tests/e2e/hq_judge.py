@@ -224,7 +224,10 @@ class Ec:
             if len(sensors) < (0 if robot == "tcpudp-1.1" else 6):
                 return False
         known = [self.judge.values.get(names[sensor], -1.0) >= 0.0 for sensor in sensors if sensor in names]
-        return names.keys() == expected and (robot == "tcpudp-1.1" or all(known))
+        if robot == "wc2ec":
+            return names.keys() == expected and all(known)
+        # Who came before the first scan was told of all sectors: those behind the scanner are never known.
+        return names.keys() == expected and (robot == "tcpudp-1.1" or sum(known) >= 6)
 
     async def leave(self) -> None:
         """Stay: the gateway ends first."""
@@ -295,7 +298,10 @@ class Stage:
         try:
             await soon(lambda: not blind(), "all see the robot")
         except AssertionError as error:
-            raise AssertionError(f"{error}: {blind()} do not") from error
+            ec = self.program("ec").judge
+            assert isinstance(ec, FragileController)
+            known = {name: ec.values.get(number) for number, (_, name) in ec.devices.items()}
+            raise AssertionError(f"{error}: {blind()} do not; the controller knows {known}") from error
 
     async def drive(self, name: str, forward: float) -> None:
         """Let one program drive, once the robot is nobody's, until it has moved as commanded; then idle."""

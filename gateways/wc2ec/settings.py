@@ -67,11 +67,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raise ConfigError for options that contradict each other."""
-        if (self.dialect == "draft") is not bool(self.devices):
-            raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
-        for field in ("number", "name"):
-            if len({getattr(device, field) for device in self.devices}) < len(self.devices):
-                raise ConfigError(f"devices: a {field} twice")
+        require_devices(self.dialect, self.devices)
         unknown = sorted(set(self.pinned) - {device.name for device in self.devices})
         if unknown:
             raise ConfigError(f"pinned: {unknown[0]!r} is none of the devices")
@@ -87,3 +83,12 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name, table in self.tables.items():
             if len(table) < 2 or any(low[0] >= high[0] for low, high in pairwise(table)):
                 raise ConfigError(f"tables.{name}: expected at least two pairs with rising first values")
+
+
+def require_devices(dialect: str, devices: tuple[DeviceOption, ...]) -> None:
+    """Raise ConfigError unless the draft, and it alone, lists its devices, each with a number and a name of its own."""
+    if (dialect == "draft") is not bool(devices):
+        raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
+    for field in ("number", "name"):
+        if len({getattr(device, field) for device in devices}) < len(devices):
+            raise ConfigError(f"devices: a {field} twice")

@@ -223,11 +223,10 @@ class Ec:
             expected = sensors | {"left", "right"}
             if len(sensors) < (0 if robot == "tcpudp-1.1" else 6):
                 return False
+            if robot == "alf":
+                sensors -= {"sector4"}  # behind the scanner: shown to who came before the first scan, and never known
         known = [self.judge.values.get(names[sensor], -1.0) >= 0.0 for sensor in sensors if sensor in names]
-        if robot == "wc2ec":
-            return names.keys() == expected and all(known)
-        # Who came before the first scan was told of all sectors: those behind the scanner are never known.
-        return names.keys() == expected and (robot == "tcpudp-1.1" or sum(known) >= 6)
+        return names.keys() == expected and (robot == "tcpudp-1.1" or all(known))
 
     async def leave(self) -> None:
         """Stay: the gateway ends first."""

@@ -175,7 +175,9 @@ async def main() -> None:
     serving.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await serving
-    print(json.dumps({"alive": judge.alive, "violations": judge.violations, "events": judge.events}))
+    account: dict[str, object] = {"alive": judge.alive, "violations": judge.violations, "events": judge.events}
+    account["piled"] = [kind for _, _, kind, _ in getattr(judge, "piled", ())]
+    print(json.dumps(account))
 
 
 if __name__ == "__main__":

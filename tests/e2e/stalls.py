@@ -501,6 +501,7 @@ class Sitting:
         outcome, robot = self.outcome, self._robot
         if not await robot.moving(FIRST, START_S):
             counted = [line for line in await self._counters() if not line.endswith(" 0")]
+            await self._report()
             raise RuntimeError(f"the robot was never driven; status {self._statuses[-1:]}; counters {counted}")
         await asyncio.sleep(self._rng.uniform(0.3, 0.8))
         before, stalls = self._reason, await self._link_stalls()

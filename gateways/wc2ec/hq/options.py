@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from gateways.wc2ec.settings import Byte, DeviceOption
-from zbridge.protocol import ConfigError, Differential, Positive
+from gateways.wc2ec.settings import Byte, DeviceOption, require_devices
+from zbridge.protocol import Differential, Positive
 
 
 class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -34,8 +34,4 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raise ConfigError for options that contradict each other."""
-        if (self.dialect == "draft") is not bool(self.devices):
-            raise ConfigError("devices: must be listed for the draft, which has no names, and for it alone")
-        for field in ("number", "name"):
-            if len({getattr(device, field) for device in self.devices}) < len(self.devices):
-                raise ConfigError(f"devices: a {field} twice")
+        require_devices(self.dialect, self.devices)

@@ -62,10 +62,15 @@ def stops(reads: list[tuple[int, bytes]]) -> list[int]:
 
 
 def _packets(reads: list[tuple[int, bytes]]) -> Iterator[tuple[int, int, bytes]]:
-    """Cut what a robot read into packets: the time of the read that completed each, its id and its body."""
+    """Cut what a robot read into packets: the time of the read that completed each, its id and its body.
+
+    Packets of one read are a nanosecond apart, so that their times tell their order.
+    """
     rest = b""
-    for at_ns, data in reads:
+    for read_ns, data in reads:
         rest += data
+        at_ns = read_ns
         while len(rest) >= HEADER.size and len(rest) >= (end := 4 + HEADER.unpack_from(rest)[0]):
             yield at_ns, rest[5], rest[HEADER.size : end]
             rest = rest[end:]
+            at_ns += 1

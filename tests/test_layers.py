@@ -33,7 +33,7 @@ OFFENCES = {
         "import zbridge.protocol.session",
     ),
     "What the author of a protocol imports is sans-IO, all the way down": (
-        "zbridge/text.py",
+        "zbridge/fleet/printable.py",
         "import threading",
     ),
     "A protocol is sans-IO, but for its simulator and its conformance kit": ("gateways/tcpudp/maps.py", "import time"),

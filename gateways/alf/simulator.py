@@ -18,7 +18,7 @@ from gateways.alf.translate import DRIVE, LASER, VEHICLE
 from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 
 log = logging.getLogger("gateways.alf.simulator")
 

@@ -39,7 +39,7 @@ from gateways.tcpudp.versions import VERSIONS
 from zbridge.protocol import ClientIds, Session, Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 
 log = logging.getLogger("gateways.tcpudp.simulator")
 

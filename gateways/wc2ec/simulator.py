@@ -27,7 +27,7 @@ from gateways.wc2ec.session import ControllerRole
 from zbridge.protocol import Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, cast
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 
 log = logging.getLogger("gateways.wc2ec.simulator")
 

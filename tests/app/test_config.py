@@ -7,12 +7,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from zbridge.address import Address
 from zbridge.app import config
 from zbridge.app.config import Plan, load, plan
 from zbridge.app.templates import listener_template, robot_template
 from zbridge.errors import ConfigError
 from zbridge.hq.settings import HqSettings
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 MINIMAL = """

@@ -6,10 +6,10 @@ import socket
 
 import pytest
 
-from zbridge.address import Address
 from zbridge.app import prometheus as exporter
 from zbridge.app.prometheus import serve_metrics
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 
 
 def free_port() -> int:

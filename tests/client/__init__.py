@@ -12,11 +12,12 @@ import msgspec
 from tests.proofs import Holder, numbered
 from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
-from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Unsupported
@@ -90,6 +91,7 @@ class Gateway:
             self._bus,
             metrics,
             Conditions(),
+            Faults(name),
             publish=self.publish,
             pump=lambda: None,
             clock=self._loop.time,

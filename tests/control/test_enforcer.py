@@ -10,11 +10,12 @@ import pytest
 from tests.client import Machine
 from tests.proofs import numbered
 from zbridge.bus.fake import FakeBus
-from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.faults import Faults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
@@ -40,6 +41,7 @@ class Rig:
             FakeBus(),
             self.metrics,
             Conditions(),
+            Faults("r1"),
             publish=self._publish,
             pump=lambda: None,
             clock=lambda: self.now,

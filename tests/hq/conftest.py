@@ -10,8 +10,8 @@ import pytest
 
 from tests.clock import scene_of
 from tests.hq.scene import SCENES, Scene, serving
-from zbridge.address import Address
 from zbridge.hq import listener as listeners
+from zbridge.protocol.address import Address
 from zbridge.transport.link import Receiver
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from tests.hq.gateway import KEYS, Gateway
-from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
@@ -26,6 +25,7 @@ from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import ATTEND_S, HqSide, Protocol, RobotUser, Send, Telemetry
 from zbridge.protocol.session import Limits, Role, Session, State
 from zbridge.protocol.session_table import ClientIds, SessionTable

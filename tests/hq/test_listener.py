@@ -11,9 +11,9 @@ import weakref
 import pytest
 
 from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, serving, soon
-from zbridge.address import Address
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Pose, Text
+from zbridge.protocol.address import Address
 from zbridge.protocol.session import Limits
 
 pytestmark = pytest.mark.jumping

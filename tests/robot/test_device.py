@@ -19,7 +19,6 @@ import zenoh
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.clock import JumpingLoop, scene_of
 from tests.proofs import Holder, lease, numbered, packed, shown
-from zbridge.address import Address
 from zbridge.bus import Handle, IncomingQuery, Lane, Sample
 from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
@@ -31,6 +30,7 @@ from zbridge.errors import LinkError, Malformed, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import HEARTBEAT_S, Device
 from zbridge.robot.telemetry import ATTEND_EVERY
@@ -2088,21 +2088,52 @@ async def test_a_device_prints_its_robot_and_state(rig: Rig) -> None:
 # Faults of the protocol's own code
 
 
-@pytest.mark.parametrize(("name", "fields"), [("drive", DRIVE_LEFT), ("light", {"on": True})])
-async def test_a_fault_of_the_protocol_in_a_command_is_a_refusal_and_is_logged_once(
-    rig: Rig, name: str, fields: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def command(*arguments: object) -> None:
-        raise KeyError(1)
+def raise_key_error(*arguments: object) -> None:
+    raise KeyError(1)
 
+
+KEY_ERROR = r"a fault of the protocol: KeyError: 1 \(test_device.py:\d+\)"
+NO_OUTCOME = r"a fault of the protocol: TypeError: Robot.command gave no Outcome \(commands.py:\d+\)"
+
+
+@pytest.mark.parametrize(("name", "fields"), [("drive", DRIVE_LEFT), ("light", {"on": True})])
+@pytest.mark.parametrize(("command", "said"), [(raise_key_error, KEY_ERROR), (lambda *arguments: None, NO_OUTCOME)])
+async def test_a_fault_of_the_protocol_in_a_command_is_a_refusal_and_is_logged_once(
+    rig: Rig,
+    name: str,
+    fields: dict[str, Any],
+    command: Callable[..., None],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     monkeypatch.setattr(TcpUdpRobot, "command", command)
     for _ in range(3):
         rig.command(name, fields)
     ((refused, reason, count),) = await rig.refusals()
     assert (refused, count) == (name, 3)
-    assert re.fullmatch(r"a fault of the protocol: KeyError: 1 \(test_device.py:\d+\)", reason)
+    assert re.fullmatch(said, reason)
     assert rig.last("control")["refusals"][0]["code"] == "unsupported"
     assert len([record for record in caplog.records if record.exc_info]) == 1
+
+
+async def test_a_fault_of_the_protocol_in_a_stop_is_shown_on_status_and_control_and_is_logged_once(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(TcpUdpRobot, "stop", raise_key_error)
+    for _ in range(2):
+        rig.command("stop", {})
+    ((refused, reason, count),) = await rig.refusals()
+    assert (refused, count) == ("stop", 2)
+    assert re.fullmatch(KEY_ERROR, reason)
+    assert rig.last("status")["reason"] == f"cannot be stopped: {reason}"
+    assert len([record for record in caplog.records if record.exc_info]) == 1
+
+
+async def test_a_fault_of_the_protocol_in_a_question_is_its_answer(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TcpUdpRobot, "known", raise_key_error)
+    (reply,) = await rig.hq.ask("fleet/r1/@rpc/map")
+    assert re.fullmatch(KEY_ERROR, str(reply.error))
 
 
 async def test_a_fault_of_the_translation_is_the_reason_of_the_end(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,8 @@ import contextlib
 import logging
 from collections.abc import AsyncIterator
 
-from zbridge.address import Address
 from zbridge.errors import NotReady, ProtocolError
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Limits, Role, Session
 from zbridge.simulation.simulator import Simulator

@@ -299,7 +299,7 @@ def raises(*arguments: object) -> None:
 FAULT = r"a fault of the protocol: KeyError: 1 \(test_conversation.py:\d+\)"
 
 
-@pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "_deliver"])
+@pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "timers", "_deliver"])
 async def test_a_fault_of_the_protocol_ends_the_session_and_its_link_with_the_place(
     method: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -12,9 +12,9 @@ import pytest
 from tests.clock import jumping
 from tests.e2e.conftest import free_port
 from tests.transport.recorder import SOON_S, Recorder
-from zbridge.address import Address
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
+from zbridge.protocol.address import Address
 from zbridge.transport import tcp, udp
 from zbridge.transport.fake import FakeLink
 from zbridge.transport.link import STALLED_S, Link

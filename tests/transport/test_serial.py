@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from tests.transport.recorder import SOON_S, Recorder
-from zbridge.address import SerialAddress
 from zbridge.errors import LinkError
+from zbridge.protocol.address import SerialAddress
 from zbridge.transport import serial
-from zbridge.transport.connect import connect
+from zbridge.transport.by_address import connect
 from zbridge.transport.link import STALLED_S
 from zbridge.transport.serial import SerialLink
 

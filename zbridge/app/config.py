@@ -19,13 +19,13 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from zbridge.address import Address, DeviceAddress, parse_device_address
 from zbridge.bus import BusSettings
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
 from zbridge.hq import HqSettings, ListenerPlan
 from zbridge.hq.settings import Network
+from zbridge.protocol.address import Address, DeviceAddress, parse_device_address
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 

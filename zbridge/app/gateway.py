@@ -21,9 +21,9 @@ from typing import Any
 from zbridge.app.config import Plan
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
-from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
+from zbridge.control.conditions import Conditions
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import BusError, Held
 from zbridge.fleet import payload as payloads

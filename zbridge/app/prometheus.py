@@ -8,8 +8,8 @@ import logging
 import socket
 from collections.abc import AsyncIterator
 
-from zbridge.address import Address
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 
 log = logging.getLogger("zbridge.metrics")
 

@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
 from zbridge.errors import ConfigError, ZbridgeError
-from zbridge.text import shown
+from zbridge.fleet.printable import shown
 
 
 def main() -> None:

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
-from zbridge.address import Address, parse_device_address
 from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
 from zbridge.fleet.topics import is_name
+from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
 app = typer.Typer(

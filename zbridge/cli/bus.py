@@ -21,10 +21,10 @@ from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
+from zbridge.fleet.printable import as_json as to_json
+from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
-from zbridge.text import as_json as to_json
-from zbridge.text import shown
 
 _SHOWN = 8
 """Bytes of a value that are printed."""

@@ -29,10 +29,10 @@ from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Pose, Status
+from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
-from zbridge.text import shown
 
 REFRESH_S = 0.5
 START_S = 20.0

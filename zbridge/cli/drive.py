@@ -16,7 +16,7 @@ from zbridge.cli.keyboard import Keyboard, split_keys
 from zbridge.client import Driver, Robot, connect
 from zbridge.errors import BusError, LeaseLost, Refused, ZbridgeError
 from zbridge.fleet.messages import Drive
-from zbridge.text import shown
+from zbridge.fleet.printable import shown
 
 EVERY_S = 0.05
 DEADMAN_S = 0.3

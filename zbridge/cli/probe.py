@@ -8,19 +8,18 @@ import json
 
 import msgspec
 
-from zbridge.address import DeviceAddress
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import console, errors, joined
 from zbridge.errors import BusError, LinkError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Status
+from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import split_key
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.text import shown
-from zbridge.transport.connect import connect
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation, connect
 
 PROBE_S = 15.0
 """Longest time a handshake may take."""

@@ -29,8 +29,8 @@ import msgspec
 
 from zbridge.control.events import Event, EventKind
 from zbridge.errors import ConfigError
+from zbridge.fleet.printable import as_json
 from zbridge.metrics import Metrics
-from zbridge.text import as_json
 
 log = logging.getLogger("zbridge.control")
 

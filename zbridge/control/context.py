@@ -7,7 +7,8 @@ from collections.abc import Callable
 import msgspec
 
 from zbridge.bus import Bus
-from zbridge.conditions import Conditions
+from zbridge.control.conditions import Conditions
+from zbridge.control.faults import Faults
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
@@ -26,6 +27,7 @@ class RobotContext(msgspec.Struct, frozen=True):
     bus: Bus
     metrics: Metrics
     conditions: Conditions
+    faults: Faults
     publish: Callable[[Topic, FleetMessage], object]
     pump: Callable[[], object]
     clock: Callable[[], float]

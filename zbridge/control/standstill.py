@@ -30,6 +30,7 @@ class Standstill:
     def __init__(self, context: RobotContext, authority: Authority, idle_stop_s: float = IDLE_STOP_S) -> None:
         self._robot = context.robot
         self._conditions = context.conditions
+        self._faults = context.faults
         self._pump = context.pump
         self._clock = context.clock
         self._authority = authority
@@ -68,12 +69,20 @@ class Standstill:
 
     def _send(self, now: float, until: float) -> None:
         try:
-            self._robot.stop(now, until)
+            self._tell(now, until)
         except Refused as refusal:
             self._conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
             raise
         self._conditions.set(_CONDITION, None)
         self._pump()
+
+    def _tell(self, now: float, until: float) -> None:
+        try:
+            self._robot.stop(now, until)
+        except Refused:
+            raise
+        except Exception as error:
+            raise self._faults.refusal("stop", error) from error
 
     def _on_time(self) -> None:
         self.begin()

@@ -22,7 +22,7 @@ from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
 from zbridge.protocol.plugin import Send, Telemetry
 from zbridge.protocol.session import Session, State
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 
 STALL_S = 5.0
 """Seconds without taking what is written after which a client is closed; seconds of taking it count against them."""

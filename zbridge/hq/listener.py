@@ -28,9 +28,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits
 from zbridge.protocol.session_table import SessionTable
-from zbridge.transport.conversation import Accepted, Conversation
-from zbridge.transport.link import Link
-from zbridge.transport.tcp import listen
+from zbridge.transport import Accepted, Conversation, Link, listen
 
 log = logging.getLogger("zbridge.hq")
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from zbridge.address import Address
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol
 
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]

@@ -27,7 +27,6 @@ metrics         :class:`Metrics`, :class:`Count`: counters.
 =============== ===================================================================================================
 """
 
-from zbridge.address import Address
 from zbridge.errors import (
     Code,
     ConfigError,
@@ -39,6 +38,7 @@ from zbridge.errors import (
     Unsupported,
 )
 from zbridge.metrics import Count, Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.bearings import BearingScan, Sectors
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock

@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from zbridge.address import Address
 from zbridge.errors import ConfigError, Unsupported
 from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.session import Limits, Session, State
 from zbridge.protocol.session_table import ClientIds

@@ -5,13 +5,11 @@ A command that is refused is counted and shown on ``control``; none is dropped s
 
 from __future__ import annotations
 
-import logging
-
 from zbridge.bus import Sample
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.gate import OF_THE_HOLDER, is_stop
-from zbridge.errors import FAULT, Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, describe
+from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
@@ -19,13 +17,9 @@ from zbridge.fleet.topics import Delivery, Topic
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 
-log = logging.getLogger("zbridge.robot.commands")
-
 LINK_BLOCKED = "the robot's link takes nothing"
 _MOTIONS = (Drive, Motor)
 _ESTABLISHED = State.ESTABLISHED
-_FAULTS = 16
-"""Faults of the protocol that are logged, each once."""
 
 
 class Commands:
@@ -42,8 +36,6 @@ class Commands:
         self.blocked = False
         """Whether the robot's link takes nothing: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
-        self._faults: set[str] = set()
-        """Faults of the protocol that were logged."""
         self._taken = context.metrics.count("commands")
         self._unwritten = context.metrics.count("drives_unwritten")
 
@@ -137,15 +129,14 @@ class Commands:
     def _tell(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         """Tell the robot; refuse the command where the protocol's own code raises what it must not."""
         try:
-            return self._robot.command(topic, command, now)
+            outcome = self._robot.command(topic, command, now)
+            if outcome is None:
+                raise TypeError("Robot.command gave no Outcome")
         except (Refused, PayloadError, EncodeError):
             raise
         except Exception as error:
-            fault = describe(error)
-            if fault not in self._faults and len(self._faults) < _FAULTS:
-                self._faults.add(fault)
-                log.exception("%s: %s: %s%s", self._keys.robot, topic.path, FAULT, fault)
-            raise Unsupported(f"{FAULT}{fault}") from error
+            raise self._context.faults.refusal(topic.path, error) from error
+        return outcome
 
     def _show(self, topic: Topic, outcome: Outcome, who: str | None) -> None:
         for shown, message in outcome.telemetry:

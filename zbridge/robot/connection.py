@@ -12,13 +12,13 @@ from typing import Any
 
 import msgspec
 
-from zbridge.address import DeviceAddress
 from zbridge.errors import LinkError
 from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
+from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.session import Session, State, Tap
 from zbridge.protocol.session_table import Backoff, SessionTable
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 
 log = logging.getLogger("zbridge.link")
 

@@ -13,19 +13,20 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from zbridge.address import DeviceAddress
 from zbridge.bus import Bus, Handle
-from zbridge.conditions import Conditions
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, Refused
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Robot
 from zbridge.protocol.session import Session
 from zbridge.protocol.session_table import SessionTable
@@ -35,7 +36,7 @@ from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport.connect import connect
+from zbridge.transport import connect
 
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
@@ -73,7 +74,16 @@ class Device:
         self._publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
-            robot, keys, bus, metrics, conditions, self._publishers.publish, links.pump, clock, clock_ns
+            robot,
+            keys,
+            bus,
+            metrics,
+            conditions,
+            Faults(keys.robot),
+            self._publishers.publish,
+            links.pump,
+            clock,
+            clock_ns,
         )
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)

@@ -39,18 +39,23 @@ class Queries:
         context = self._context
         topic = _ASKED[context.keys.path(query.key)]
         try:
-            self._commands.require_ready()
-            known = context.robot.known(topic)
-            if known is not None:
-                query.answer(payloads.encode(known))
-                return
-            self._commands.require_flowing()
-            if self._pending.add(topic, query):
-                context.robot.ask(topic)
-                context.pump()
-        except Refused as refusal:
+            self._answer_or_ask(topic, query)
+        except Exception as error:
+            refusal = error if isinstance(error, Refused) else context.faults.refusal(topic.path, error)
             self._pending.remove(topic, query)
             query.refuse(refusal)
+
+    def _answer_or_ask(self, topic: Topic, query: IncomingQuery) -> None:
+        context = self._context
+        self._commands.require_ready()
+        known = context.robot.known(topic)
+        if known is not None:
+            query.answer(payloads.encode(known))
+            return
+        self._commands.require_flowing()
+        if self._pending.add(topic, query):
+            context.robot.ask(topic)
+            context.pump()
 
 
 class PendingQueries:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from zbridge.address import DeviceAddress
+from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
 
 

@@ -8,7 +8,6 @@ stream drops the oldest, and a lossless bus asks to pause: then the links read n
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from typing import Any
 
@@ -108,8 +107,11 @@ class Telemetry:
         """Tell the robot whether anybody listens to a topic."""
 
         def changed(anybody: bool) -> None:
-            with contextlib.suppress(Refused):
+            try:
                 self._context.robot.listened(topic, anybody)
                 self._context.pump()
+            except Exception as error:
+                if not isinstance(error, Refused):
+                    self._context.faults.refusal(topic.path, error)
 
         return self._bus.watch_listeners(self._context.keys.key(topic.path), changed)

@@ -14,14 +14,14 @@ from typing import Any
 
 import msgspec
 
-from zbridge.address import Address
 from zbridge.errors import ProtocolError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, Robot, Simulation
 from zbridge.protocol.session import Session, State
-from zbridge.transport.conversation import Conversation
+from zbridge.transport import Conversation
 from zbridge.transport.tcp import connect
 
 SHOWN_S = 1.0

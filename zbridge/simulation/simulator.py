@@ -16,9 +16,7 @@ from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Session, State
 from zbridge.simulation.ticker import Ticker
-from zbridge.transport.conversation import Accepted, Conversation
-from zbridge.transport.link import Link, Receiver
-from zbridge.transport.tcp import listen
+from zbridge.transport import Accepted, Conversation, Link, Receiver, listen
 
 STEP_S = 0.02
 """Seconds between two steps of a simulated robot, in its own time too."""

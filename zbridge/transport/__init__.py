@@ -1,1 +1,11 @@
 """Links to peers (tcp, udp, serial), and conversations: one session over one link. Knows no protocol and no bus."""
+
+from __future__ import annotations
+
+from zbridge.transport.accepted import Accepted
+from zbridge.transport.by_address import connect
+from zbridge.transport.conversation import Conversation
+from zbridge.transport.link import Link, Receiver
+from zbridge.transport.tcp import TcpLink, listen
+
+__all__ = ["Accepted", "Conversation", "Link", "Receiver", "TcpLink", "connect", "listen"]

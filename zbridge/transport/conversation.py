@@ -1,7 +1,8 @@
 """Runs one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus.
 
 ``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
-ends with it: bytes, a timer, a command of the device.
+ends with it: bytes, a timer, a command of the device. What the protocol's own code raises in any of them ends its
+session, with the place as the reason.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
 from zbridge.protocol.session import Datagram, Session, State
-from zbridge.transport.link import STALLED_S, Link, Receiver
+from zbridge.transport.link import STALLED_S, Link
 
 log = logging.getLogger("zbridge.link")
 
@@ -22,6 +24,23 @@ _ESTABLISHED = State.ESTABLISHED
 
 LOOK_S = 0.05
 """Seconds between two checks of a stalled link."""
+
+
+_P = ParamSpec("_P")
+
+
+def _then_pump(step: Callable[Concatenate[Conversation, _P], None]) -> Callable[Concatenate[Conversation, _P], None]:
+    """Let a step end with ``pump``; a fault of the protocol's own code ends the session."""
+
+    @wraps(step)
+    def contained(self: Conversation, /, *args: _P.args, **kwargs: _P.kwargs) -> None:
+        try:
+            step(self, *args, **kwargs)
+            self._pump()
+        except Exception as error:
+            self._fault(error)
+
+    return contained
 
 
 class Conversation:
@@ -77,43 +96,34 @@ class Conversation:
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
 
+    @_then_pump
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
         self._link = link
         self.session.peer = link.peer
-        try:
-            self.session.open(self._clock())
-            self.pump()
-        except Exception as error:  # of the protocol's own code
-            self._fault(error)
+        self.session.open(self._clock())
 
+    @_then_pump
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        try:
-            self._hand_on(self.session.receive(data, self._clock()))
-            self.pump()
-        except Exception as error:  # of the protocol's own code
-            self._fault(error)
+        self._hand_on(self.session.receive(data, self._clock()))
 
+    @_then_pump
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        try:
-            self._hand_on(self.session.receive_datagram(datagram, self._clock()))
-            self.pump()
-        except Exception as error:  # of the protocol's own code
-            self._fault(error)
+        self._hand_on(self.session.receive_datagram(datagram, self._clock()))
 
     def claims(self, datagram: bytes, port: int) -> bool:
         """Ask the session whether this datagram is from its peer."""
         return self.session.claims(datagram, port)
 
+    @_then_pump
     def rivalled(self) -> None:
         """Count a second source, or session, with the same claim, and tell the session."""
         self._rivals.value += 1
         self.session.rivalled(self._clock())
         if self._may_warn("with a rival source of datagrams"):
             log.warning("%s: another source of datagrams claims to be %s", self.session.name, self.session.peer)
-        self.pump()
 
     def stray_datagram(self, datagram: bytes) -> None:
         """Show the session a datagram of the peer's host that nobody claimed."""
@@ -142,18 +152,24 @@ class Conversation:
         self._end()
         self._notify()
 
+    @_then_pump
     def lost(self, reason: str) -> None:
         """End: the link is gone."""
         self._link = None
         self.session.lost(reason)
-        self.pump()
+
+    def pump(self) -> None:
+        """Write what may be written now, report a change of state, and set the timer for the rest."""
+        try:
+            self._pump()
+        except Exception as error:
+            self._fault(error)
 
     def writable(self) -> None:
         """Go on writing."""
         self.pump()
 
-    def pump(self) -> None:
-        """Write what may be written now, report a change of state, and set the timer for the rest."""
+    def _pump(self) -> None:
         session, link = self.session, self._link
         outbox = session.outbox
         if session.drops_source and link is not None:
@@ -180,10 +196,10 @@ class Conversation:
             ready = writing and link is not None and link.ready
             self._set_timer(self._next(session.deadline(writing=ready), link))
 
+    @_then_pump
     def close(self, reason: str) -> None:
         """End the conversation from our side."""
         self.session.close(reason, self._clock())
-        self.pump()
 
     @property
     def stalled(self) -> bool:
@@ -195,12 +211,12 @@ class Conversation:
         """Seconds for which the peer's machine has not answered."""
         return self._link.silent_s if self._link is not None else 0.0
 
+    @_then_pump
     def cut(self, reason: str) -> None:
         """End the conversation and its link at once, with a reason; what was written may be lost."""
         self.session.lost(reason)
         if self._link is not None:
             self._link.abort()
-        self.pump()
 
     def abandon(self) -> None:
         """End the conversation and its link at once, in any state; idempotent."""
@@ -217,13 +233,10 @@ class Conversation:
         if self._link is not None:
             self._link.resume()
 
+    @_then_pump
     def _tick(self) -> None:
         self._timer = None
-        try:
-            self.session.expire(self._clock())
-            self.pump()
-        except Exception as error:  # of the protocol's own code
-            self._fault(error)
+        self.session.expire(self._clock())
 
     def _takes(self, link: Link) -> bool:
         """True if the link is not stalled. A stall ends when the last byte is acknowledged."""
@@ -275,66 +288,3 @@ class Conversation:
         if due and self._may_warn("warnings of malformed messages"):
             log.warning("%s: %d malformed so far, last: %s", self.session.name, count, self.session.last_malformed)
         self._malformed_logged = count
-
-
-class Accepted(Receiver):
-    """The receiver of an accepted link; ``admit`` makes its conversation, or refuses the peer with None.
-
-    ``level``: log level of the line about the end of the link.
-    """
-
-    def __init__(self, admit: Callable[[Link], Conversation | None], level: int = logging.INFO) -> None:
-        self._admit = admit
-        self._level = level
-        self._conversation: Conversation | None = None
-
-    def __repr__(self) -> str:
-        return f"<Accepted {self._conversation!r}>"
-
-    def attached(self, link: Link) -> None:
-        """Begin the conversation, or close the link."""
-        self._conversation = self._admit(link)
-        if self._conversation is None:
-            link.close()
-        else:
-            self._conversation.attached(link)
-
-    def received(self, data: bytes) -> None:
-        """Take bytes from the link."""
-        if self._conversation is not None:
-            self._conversation.received(data)
-
-    def lost(self, reason: str) -> None:
-        """End: the link is gone."""
-        if self._conversation is not None:
-            log.log(self._level, "%s: %s", self._conversation.session.peer, reason)
-            self._conversation.lost(reason)
-
-    def received_datagram(self, datagram: bytes) -> None:
-        """Take a datagram from the link."""
-        if self._conversation is not None:
-            self._conversation.received_datagram(datagram)
-
-    def claims(self, datagram: bytes, port: int) -> bool:
-        """Ask the session whether this datagram is from its peer."""
-        return self._conversation is not None and self._conversation.claims(datagram, port)
-
-    def rivalled(self) -> None:
-        """Tell the conversation of a second source, or conversation, with the same claim."""
-        if self._conversation is not None:
-            self._conversation.rivalled()
-
-    def stray_datagram(self, datagram: bytes) -> None:
-        """Show the session a datagram of the peer's host that nobody claimed."""
-        if self._conversation is not None:
-            self._conversation.stray_datagram(datagram)
-
-    def foreign_datagram(self) -> None:
-        """Count a datagram that came from elsewhere."""
-        if self._conversation is not None:
-            self._conversation.foreign_datagram()
-
-    def writable(self) -> None:
-        """Go on writing."""
-        if self._conversation is not None:
-            self._conversation.writable()

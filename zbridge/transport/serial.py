@@ -16,8 +16,8 @@ import termios
 import time
 from typing import Any
 
-from zbridge.address import SerialAddress
 from zbridge.errors import LinkError
+from zbridge.protocol.address import SerialAddress
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.link import STALLED_S, Receiver
 

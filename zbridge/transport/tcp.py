@@ -16,9 +16,9 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import cast
 
-from zbridge.address import Address
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
+from zbridge.protocol.address import Address
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.link import STALLED_S, Receiver
 from zbridge.transport.udp import DatagramHub, DatagramSocket

@@ -10,12 +10,12 @@ from typing import Any
 
 import msgspec
 
-from zbridge.address import Address
 from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Pose
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry, Translate
 from zbridge.protocol.session import Limits, Role, Session

@@ -9,8 +9,8 @@ from gateways.alf import PROTOCOL
 from gateways.alf.messages import Dialect, DriveCommand, DriveInfo, Measurement, ScannerInit
 from gateways.alf.session import HqRole, VehicleRole
 from gateways.alf.simulator import SCANNER, SPEED_M_S, TEMPERATURE, Car
-from zbridge.address import Address
 from zbridge.errors import ConfigError
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation
 from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import BOXES, HALF_SIDE_M

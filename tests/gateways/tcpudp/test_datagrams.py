@@ -20,7 +20,6 @@ from gateways.tcpudp import PROTOCOL
 from gateways.tcpudp.hq import HqOptions
 from gateways.tcpudp.session import robot_role as sessions
 from tests.hq.gateway import Gateway
-from zbridge.address import Address
 from zbridge.bus.fake import FakeBus
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -30,6 +29,7 @@ from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.transport import udp as datagrams
 

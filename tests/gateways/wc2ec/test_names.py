@@ -13,13 +13,13 @@ import pytest
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.clock import scene_of
-from zbridge.address import Address
 from zbridge.bus import Publisher
 from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.names import HOUR_S, NAMES

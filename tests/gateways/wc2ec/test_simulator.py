@@ -16,8 +16,8 @@ from gateways.wc2ec.messages import (
     SetValue,
 )
 from gateways.wc2ec.simulator import DEVICES, Machine
-from zbridge.address import Address
 from zbridge.errors import ConfigError
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation
 from zbridge.simulation.simulator import STEP_S
 from zbridge.simulation.world import HALF_SIDE_M, SOLID

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zbridge.address import DeviceAddress, SerialAddress
+from zbridge.protocol.address import DeviceAddress, SerialAddress
 from zbridge.transport import serial, tcp
 from zbridge.transport.link import Link, Receiver
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zbridge.text import as_json, shown
+from zbridge.fleet.printable import as_json, shown
 
 WRITTEN = [
     ("plain text", "plain text"),

@@ -2,8 +2,8 @@
 
 import pytest
 
-from zbridge.address import Address, DeviceAddress, SerialAddress, parse_device_address
 from zbridge.errors import LinkError
+from zbridge.protocol.address import Address, DeviceAddress, SerialAddress, parse_device_address
 
 
 @pytest.mark.parametrize(

@@ -98,6 +98,14 @@ async def test_a_lease_that_control_shows_and_nobody_knows_of_loses_its_token() 
     scene.authority.acquire(Acquire(who="ann"), scene.loop.time())
     scene.holder.look(scene.authority.report(scene.loop.time()))
     assert await scene.tokens() == []
+    scene.authority.stop("its token is lost")
+    scene.holder.want()
+    assert await scene.tokens() == [KEYS.alive(f"{TOKEN}.1")], "the end of the first one ends no later lease"
+    await scene.settle()
+    scene.authority.vanished(TOKEN)
+    assert scene.authority.state == "held"
+    scene.authority.vanished(f"{TOKEN}.1")
+    assert scene.authority.state == "stopped"
 
 
 async def test_a_bus_that_cannot_be_asked_denies_the_lease(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,8 @@ import contextlib
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+from msgspec import structs
+
 from zbridge.bus import Bus, Handle
 from zbridge.control.lease_client import LeaseClient, Question
 from zbridge.control.lease_events import LeaseEvent
@@ -36,7 +38,9 @@ class LeaseHolder:
         self._spawn = spawn
         self._on_event = on_event
         self._clock = clock
+        self._alive = client.request.alive
         self._token: Handle | None = None
+        self._disowned = 0
         self._closed = False
         self._changed = asyncio.Event()
 
@@ -79,7 +83,7 @@ class LeaseHolder:
         """Take news from ``control``; return what was refused to this program since the last call."""
         news = self.client.look(control, self._clock())
         if self.client.free and control.holder == self.client.request.who:
-            self.withdraw()  # the answer that granted it was lost: without its token that lease ends
+            self._disown()
         self._settle()
         return news
 
@@ -102,6 +106,17 @@ class LeaseHolder:
                     await self._changed.wait()
             self.expire()
             self._changed.clear()
+
+    def _disown(self) -> None:
+        """End a lease whose grant was lost on the way: without its token it ends at the gateway.
+
+        The next token has another name: the gateway may hear of the end of this one after the next lease was granted.
+        """
+        client = self.client
+        self.withdraw()
+        self._disowned += 1
+        if self._alive is not None:
+            client.request = structs.replace(client.request, alive=f"{self._alive}.{self._disowned}")
 
     def _settle(self) -> None:
         """Ask what the machine has to ask, and tell what it has to tell."""

@@ -71,19 +71,10 @@ class Device:
     ) -> None:
         loop = asyncio.get_running_loop()
         clock, conditions = clock or loop.time, conditions or Conditions()
-        self._publishers = RobotPublishers(bus, keys, conditions, clock)
+        self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
-            robot,
-            keys,
-            bus,
-            metrics,
-            conditions,
-            Faults(keys.robot),
-            self._publishers.publish,
-            links.pump,
-            clock,
-            clock_ns,
+            robot, keys, bus, metrics, conditions, Faults(keys.robot), publishers.publish, links.pump, clock, clock_ns
         )
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)

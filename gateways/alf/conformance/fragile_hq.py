@@ -183,7 +183,16 @@ class _Phase(enum.Enum):
 
 
 class FragileHq(Judge):
-    """One connection of an operator program: records every violation and dies of what breaks it."""
+    """One connection of an operator program: records every violation and dies of what breaks it.
+
+    ``points``: of every measurement; ``serves``: what the listener is configured to serve; ``deployed``: be the
+    driving program, which stops reading after ten measurements, or the scanning one, which sends no commands and
+    takes any id but 1 and 2 as END; None: neither, it bears both; ``repeat_s``: from one drive command to the next,
+    None for a viewer that sends none; ``stops_reading_after``: so many measurements it reads no more, for good;
+    ``answer_s``: longest time to the vehicle's END after ours, and to its close after both; ``flight_s``: how long
+    after the first command measurements may still come; ``keep``: most entries of every list; ``note``: called with
+    each violation.
+    """
 
     def __init__(
         self,
@@ -199,16 +208,6 @@ class FragileHq(Judge):
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        """Set up the HQ.
-
-        ``points``: of every measurement; ``serves``: what the listener is configured to serve; ``deployed``: be the
-        driving program, which stops reading after ten measurements, or the scanning one, which sends no commands and
-        takes any id but 1 and 2 as END; None: neither, it bears both; ``repeat_s``: from one drive command to the next,
-        None for a viewer that sends none; ``stops_reading_after``: so many measurements it reads no more, for good;
-        ``answer_s``: longest time to the vehicle's END after ours, and to its close after both; ``flight_s``: how long
-        after the first command measurements may still come; ``keep``: most entries of every list; ``note``: called with
-        each violation.
-        """
         if dialect not in _FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
         super().__init__(keep=keep, note=note)
@@ -232,13 +231,17 @@ class FragileHq(Judge):
         self._blind = False
         """True once it took a message as END: it shows nothing more."""
         self._reader = Reader(dialect, points)
+        self._command: tuple[int, int, int, int]
+        self.idle()
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Set up what belongs to the connection."""
         self._phase, self._stopped, self._midway = _Phase.CONNECTING, False, False
         self._conn: socket.socket | None = None
         self._limit: asyncio.Timeout | None = None
         self._sending, self._over = asyncio.Lock(), asyncio.Event()
         self._broken, self._error = asyncio.Event(), ""
-        self._command: tuple[int, int, int, int]
-        self.idle()
 
     def __repr__(self) -> str:
         state = f"{self._phase.name} scans={self.scans} violations={len(self.violations)} alive={self.alive}"

@@ -15,6 +15,7 @@ import random
 import socket
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.machine import Machine
@@ -43,7 +44,12 @@ _COUNTS = Scale()
 
 
 class FragileVehicle(FragileServer):
-    """One server of a vehicle: serves one connection, records every violation and dies of the deadly ones."""
+    """One server of a vehicle: serves one connection, records every violation and dies of the deadly ones.
+
+    ``laser``: sends 2 and 1; ``drive``: sends 4 and takes 3; ``speed_full``: full speed in ``text``; ``scale``: of
+    message 4 in ``binary``; ``machine``: shared with the vehicle's other server, default its own; ``keep``: most
+    entries of every list; ``note``: called with each violation.
+    """
 
     def __init__(
         self,
@@ -60,12 +66,6 @@ class FragileVehicle(FragileServer):
         keep: int = 100_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        """Set up the server.
-
-        ``laser``: sends 2 and 1; ``drive``: sends 4 and takes 3; ``speed_full``: full speed in ``text``; ``scale``: of
-        message 4 in ``binary``; ``machine``: shared with the vehicle's other server, default its own; ``keep``: most
-        entries of every list; ``note``: called with each violation.
-        """
         if not (laser or drive) or dialect not in ("text", "binary"):
             raise ValueError(f"no such server: dialect {dialect!r}, laser {laser}, drive {drive}")
         super().__init__(keep=keep, note=note)
@@ -313,27 +313,12 @@ async def simulate_fragile(
     ``ready`` is called with both ports once both listen.
     """
     one = laser_port is None
-    drive = FragileVehicle(
-        dialect,
-        laser=one,
-        drive=True,
-        points=points,
-        seed=seed,
-        times=times,
-        note=log_violations(_log, "vehicle" if one else "drive"),
-    )
+    server = partial(FragileVehicle, dialect, seed=seed, times=times)
+    drive = server(laser=one, drive=True, points=points, note=log_violations(_log, "vehicle" if one else "drive"))
     if laser_port is None:
         await _run(drive, host, port, lambda number: ready(number, None))
         return
-    laser = FragileVehicle(
-        dialect,
-        laser=True,
-        drive=False,
-        seed=seed,
-        times=times,
-        machine=drive.machine,
-        note=log_violations(_log, "laser"),
-    )
+    laser = server(laser=True, drive=False, machine=drive.machine, note=log_violations(_log, "laser"))
     ports: dict[str, int] = {}
 
     def listening(name: str, number: int) -> None:

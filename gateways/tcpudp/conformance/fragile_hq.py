@@ -49,7 +49,14 @@ _DEPLOYED = HqTimes()
 
 
 class FragileHq(Judge):
-    """An HQ program of one version, for one connection: records every violation and dies of the deadly ones."""
+    """An HQ program of one version, for one connection: records every violation and dies of the deadly ones.
+
+    ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
+    ``unasked``: a 1.1 program has handlers for 53 and 55 before it asked, unlike the first programs of 1.1;
+    ``repeat_s``: seconds between repetitions of the stick, None for a viewer that sends nothing by itself;
+    ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken; ``keep``: most
+    entries of every list; ``note``: called with each violation.
+    """
 
     def __init__(
         self,
@@ -65,14 +72,6 @@ class FragileHq(Judge):
         note: Callable[[str], None] | None = None,
         times: HqTimes = _DEPLOYED,
     ) -> None:
-        """Set up the program.
-
-        ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
-        ``unasked``: a 1.1 program has handlers for 53 and 55 before it asked, unlike the first programs of 1.1;
-        ``repeat_s``: seconds between repetitions of the stick, None for a viewer that sends nothing by itself;
-        ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken; ``keep``: most
-        entries of every list; ``note``: called with each violation.
-        """
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
         super().__init__(keep=keep, note=note)

@@ -53,8 +53,34 @@ _EXPECTED = {
 }
 
 
+class _Chances:
+    """One stream of random numbers for each thing that a robot leaves to chance: none disturbs another."""
+
+    def __init__(self, seed: int) -> None:
+        self.sleeps, self.answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
+        self.pauses = random.Random(f"{seed} pause")
+        self.misreads = {kind: random.Random(f"{seed} misread {kind}") for kind in range(256)}
+        self.losses = random.Random(f"{seed} loss")
+
+
+def _announced(version: str, features: Collection[Feature] | None, *, udp: bool) -> frozenset[Feature]:
+    known = frozenset(list(Feature)[: wire.FLAGS[version]])
+    others = known if features is None else frozenset(features)
+    if not others <= known:
+        raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
+    return (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
+
+
 class FragileRobot(FragileServer):
-    """A robot of one version: serves one connection, records every violation and dies of the deadly ones."""
+    """A robot of one version: serves one connection, records every violation and dies of the deadly ones.
+
+    ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
+    announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
+    fraction of positions sent as id 53; ``misread``: the fraction of packets dropped after the handshake, chosen
+    for each packet id by itself; ``again``: serve a connection after the first, which loses half of all packets in
+    both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of every list; ``note``:
+    called with each violation.
+    """
 
     def __init__(
         self,
@@ -74,22 +100,9 @@ class FragileRobot(FragileServer):
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        """Set up the robot.
-
-        ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
-        announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
-        fraction of positions sent as id 53; ``misread``: the fraction of packets dropped after the handshake, chosen
-        for each packet id by itself; ``again``: serve a connection after the first, which loses half of all packets in
-        both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of every list; ``note``:
-        called with each violation.
-        """
-        known = frozenset(list(Feature)[: wire.FLAGS[version]])
-        others = known if features is None else frozenset(features)
-        if not others <= known:
-            raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
         super().__init__(keep=keep, note=note)
         self.version = version
-        self.features = (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
+        self.features = _announced(version, features, udp=udp)
         self.client_id = client_id or random.Random(seed).randint(1, 255)
         self.received: list[tuple[float, Channel, int, bytes]] = []
         self.misread: list[tuple[float, Channel, int, bytes]] = []
@@ -98,21 +111,16 @@ class FragileRobot(FragileServer):
         self.machine = Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
-        self._sleeps, self._answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
-        self._pauses = random.Random(f"{seed} pause")
-        self._misreads = {kind: random.Random(f"{seed} misread {kind}") for kind in range(256)}
-        self._losses = random.Random(f"{seed} loss")
+        self._chance = _Chances(seed)
         self._misread, self._again, self._poor = misread, again, False
         self._phase = _Phase.LISTENING
         self._conn: socket.socket | None = None
         self._broken: ConnectionResetError | None = None
         self._udp: socket.socket | None = None
         self._sending = asyncio.Lock()
-        self._empty_at = self._unread_s = 0.0
-        self._wake_at = 0.0
+        self._empty_at = self._unread_s = self._wake_at = self._closed_s = 0.0
         self._awake_s = 0.0
         """This process's own time, which stands still while the process is late: it judges what was in flight."""
-        self._closed_s = 0.0
         self._forget()
 
     def _forget(self) -> None:
@@ -206,7 +214,7 @@ class FragileRobot(FragileServer):
             await self._take(received, "tcp")
 
     async def _nap(self) -> None:
-        await asyncio.sleep(self._sleeps.uniform(0, self._times.read_s))
+        await asyncio.sleep(self._chance.sleeps.uniform(0, self._times.read_s))
 
     async def _send(self, kind: int, body: bytes = b"") -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
@@ -283,7 +291,7 @@ class FragileRobot(FragileServer):
     async def _take(self, received: Packet, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
-        if self._phase is _Phase.ESTABLISHED and self._misreads[kind].random() < self._misread:
+        if self._phase is _Phase.ESTABLISHED and self._chance.misreads[kind].random() < self._misread:
             self.misread.append((time.monotonic(), channel, kind, body))
             del self.misread[: -self._keep]
             return
@@ -332,7 +340,7 @@ class FragileRobot(FragileServer):
             self.machine.lidar_on = body[0] == 1
             await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
         elif kind == wire.GET_POSITION:
-            misnamed = self._answers.random() < self._misnamed
+            misnamed = self._chance.answers.random() < self._misnamed
             await self._send(wire.MAP if misnamed else wire.POSITION, self.machine.body(wire.POSITION))
         elif kind == wire.GET_MAP:
             await self._send_map()
@@ -408,7 +416,7 @@ class FragileRobot(FragileServer):
 
     def _loses(self) -> bool:
         """True if the connection is a poor one and loses the packet."""
-        return self._poor and self._losses.random() < 0.5
+        return self._poor and self._chance.losses.random() < 0.5
 
     # Motion, maps, talk
 
@@ -443,7 +451,7 @@ class FragileRobot(FragileServer):
         mean = self._times.unasked_s
         with contextlib.suppress(OSError):
             for kind, body in self.machine.unasked(self.version, self.features, self._hq_features):
-                await asyncio.sleep(self._pauses.uniform(0.5 * mean, 1.5 * mean))
+                await asyncio.sleep(self._chance.pauses.uniform(0.5 * mean, 1.5 * mean))
                 if self._conn is not conn:
                     return
                 await self._send(kind, body or self.machine.body(kind))

@@ -1,16 +1,14 @@
 """The audit log: what a line says, what is counted instead of repeated, and what becomes of it on the disk."""
 
-import contextlib
 import errno
 import json
 import logging
 import os
 import queue
-import select
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +26,6 @@ EPOCH_NS = 1_767_225_600_000_000_000
 """The first second of 2026, UTC."""
 JOIN_S = 30.0
 """Longest time a thread of a test may take; no test waits that long."""
-QUIET_S = 2.0
-"""How long nothing may come from a file that is open; no test waits that long either, unless it fails."""
 
 
 class Log:
@@ -240,14 +236,6 @@ def test_different_refusals_are_bounded_the_rest_is_counted_as_others_and_none_h
     assert (lines[-1]["event"], lines[-1]["reason"]) == ("refused", "others")
 
 
-def test_refusals_of_long_ago_leave_room_for_others(log: Log) -> None:
-    for number in range(3 * KINDS):
-        log.write(2 * [refused(reason=f"reason {number}")])
-        log.audit.flush()
-        log.audit.flush()
-    assert len({line["reason"] for line in log.lines()}) == 3 * KINDS
-
-
 def test_a_day_of_a_flood_fills_no_disk(log: Log) -> None:
     size = 0
     for second in range(600):
@@ -353,28 +341,6 @@ def told(monkeypatch: pytest.MonkeyPatch) -> Told:
 FULL = "No space left on device"
 
 
-def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_again(
-    tmp_path: Path, metrics: Metrics, told: Told, caplog: pytest.LogCaptureFixture
-) -> None:
-    path = tmp_path / "audit.jsonl"
-    path.symlink_to("/dev/full")
-    file = opened(path, metrics, file_bytes=1_000_000, tell=told.put)
-    lines = [f"line {number}" for number in range(100)]
-    for line in lines:
-        file.write(line)
-    hear(told, FULL)
-    assert metrics.count("audit_failed").value >= 1
-    room = tmp_path / "room"
-    (tmp_path / "link").symlink_to(room)
-    os.replace(tmp_path / "link", path)
-    hear(told, None)
-    file.close()
-    assert room.read_text().splitlines() == lines
-    assert metrics.count("audit_dropped").value == 0
-    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
-    assert errors == [f"the audit log is not written: {FULL} ({path})"]
-
-
 @pytest.mark.parametrize(
     ("make", "why", "lines"),
     [(lambda path: path.symlink_to("/dev/full"), FULL, 100), (os.mkfifo, "No such device or address", 1)],
@@ -395,9 +361,11 @@ def test_what_cannot_be_written_until_the_end_keeps_nobody_from_ending_and_is_co
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_line_that_was_half_written_is_finished(tmp_path: Path, told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_said_once_and_what_waits_is_written_when_it_has_room_again(
+    tmp_path: Path, metrics: Metrics, told: Told, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     path, write, full = tmp_path / "audit.jsonl", os.write, threading.Event()
-    file = opened(path, tell=told.put)
+    file = opened(path, metrics, tell=told.put)
 
     def short_of_room(descriptor: int, data: bytes) -> int:
         if descriptor != file._file._descriptor:
@@ -414,7 +382,10 @@ def test_a_line_that_was_half_written_is_finished(tmp_path: Path, told: Told, mo
     file.write("and another")
     hear(told, None)
     file.close()
-    assert path.read_text() == "a whole line\nand another\n"
+    assert path.read_text() == "a whole line\nand another\n", "a line that was half written is finished"
+    assert (metrics.total("audit_failed") >= 1, metrics.total("audit_dropped")) == (True, 0)
+    errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
+    assert errors == [f"the audit log is not written: {FULL} ({path})"]
 
 
 def test_a_pipe_is_written_when_somebody_reads_it_and_again_when_somebody_else_does(tmp_path, metrics, told) -> None:
@@ -450,68 +421,48 @@ def test_a_path_that_cannot_be_written_is_an_error_of_the_configuration(tmp_path
 
 
 class Disk:
-    """A disk that stands still until the test reads: a pipe in the place of the file."""
+    """An audit file whose thread stands still in the midst of writing, and as many lines as may wait."""
 
-    def __init__(self, path: Path, metrics: Metrics) -> None:
-        os.mkfifo(path)
-        self._outlet = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        os.set_blocking(self._outlet, True)
-        self._data = b""
-        self.file = opened(path, metrics)
+    def __init__(self, path: Path, metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.file = opened(path, metrics, file_bytes=1_000_000)
+        self.moves, held, write = threading.Event(), threading.Event(), os.write
 
-    def stand_still(self) -> list[bytes]:
-        """Let the writing thread begin a line that is too long for the pipe; write as many lines as may wait."""
-        self.file.write("x" * 2**20)
-        self._data += os.read(self._outlet, 1)
-        lines = [f"line {number}" for number in range(WAITING)]
-        for line in lines:
+        def stand_still(descriptor: int, data: bytes) -> int:
+            if descriptor == self.file._file._descriptor:
+                held.set()
+                self.moves.wait(JOIN_S)
+            return write(descriptor, data)
+
+        monkeypatch.setattr(os, "write", stand_still)
+        self.lines = [f"line {number}" for number in range(1 + WAITING)]
+        for line in self.lines:
             self.file.write(line)
-        return [line.encode() for line in lines]
-
-    def read(self, lines: int) -> list[bytes]:
-        """Take what is written after the long line until there are that many lines, or until nothing more comes."""
-        more = b"more"
-        while more and self._data.count(b"\n") <= lines and select.select([self._outlet], [], [], QUIET_S)[0]:
-            more = os.read(self._outlet, 65536)
-            self._data += more
-        return self._data.splitlines()[1:]
-
-    @contextlib.contextmanager
-    def closing(self, within_s: float = 0.05) -> Iterator[threading.Thread]:
-        """Close the file in a thread, and go on when that is done or waits for the disk."""
-        thread = threading.Thread(target=self.file.close, daemon=True)
-        thread.start()
-        thread.join(within_s)
-        yield thread
-        thread.join(JOIN_S)
-
-    def close(self) -> None:
-        os.close(self._outlet)
+            assert held.wait(JOIN_S)
 
 
 @pytest.fixture
-def disk(tmp_path: Path, metrics: Metrics) -> Iterator[Disk]:
-    with contextlib.closing(Disk(tmp_path / "audit.jsonl", metrics)) as disk:
-        yield disk
+def disk(tmp_path: Path, metrics: Metrics, monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(tmp_path / "audit.jsonl", metrics, monkeypatch)
 
 
-def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written_at_the_end_too(disk, metrics) -> None:
-    dropped = metrics.count("audit_dropped")
-    lines = disk.stand_still()
-    assert dropped.value == 0
+def test_what_finds_no_room_is_dropped_and_counted_and_all_else_is_written_at_the_end(disk, metrics, tmp_path) -> None:
+    assert metrics.total("audit_dropped") == 0
     for _ in range(10):
-        disk.file.write("no room for this one")  # and it returns, although nobody reads
-    with disk.closing():
-        assert disk.read(WAITING + 1) == lines
-    assert dropped.value == 10
+        disk.file.write("no room for this one")  # and it returns, although the disk stands still
+    closing = threading.Thread(target=disk.file.close)
+    closing.start()
+    disk.moves.set()
+    closing.join(JOIN_S)
+    assert (tmp_path / "audit.jsonl").read_text().splitlines() == disk.lines
+    assert metrics.total("audit_dropped") == 10
 
 
 def test_a_disk_that_never_moves_again_keeps_nobody_from_ending_and_what_is_given_up_is_counted(
     disk: Disk, metrics: Metrics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("zbridge.control.audit_log.CLOSE_S", 0.001)
-    lines = disk.stand_still()
-    with disk.closing(within_s=2.0) as thread:
-        assert not thread.is_alive(), "close() waits for the disk without an end"
-        written = disk.read(WAITING + 1)
-    assert len(written) + metrics.count("audit_dropped").value >= len(lines)
+    disk.file.close()
+    assert disk.file._writer.is_alive(), "nobody waited for the disk"
+    assert metrics.total("audit_dropped") == WAITING
+    disk.moves.set()
+    disk.file._writer.join(JOIN_S)

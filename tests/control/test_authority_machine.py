@@ -107,22 +107,14 @@ class Driving(RuleBasedStateMachine):
         self.leases = [*self.leases[1 - REMEMBERED :], given]
         self.stopped = self.must_neutral = False
 
-    @rule(number=which)
-    def renew(self, number: int) -> None:
+    @rule(number=which, name=st.sampled_from(["renew", "release"]))
+    def question(self, number: int, name: str) -> None:
         self.wake()
-        given = self.any_lease(number)
-        assert self.question("renew", given).ok == self.is_drivers(given)
-        if self.driver is not None and self.is_drivers(given):
-            self.driver.expires_at = self.now + self.driver.lease_s
-        self.take_events()
-
-    @rule(number=which)
-    def release(self, number: int) -> None:
-        self.wake()
-        given = self.any_lease(number)
-        assert self.question("release", given).ok == self.is_drivers(given)
-        if self.is_drivers(given):
-            self.driver = None
+        given, driver = self.any_lease(number), self.driver
+        assert self.asked(name, given).ok == self.is_drivers(given)
+        if driver is not None and self.is_drivers(given):
+            driver.expires_at = self.now + driver.lease_s
+            self.driver = driver if name == "renew" else None
         self.take_events()
 
     # Commands
@@ -245,8 +237,8 @@ class Driving(RuleBasedStateMachine):
     def no_other_lease_is_good_for_anything(self) -> None:
         for given in self.leases:
             if not self.is_drivers(given):
-                assert not self.question("renew", given).ok
-                assert not self.question("release", given).ok
+                assert not self.asked("renew", given).ok
+                assert not self.asked("release", given).ok
                 with pytest.raises(Refused):
                     self.authority.admit(attach(given, 2**63), KEY, PAYLOAD, self.now)
         assert {event.what for event in self.authority.events()} <= {EventKind.REFUSED}
@@ -283,10 +275,10 @@ class Driving(RuleBasedStateMachine):
         """Give one of the last leases, the newest for 0; one that never was where there is none."""
         return self.leases[-1 - number % len(self.leases)] if self.leases else NEVER
 
-    def question(self, name: str, given: Given) -> Lease:
+    def asked(self, name: str, given: Given) -> Lease:
         key, seq = f"fleet/r1/@rpc/control/{name}", next(self.questions)
-        asked = Authorization(lease=given.lease, seq=seq, proof=proof(given.token, key, seq))
-        lease: Lease = getattr(self.authority, name)(asked, key, self.now)
+        shows = Authorization(lease=given.lease, seq=seq, proof=proof(given.token, key, seq))
+        lease: Lease = getattr(self.authority, name)(shows, key, self.now)
         return lease
 
     def is_held_back(self) -> bool:

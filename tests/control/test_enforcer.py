@@ -19,7 +19,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
 from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Motor, Raw, Text
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 
 PATH = "@cmd/drive"
@@ -41,7 +41,7 @@ class Rig:
             self.metrics,
             Conditions(),
             Faults("r1"),
-            publish=self._publish,
+            publish=lambda topic, message: self.shown.append(message),
             pump=lambda: None,
             clock=lambda: self.now,
             clock_ns=time.time_ns,
@@ -50,9 +50,6 @@ class Rig:
         self.enforcer = Enforcer(context, self.authority, standstill, Audit("r1", lambda line: None), limits)
         assert self.authority.acquire(Acquire(who="a"), self.now).ok
         self.enforcer.settle()
-
-    def _publish(self, topic: Topic, message: FleetMessage) -> None:
-        self.shown.append(message)
 
     def drive(self) -> Drive | Motor:
         """Drive at full speed; return what the robot was told."""

@@ -49,6 +49,7 @@ def kind(frame: bytes) -> str:
     return "move" if frame[5] == 11 else {STOP: "stop", MODE_NONE: "mode none"}.get(frame, frame.hex())
 
 
+PAIR = {"mode none", "stop"}
 COURSES = {
     # what happens, then what happens while the robot is watched; what it is sent meanwhile, at least and at most
     "nobody drives": ("wait 0.5", "wait 60", {"stop"}, 59, 61),
@@ -57,32 +58,14 @@ COURSES = {
     "the deadman came, and the lease is held": ("drive 1; wait 8", "wait 20", {"stop"}, 19, 21),
     "a robot drives itself": ("mode autonomous; wait 0.2", "wait 10", set(), 0, 0),
     "it drives itself no more": ("mode autonomous; wait 0.2; mode manual; wait 0.2", "wait 10", {"stop"}, 9, 11),
-    "a stop after mode 3 is the pair 1, 13": (
-        "mode autonomous; wait 0.5; neutral; wait 3",
-        "wait 5",
-        {"mode none", "stop"},
-        9,
-        11,
-    ),
+    "a stop after mode 3 is the pair": ("mode autonomous; wait 0.5; neutral; wait 3", "wait 5", PAIR, 9, 11),
     "somebody only chats": ("raw 40; wait 0.2", "wait 10", {"stop"}, 9, 11),
-    "a stop drops the raw packets that wait": (
-        "; ".join(30 * ["raw 21"] + ["stop"]),
-        "wait 5",
-        {"stop"},
-        9,
-        100,
-    ),
+    "a stop drops raw packets that wait": ("raw 21; " * 30 + "stop", "wait 5", {"stop"}, 9, 100),
     "a link is slow but not silent": ("stall 0.3", "drive 2", {"move"}, 15, 100),
     "a link takes nothing": ("drive 1; stall 0.31; drive 0.1", "drive 2", set(), 0, 0),
     "it takes again": ("drive 1; stall 0.31; drive 2", "stall 0; drive 1", {"stop"}, 1, 100),
     "a drive finds it open again": ("drive 1; stall 1; wait 0.01; once", "stall 0; once; wait 3", {"stop"}, 3, 100),
-    "after that neutral comes first": (
-        "drive 1; stall 1; drive 1; stall 0; drive 1; neutral; wait 2; once; wait 0.2",
-        "drive 1",
-        {"move"},
-        5,
-        100,
-    ),
+    "then neutral comes first": ("stall 1; drive 1; stall 0; drive 1; neutral; wait 2", "drive 1", {"move"}, 5, 100),
 }
 
 

@@ -1,7 +1,7 @@
 """The thread that writes what may block: order, bounds, newest wins or back pressure."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
@@ -66,13 +66,6 @@ def _fail() -> None:
 
 
 @pytest.fixture
-def newest() -> Iterator[Rig]:
-    rig = Rig(lossless=False)
-    yield rig
-    rig.end()
-
-
-@pytest.fixture
 def lossless() -> Iterator[Rig]:
     rig = Rig(lossless=True)
     yield rig
@@ -131,7 +124,8 @@ def test_calls_are_carried_out_on_a_thread_of_their_own_which_nobody_waits_for(l
     assert sorted(rig.written) == ["late", "status=late"]
 
 
-def test_a_call_with_a_key_that_comes_meanwhile_goes_before_what_waits_in_line(newest: Rig) -> None:
+def test_a_call_with_a_key_that_comes_meanwhile_goes_before_what_waits_in_line() -> None:
+    newest = Rig(lossless=False)
     newest.hold()
     newest.writer.put(lambda: newest.play("status=on"))
     newest.play("second")
@@ -141,11 +135,10 @@ def test_a_call_with_a_key_that_comes_meanwhile_goes_before_what_waits_in_line(n
 
 def test_the_relief_comes_once_when_less_than_half_the_backlog_waits(lossless: Rig) -> None:
     before: list[bool] = []
-    look: Callable[[], object] = lambda: before.append(lossless.relieved.is_set())  # noqa: E731
     lossless.hold()
     lossless.play(f"large:{BACKLOG // 2 + 1}")
-    lossless.writer.put(look, 1)  # half the backlog waits still
-    lossless.writer.put(look, BACKLOG // 2 - 1)
+    for size in (1, BACKLOG // 2 - 1):  # after the large call half the backlog waits still
+        lossless.writer.put(lambda: before.append(lossless.relieved.is_set()), size)
     assert lossless.play("more") == "more"
     lossless.end()
     assert before == [False, False]

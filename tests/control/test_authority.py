@@ -77,20 +77,8 @@ def expire(at: float) -> Does:
     return lambda authority: authority.expire(NOW + at)
 
 
-def vanish(alive: str) -> Does:
-    return lambda authority: authority.vanished(alive)
-
-
-def lose_bus(authority: Authority) -> None:
-    authority.bus_lost()
-
-
 def stop(authority: Authority) -> None:
     authority.stop("stop")
-
-
-def become_autonomous(authority: Authority) -> None:
-    authority.mode_chosen(autonomous=True)
 
 
 def acquired(authority: Authority) -> None:
@@ -104,7 +92,7 @@ STATES: dict[str, tuple[str, list[Does]]] = {
     "released": ("free", [acquired, question("release")]),
     "held": ("held", [acquired]),
     "moving": ("held", [acquired, MOTION]),
-    "by itself": ("held", [acquired, become_autonomous]),
+    "by itself": ("held", [acquired, lambda authority: authority.mode_chosen(autonomous=True)]),
     "held back": ("held", [acquired, MOTION, expire(WAIT_S)]),
     "stopped": ("stopped", [acquired, MOTION, stop]),
 }
@@ -218,8 +206,8 @@ def test_wishes_are_granted_up_to_the_most(wish_s: float) -> None:
 
 ENDS: dict[str, tuple[Does, str]] = {
     "released": (question("release"), "free"),
-    "holder lost": (vanish("ann.1"), "stopped"),
-    "bus lost": (lose_bus, "stopped"),
+    "holder lost": (lambda authority: authority.vanished("ann.1"), "stopped"),
+    "bus lost": (Authority.bus_lost, "stopped"),
     "lease expired": (expire(LEASE_S), "stopped"),
     "stop": (stop, "stopped"),
 }
@@ -245,8 +233,9 @@ def test_whenever_a_lease_ends_what_moves_is_stopped_and_its_holder_drives_no_mo
 @pytest.mark.parametrize("state", NOT_HELD)
 def test_where_nobody_holds_the_robot_nothing_is_lost_and_a_stop_stops_all_the_same(state: str) -> None:
     authority = made(state)
-    for happens in (vanish("ann.1"), lose_bus, expire(1e12)):
-        happens(authority)
+    authority.vanished("ann.1")
+    authority.bus_lost()
+    authority.expire(1e12)
     assert told(authority) == []
     assert seen(authority) == (STATES[state][0], False, False, None, None)
     stop(authority)

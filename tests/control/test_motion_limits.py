@@ -72,17 +72,12 @@ def test_a_drive_is_limited_to_one_full_scale_a_second(steps: list[tuple[float, 
         assert passed(limits, Drive(forward=wanted, turn=-wanted), at) == Drive(forward=sent, turn=-sent)
 
 
-def test_a_robot_that_was_stopped_begins_from_standing() -> None:
-    limits = MotionLimits(slew_per_s=1.0)
-    limits.sent(Drive(forward=1.0, left=-1.0, turn=1.0), 0.0)
-    limits.at_rest()
-    assert limits.limit(Drive(forward=1.0, left=-1.0, turn=1.0), 0.125) == Drive(forward=0.125, left=-0.125, turn=0.125)
-
-
-def test_a_drive_that_was_refused_or_not_sent_counts_for_no_growth() -> None:
+def test_a_drive_that_was_refused_or_not_sent_counts_for_no_growth_and_a_stop_ends_what_was_sent() -> None:
     limits = MotionLimits(rate_hz=8, slew_per_s=1.0)
     limits.sent(NEUTRAL, 0.0)
     limits.limit(FORWARD, 0.0625)
     assert passed(limits, FORWARD, 0.0625) == Drive(forward=0.0625)
     assert passed(limits, FORWARD, 0.125) is None
     assert passed(limits, FORWARD, 0.1875) == Drive(forward=0.1875)
+    limits.at_rest()
+    assert passed(limits, FORWARD, 0.3125) == Drive(forward=0.125), "a robot that was stopped begins from standing"

@@ -3,41 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import msgpack
 import pytest
 import zenoh
 
+from tests.bus import SOON_S, Seen
 from tests.e2e.conftest import free_port
-from zbridge.bus import BusSettings, IncomingQuery, Lane, Look
+from zbridge.bus import BusSettings, Lane, Look
 from zbridge.bus.zenoh import ZenohBus, declared, incoming, open_zenoh, publishers, session, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics
 
-SOON_S = 5.0
 BLOCK = zenoh.CongestionControl.BLOCK
 ALONE = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
-
-
-class Seen(list[object]):
-    """What a handler was told, and a way to wait for it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._changed = asyncio.Event()
-
-    def take(self, *told: object) -> None:
-        self.append(told if len(told) > 1 else told[0])
-        self._changed.set()
-
-    async def until(self, condition: Callable[[], object]) -> None:
-        async with asyncio.timeout(SOON_S):
-            while not condition():
-                self._changed.clear()
-                await self._changed.wait()
 
 
 @pytest.fixture
@@ -47,90 +30,39 @@ async def bus() -> AsyncIterator[ZenohBus]:
     await opened.close()
 
 
-async def test_who_watches_tokens_is_told_those_there_are_those_that_come_and_those_that_go(bus: ZenohBus) -> None:
-    first = bus.announce("fleet/r1/@alive/first")
-    elsewhere = bus.announce("fleet/r2/@alive/elsewhere")
-    seen = Seen()
-    handle = bus.watch_alive("fleet/r1/@alive/*", seen.take)
-    await seen.until(lambda: len(seen) == 1)
-    second = bus.announce("fleet/r1/@alive/second")
-    await seen.until(lambda: len(seen) == 2)
-    elsewhere.close()
-    first.close()
-    await seen.until(lambda: len(seen) == 3)
-    assert seen == [("fleet/r1/@alive/first", True), ("fleet/r1/@alive/second", True), ("fleet/r1/@alive/first", False)]
-    handle.close()
-    handle.close()
-    again = Seen()
-    bus.watch_alive("fleet/r1/@alive/*", again.take)
-    second.close()
-    await again.until(lambda: ("fleet/r1/@alive/second", False) in again)
-    assert len(seen) == 3, "a closed watch is told nothing"
+async def test_the_lane_of_a_sample_is_chosen_by_its_attachment_and_what_a_sort_drops_never_comes(bus) -> None:
+    seen, sorted_out = Seen(), list[tuple[str, bytes | None, int, bytes]]()
+    all_sorted = threading.Event()
 
+    def lane(key: str, attachment: bytes | None, size: int, look: Look) -> Lane | None:
+        sorted_out.append((key, attachment, size, look()))
+        if len(sorted_out) == len(sent):
+            all_sorted.set()
+        return None if attachment == b"bad" else Lane.COMMAND if attachment == b"holder" else Lane.OTHER
 
-async def test_the_lane_of_a_sample_is_chosen_by_its_attachment(bus: ZenohBus) -> None:
-    seen, asked, all_asked = Seen(), list[bytes | None](), threading.Event()
-
-    def lane(key: str, attachment: bytes | None, size: int, look: Look) -> Lane:
-        asked.append(attachment)
-        assert size == 1 + len(attachment or b"")
-        if attachment is not None:
-            looked.append((key, look()))
-        if attachment == b"last":
-            all_asked.set()
-        return Lane.COMMAND if attachment == b"holder" else Lane.OTHER
-
-    looked = list[tuple[str, bytes]]()
     bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload, sample.attachment), lane=lane)
     drive = bus.publisher("fleet/r1/@cmd/drive", topics.CMD_DRIVE)
-    sent = [(b"1", None), (b"2", b"other"), (b"3", b"holder"), (b"4", b"holder"), (b"5", b"last")]
+    sent = [(b"1", None), (b"2", b"other"), (b"3", b"holder"), (b"4", b"bad"), (b"5", b"holder"), (b"6", b"last")]
     for payload, attachment in sent:
         drive.put(payload, attachment)
-    assert all_asked.wait(SOON_S)  # the event loop stands still meanwhile, so that everything waits for it
-    assert asked == [attachment for _, attachment in sent]
-    assert looked == [("fleet/r1/@cmd/drive", payload) for payload, attachment in sent if attachment is not None]
+    assert all_sorted.wait(SOON_S)  # the event loop stands still meanwhile, so that everything waits for it
+    assert sorted_out == [("fleet/r1/@cmd/drive", shown, 1 + len(shown or b""), payload) for payload, shown in sent]
     await seen.until(lambda: len(seen) == 5)
-    assert seen == [sent[2], sent[3], sent[0], sent[1], sent[4]]
+    assert seen == [sent[2], sent[4], sent[0], sent[1], sent[5]]
 
 
-async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_the_asked_key(bus: ZenohBus) -> None:
-    chosen = list[tuple[bytes | None, str, bytes]]()
+async def test_the_lane_of_a_question_is_chosen_by_its_payload_and_what_a_sort_drops_is_not_answered(bus) -> None:
+    chosen = list[tuple[str, bytes | None, int, bytes]]()
 
-    def lane(key: str, payload: bytes | None, size: int, look: Look) -> Lane:
-        assert size == len(b"proof")
-        chosen.append((payload, key, look()))
-        return Lane.COMMAND
+    def lane(key: str, payload: bytes | None, size: int, look: Look) -> Lane | None:
+        chosen.append((key, payload, size, look()))
+        return Lane.COMMAND if payload == b"proof" else None
 
     bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lane)
-    await bus.ask("fleet/r1/@rpc/control/renew", b"proof")
-    await bus.ask("fleet/*/@rpc/control/renew", b"proof")
-    assert chosen == [(b"proof", "fleet/r1/@rpc/control/renew", b""), (b"proof", "fleet/*/@rpc/control/renew", b"")]
-
-
-async def test_a_question_knows_what_was_asked_and_is_answered_on_a_concrete_key(bus: ZenohBus) -> None:
-    asked = list[tuple[str, str]]()
-
-    def answer(question: IncomingQuery) -> None:
-        asked.append((question.asked, question.key))
-        question.answer(b"yes")
-
-    bus.answer("fleet/r1/@rpc/control/acquire/*", answer)
-    bus.answer("fleet/r1/@rpc/control/renew", answer)
-    for key in ("fleet/r1/@rpc/control/acquire/user%40host", "fleet/*/@rpc/control/renew"):
-        (reply,) = await bus.ask(key)
-        assert (reply.payload, reply.error) == (b"yes", None)
-        assert reply.key == asked[-1][1]
-    assert asked == [
-        ("fleet/r1/@rpc/control/acquire/user%40host", "fleet/r1/@rpc/control/acquire/user%40host"),
-        ("fleet/*/@rpc/control/renew", "fleet/r1/@rpc/control/renew"),
-    ]
-
-
-@pytest.mark.parametrize("asked", ["fleet/r1/@rpc/control/acquire/*", "fleet/*/@rpc/control/acquire/op1"])
-async def test_a_question_with_wildcards_can_be_refused(bus: ZenohBus, asked: str) -> None:
-    bus.answer("fleet/r1/@rpc/control/acquire/*", lambda question: question.refuse(Held("held by ann")))
-    (reply,) = await bus.ask(asked)
-    assert isinstance(reply.error, Held)
+    for key in ("fleet/r1/@rpc/control/renew", "fleet/*/@rpc/control/renew"):
+        assert len(await bus.ask(key, b"proof")) == 1
+        assert chosen[-1] == (key, b"proof", 5, b"")
+    assert await bus.ask("fleet/r1/@rpc/control/renew", b"forged", timeout_s=SOON_S) == []
 
 
 async def test_an_error_reply_is_a_map_of_code_and_reason(bus: ZenohBus) -> None:
@@ -163,11 +95,15 @@ def test_an_error_reply_of_anybody_is_read(payload: bytes, kind: type[Exception]
     assert not isinstance(error, Refused) or error.code in Code
 
 
-async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> None:
+async def test_flush_waits_for_what_was_given_to_be_published_but_not_for_ever(bus, monkeypatch) -> None:
     seen, go = Seen(), threading.Event()
     bus.subscribe("fleet/r1/@cmd/mode", lambda sample: seen.take(sample.payload))
     bus._writer.put(lambda: go.wait(SOON_S))  # as a full transmission queue holds it
     bus.publisher("fleet/r1/@cmd/mode", topics.CMD_MODE).put(b"mode")
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "FLUSH_S", 0.01)
+        with pytest.raises(BusError, match=r"the bus took nothing for 0\.01 s"):
+            await bus.flush()
     flushed = asyncio.ensure_future(bus.flush())
     await asyncio.to_thread(lambda: None)
     assert not flushed.done()
@@ -177,68 +113,46 @@ async def test_flush_waits_for_what_was_given_to_be_published(bus: ZenohBus) -> 
     await seen.until(lambda: seen == [b"mode"])
 
 
-async def test_flush_on_a_bus_that_takes_nothing_is_an_error_that_says_so(bus, monkeypatch) -> None:
-    monkeypatch.setattr(session, "FLUSH_S", 0.01)
-    go = threading.Event()
-    bus._writer.put(lambda: go.wait(SOON_S))
-    with pytest.raises(BusError, match=r"the bus took nothing for 0\.01 s"):
-        await bus.flush()
-    go.set()
-    monkeypatch.undo()
-    await bus.flush()
-
-
 class Busy:
     """An entity of Zenoh's whose callback runs for a while: so long taking it back fails as the library does."""
 
-    def __init__(self, times: int) -> None:
+    def __init__(self, times: float, why: str = "Already borrowed") -> None:
         self.asked: list[str] = []
         self.undeclared = threading.Event()
         self._times = times
+        self._why = why
 
     def undeclare(self) -> None:
         self.asked.append(threading.current_thread().name)
         if len(self.asked) <= self._times:
-            raise RuntimeError("Already borrowed")
+            raise RuntimeError(self._why)
         self.undeclared.set()
 
 
-def test_what_meets_its_own_callback_is_taken_back_again_at_once() -> None:
+def test_what_meets_its_own_callback_is_taken_back_again_and_a_callback_that_goes_on_keeps_nobody_waiting() -> None:
+    here = threading.current_thread().name
     entity = Busy(2)
     handle = declared.Declared(entity)
     handle.close()
-    assert entity.asked == 3 * [threading.current_thread().name]
     assert entity.undeclared.is_set()
     handle.close()
-    assert len(entity.asked) == 3, "taken back once"
-
-
-def test_a_callback_that_goes_on_keeps_nobody_waiting_and_is_taken_back_after_it() -> None:
+    assert entity.asked == 3 * [here], "taken back once"
     entity = Busy(30)
     declared.Declared(entity).close()
-    assert 0 < entity.asked.count(threading.current_thread().name) < 10
+    assert 0 < entity.asked.count(here) < 10
     assert entity.undeclared.wait(SOON_S)
     assert len(entity.asked) == 31
 
 
-def test_a_callback_that_never_ends_is_given_up_and_said_so(caplog, monkeypatch) -> None:
+def test_a_callback_that_never_ends_is_given_up_and_said_so_and_other_errors_are_raised(caplog, monkeypatch) -> None:
     monkeypatch.setattr(declared, "UNDECLARE_S", 0.05)
-    entity = Busy(10**9)
-    declared.Declared(entity).close()
+    declared.Declared(Busy(math.inf)).close()
     for thread in threading.enumerate():
         if thread.name == "zbridge-undeclare":
             thread.join(SOON_S)
     assert "not taken back: Already borrowed" in caplog.text
-    assert not entity.undeclared.is_set()
-
-
-def test_other_errors_are_not_tried_again() -> None:
-    class Broken:
-        def undeclare(self) -> None:
-            raise RuntimeError("no such thing")
-
     with pytest.raises(RuntimeError, match="no such thing"):
-        declared.Declared(Broken()).close()
+        declared.Declared(Busy(math.inf, "no such thing")).close()
 
 
 async def test_subscribers_queryables_and_publishers_of_every_kind_are_taken_back_again(bus: ZenohBus) -> None:
@@ -309,25 +223,6 @@ async def test_what_was_closed_is_forgotten(bus: ZenohBus, monkeypatch: pytest.M
     assert len(bus._publishers.stream_keys) == 2
 
 
-async def test_what_a_sort_drops_never_comes_to_the_event_loop(bus: ZenohBus) -> None:
-    seen = Seen()
-
-    def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
-        return Lane.OTHER if look() == b"good" else None
-
-    bus.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.payload), lane=sort)
-    text = bus.publisher("fleet/r1/@cmd/text", topics.CMD_TEXT)
-    for payload in (b"bad", b"good", b"bad", b"good"):
-        text.put(payload)
-    await seen.until(lambda: len(seen) == 2)
-    assert seen == [b"good", b"good"]
-
-
-async def test_a_question_that_a_sort_drops_ends_without_an_answer(bus: ZenohBus) -> None:
-    bus.answer("fleet/r1/@rpc/control/renew", lambda question: question.answer(b"yes"), lane=lambda *_: None)
-    assert await bus.ask("fleet/r1/@rpc/control/renew", b"proof", timeout_s=SOON_S) == []
-
-
 async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(incoming, "QUERIES_HZ", 2.0)
     metrics = Metrics()
@@ -339,39 +234,39 @@ async def test_questions_beyond_the_rate_are_not_answered_and_counted(monkeypatc
     await bus.close()
 
 
-@pytest.mark.parametrize(
-    ("key", "most"),
-    [
-        *((f"fleet/{key}", 256) for key in ("r1/@cmd/drive", "r1/@cmd/motor/left", "*/@cmd/mode", "**/@cmd/stop")),
-        ("fleet/r1/@cmd/sensor/front", 16_384),
-        *((f"fleet/r1/@cmd/{key}", 65_536) for key in ("scan", "raw/tcpudp", "*", "none")),
-    ],
-)
-async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called(key: str, most: int) -> None:
+BOUNDS = {
+    **dict.fromkeys(("r1/@cmd/drive", "r1/@cmd/motor/left", "*/@cmd/mode", "**/@cmd/stop"), 256),
+    "r1/@cmd/sensor/front": 16_384,
+    **dict.fromkeys(("r1/@cmd/scan", "r1/@cmd/raw/tcpudp", "r1/@cmd/*", "r1/@cmd/none"), 65_536),
+}
+
+
+async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called() -> None:
     where = (f"tcp/127.0.0.1:{free_port()}",)
     gateway = await open_zenoh(BusSettings(multicast=False, listen=where), Metrics(), bounds=topics.size_bounds())
     sender = await asyncio.to_thread(zenoh.open, zenoh_config(BusSettings(multicast=False, connect=where)))
-    seen, called = Seen(), list[int]()
+    seen, called = Seen(), list[tuple[str, int]]()
 
     def sort(key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
-        called.append(size)
+        called.append((key, size))
         return Lane.OTHER
 
-    gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(len(sample.payload)), lane=sort)
+    gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.key, len(sample.payload)), lane=sort)
     gateway.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
 
     def put_all() -> None:
         while not list(sender.get("fleet/r1/@rpc/pose", timeout=0.1)):
             pass
-        for payload, attachment in ((most + 1, 0), (most - 9, 10), (most - 10, 10), (0, most + 1), (1, 0)):
-            sender.put(key, bytes(payload), attachment=bytes(attachment), congestion_control=BLOCK)
+        for key, most in BOUNDS.items():
+            for payload, attachment in ((most + 1, 0), (most - 9, 10), (most - 10, 10), (0, most + 1), (1, 0)):
+                sender.put(f"fleet/{key}", bytes(payload), attachment=bytes(attachment), congestion_control=BLOCK)
         assert list(sender.get("fleet/r1/@rpc/pose", payload=bytes(1025), timeout=SOON_S)) == []
 
     try:
         await asyncio.to_thread(put_all)
-        await seen.until(lambda: 1 in seen)
-        assert seen == [most - 10, 1]
-        assert called == [most, 1]
+        await seen.until(lambda: len(seen) == 2 * len(BOUNDS))
+        assert seen == [(f"fleet/{key}", size) for key, most in BOUNDS.items() for size in (most - 10, 1)]
+        assert called == [(f"fleet/{key}", size) for key, most in BOUNDS.items() for size in (most, 1)]
     finally:
         await asyncio.to_thread(sender.close)
         await gateway.close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import pytest
 
@@ -19,8 +18,8 @@ from zbridge.control.faults import Faults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
-from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Raw, Text
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Mode, Motor, Raw, Text
+from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 
 PATH = "@cmd/drive"
@@ -42,7 +41,7 @@ class Rig:
             self.metrics,
             Conditions(),
             Faults("r1"),
-            publish=self._publish,
+            publish=lambda topic, message: self.shown.append(message),
             pump=lambda: None,
             clock=lambda: self.now,
             clock_ns=time.time_ns,
@@ -52,74 +51,68 @@ class Rig:
         assert self.authority.acquire(Acquire(who="a"), self.now).ok
         self.enforcer.settle()
 
-    def _publish(self, topic: Topic, message: FleetMessage) -> None:
-        self.shown.append(message)
-
-    def drive(self) -> None:
+    def drive(self) -> Drive | Motor:
+        """Drive at full speed; return what the robot was told."""
         permitted = self.enforcer.permit(FORWARD, self.now)
         self.enforcer.moved(PATH, permitted, self.now, moving=permitted.moving)
         self.enforcer.settle()
+        return permitted
 
 
-@pytest.fixture
-async def rig() -> Any:
-    made = Rig()
-    yield made
-    made.enforcer.close()
-
-
-@pytest.fixture
-async def limited() -> Any:
-    made = Rig(MotionLimits(rate_hz=1.0))
-    yield made
-    made.enforcer.close()
-
-
-async def test_keeping_time_before_the_deadline_asks_nothing_of_the_authority(rig, monkeypatch) -> None:
+async def test_a_gateway_frozen_past_the_deadman_stops_the_robot_before_it_writes_anything(monkeypatch) -> None:
+    rig = Rig()
     rig.drive()
-    monkeypatch.setattr(rig.authority, "expire", pytest.fail)
-    rig.now += DEADMAN_S - 0.01
-    rig.enforcer.keep_time()
-    assert rig.machine.stops == 0
-
-
-async def test_a_gateway_frozen_past_the_deadman_stops_the_robot_before_it_writes_anything(rig: Rig) -> None:
-    rig.drive()
-    rig.now += DEADMAN_S + 1.0
+    with monkeypatch.context() as patch:
+        patch.setattr(rig.authority, "expire", pytest.fail)
+        rig.now += DEADMAN_S - 0.01
+        rig.enforcer.keep_time()  # nothing is due: the authority is not asked
+    rig.now += 1.0
     rig.enforcer.keep_time()
     assert rig.machine.stops == 1
     with pytest.raises(NeutralFirst):
         rig.enforcer.permit(FORWARD, rig.now)
 
 
-async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion(rig: Rig) -> None:
+async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion() -> None:
+    rig = Rig()
     rig.enforcer.hold_back("the robot's link took nothing", stops=True)
     with pytest.raises(NeutralFirst):
         rig.enforcer.moved(PATH, FORWARD, rig.now, moving=True)
     assert not rig.authority.moving
 
 
-async def test_limits_refuse_what_comes_too_often_and_without_limits_nothing_is(limited: Rig, rig: Rig) -> None:
-    for _ in range(10):
-        rig.drive()
-    limited.drive()
-    limited.drive()
+async def test_limits_refuse_what_comes_too_often_and_slow_what_grows_too_fast_from_what_was_sent() -> None:
+    rig = Rig()
+    assert [rig.drive() for _ in range(10)] == [FORWARD] * 10, "without limits nothing is refused"
+    rig = Rig(MotionLimits(rate_hz=4.0, slew_per_s=1.0))
+    told = []
+    for _ in range(2):
+        told.append(rig.drive())
+        rig.now += 0.25
+    assert told == [Drive(forward=0.25), Drive(forward=0.5)]
+    assert rig.metrics.count("drives_slowed").value == 2
+    rig.enforcer.stop("stop")
+    rig.authority.acquire(Acquire(who="a"), rig.now)
+    assert rig.drive() == Drive(forward=0.25), "a robot that was stopped begins from standing"
+    rig.drive()
     with pytest.raises(TooFast):
-        limited.drive()
+        rig.drive()
 
 
-async def test_a_stop_ends_the_lease_and_is_counted_and_shown(rig: Rig) -> None:
+async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_is_folded() -> None:
+    rig = Rig()
     rig.drive()
     rig.enforcer.stop_commanded()
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
     assert rig.metrics.count("control", what="stopped").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]
+    assert rig.enforcer.gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
 
 
 @pytest.mark.parametrize(
     ("command", "moves"),
     [(Raw(id=21, body=b""), True), (Mode("autonomous"), True), (Mode("manual"), False), (Text("hi"), False)],
-    ids=lambda value: type(value).__name__,
+    ids=["raw", "autonomous", "manual", "text"],
 )
 async def test_what_may_move_a_robot_by_itself_is_noted(command: FleetMessage, moves: bool) -> None:
     rig = Rig()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.proofs import proof, shown
+from tests.proofs import packed, proof, shown
 from zbridge.control.proof import LEAST_BYTES, MOST_BYTES, NOTES, Signer, Verifier, read
 from zbridge.errors import Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
@@ -16,77 +16,97 @@ from zbridge.fleet.messages import Authorization, Lease
 LEASE, TOKEN = bytes(range(8)), bytes(range(100, 132))
 GRANTED = Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="ann")
 DRIVE, RENEW = "fleet/r1/@cmd/drive", "fleet/r1/@rpc/control/renew"
-PAYLOAD = msgpack.packb({"forward": 0.5})
+PAYLOAD = packed({"forward": 0.5})
+PROOF = proof(TOKEN, DRIVE, 9, PAYLOAD)
+WHOLE = {"lease": LEASE, "seq": 9, "proof": PROOF}
+ATTACHMENT = packed(WHOLE)
 
 
-def test_the_proof_of_a_command_is_what_the_design_says_byte_by_byte() -> None:
-    signed = (
-        b"fleet/r1/@cmd/drive\x00\x00\x00\x00\x00\x00\x00\x00\x01\x81\xa7forward\xcb\x3f\xe0\x00\x00\x00\x00\x00\x00"
-    )
-    assert PAYLOAD in signed
-    expected = hmac.new(TOKEN, signed, hashlib.sha256).digest()[:16]
-    assert msgpack.unpackb(Signer(GRANTED).command(DRIVE, PAYLOAD)) == {"lease": LEASE, "seq": 1, "proof": expected}
-
-
-def test_the_proof_of_a_question_has_an_empty_payload() -> None:
-    signed = b"fleet/r1/@rpc/control/renew\x00\x00\x00\x00\x00\x00\x00\x00\x01"
-    expected = hmac.new(TOKEN, signed, hashlib.sha256).digest()[:16]
-    assert msgpack.unpackb(Signer(GRANTED).question(RENEW)) == {"lease": LEASE, "seq": 1, "proof": expected}
-
-
-def test_commands_and_questions_are_numbered_apart_and_rise() -> None:
+@pytest.mark.parametrize(
+    ("key", "payload", "signed"),
+    [
+        (DRIVE, PAYLOAD, b"fleet/r1/@cmd/drive\0\0\0\0\0\0\0\0\x03\x81\xa7forward\xcb\x3f\xe0\0\0\0\0\0\0"),
+        (RENEW, None, b"fleet/r1/@rpc/control/renew\0\0\0\0\0\0\0\0\x03"),
+    ],
+)
+def test_a_proof_is_what_the_design_says_byte_by_byte_and_commands_are_numbered_apart(key, payload, signed) -> None:
     signer = Signer(GRANTED)
-    commands = [msgpack.unpackb(signer.command(DRIVE, b""))["seq"] for _ in range(3)]
-    questions = [msgpack.unpackb(signer.question(RENEW))["seq"] for _ in range(3)]
-    assert commands == questions == [1, 2, 3]
-    assert msgpack.unpackb(signer.command("fleet/r1/@cmd/mode", b""))["seq"] == 4, "whatever the key"
+    for _ in range(2):
+        signer.command("fleet/r1/@cmd/mode", b"")
+        signer.question(RENEW)
+    said = signer.question(key) if payload is None else signer.command(key, payload)
+    expected = hmac.new(TOKEN, signed, hashlib.sha256).digest()[:16]
+    assert msgpack.unpackb(said) == {"lease": LEASE, "seq": 3, "proof": expected}
+    assert Verifier(LEASE, TOKEN).proves(read(said), key, payload or b"")
 
 
 @given(st.binary(min_size=32, max_size=32), st.text(min_size=1), st.integers(0, 2**64 - 1), st.binary(max_size=300))
-def test_a_verifier_takes_what_the_design_defines(token: bytes, key: str, seq: int, payload: bytes) -> None:
+def test_a_verifier_takes_what_the_design_defines_and_nothing_near_it(token, key, seq, payload) -> None:
     key = key.encode("utf-8", "ignore").decode()
     verifier = Verifier(LEASE, token)
     said = shown(LEASE, token, key, seq, payload)
+    assert LEAST_BYTES <= len(said) <= MOST_BYTES
     assert verifier.plausible(said)
     assert verifier.proves(read(said), key, payload)
     assert not verifier.proves(read(said), key, payload + b"x")
     assert not verifier.proves(read(said), key + "x", payload)
 
 
-def test_a_verifier_takes_what_a_signer_signs_again_and_again() -> None:
-    signer, verifier = Signer(GRANTED), Verifier(LEASE, TOKEN)
-    for _ in range(3):
-        assert verifier.proves(read(signer.command(DRIVE, PAYLOAD)), DRIVE, PAYLOAD)
-        assert verifier.proves(read(signer.question(RENEW)), RENEW)
-
-
-@pytest.mark.parametrize("seq", [0, 1, 127, 128, 2**16, 2**32, 2**64 - 1])
-def test_what_a_true_holder_sends_is_always_plausible(seq: int) -> None:
-    said = shown(LEASE, TOKEN, DRIVE, seq, PAYLOAD)
-    assert LEAST_BYTES <= len(said) <= MOST_BYTES
-    assert Verifier(LEASE, TOKEN).plausible(said)
+def test_a_proof_or_a_token_with_one_bit_changed_proves_nothing() -> None:
+    for bit in range(8 * 16):
+        near = (int.from_bytes(PROOF, "big") ^ 1 << bit).to_bytes(16, "big")
+        assert not Verifier(LEASE, TOKEN).proves(Authorization(lease=LEASE, seq=9, proof=near), DRIVE, PAYLOAD)
+    for bit in range(8 * 32):
+        near = (int.from_bytes(TOKEN, "big") ^ 1 << bit).to_bytes(32, "big")
+        assert not Verifier(LEASE, near).proves(Authorization(lease=LEASE, seq=9, proof=PROOF), DRIVE, PAYLOAD)
 
 
 @pytest.mark.parametrize(
     "said",
-    [
-        None,
-        b"",
-        LEASE,
-        shown(LEASE, TOKEN, DRIVE, 1)[:-12],
-        shown(LEASE, TOKEN, DRIVE, 1) + bytes(100),
-        shown(LEASE[::-1], TOKEN, DRIVE, 1),
-        bytes(60),
-    ],
+    [None, b"", ATTACHMENT[:-12], ATTACHMENT + bytes(100), shown(LEASE[::-1], TOKEN, DRIVE, 1), bytes(60)],
 )
 def test_what_cannot_be_a_proof_is_told_by_a_look(said: bytes | None) -> None:
     assert not Verifier(LEASE, TOKEN).plausible(said)
 
 
-@pytest.mark.parametrize("said", [None, b"", b"\xc1", b"\x90", msgpack.packb({"lease": LEASE, "seq": 1})])
+MALFORMED = {
+    "nothing": None,
+    "no map": msgpack.packb([*WHOLE.values()]),
+    "nil": msgpack.packb(None),
+    "the bare token": TOKEN,
+    "no MessagePack": b"\xc1",
+    **{f"{name} is nil": packed({**WHOLE, name: None}) for name in WHOLE},
+    **{f"{name} is not there": packed({key: WHOLE[key] for key in WHOLE if key != name}) for name in WHOLE},
+    "a lease as text": packed({**WHOLE, "lease": LEASE.decode()}),
+    "a short lease": packed({**WHOLE, "lease": LEASE[1:]}),
+    "a long lease": packed({**WHOLE, "lease": LEASE + b"\x01"}),
+    "a short proof": packed({**WHOLE, "proof": PROOF[:15]}),
+    "no proof at all": packed({**WHOLE, "proof": b""}),
+    "a longer proof": packed({**WHOLE, "proof": PROOF + b"\x00"}),
+    "a proof as text": packed({**WHOLE, "proof": "0123456789abcdef"}),
+    "a negative number": packed({**WHOLE, "seq": -1}),
+    "a fraction": packed({**WHOLE, "seq": 9.5}),
+    "a truth": packed({**WHOLE, "seq": True}),
+    "more behind it": ATTACHMENT + b"\x00",
+    "much beside it": packed({**WHOLE, "x": bytes(200)}),
+    "deeply nested": b"\x91" * 100_000 + b"\xc0",
+    "deeply nested but short": ATTACHMENT.replace(b"\x83", b"\x84", 1) + b"\xa1x" + b"\x91" * 60,
+    **{f"cut at {size}": ATTACHMENT[:size] for size in range(len(ATTACHMENT))},
+}
+
+
+@pytest.mark.parametrize("said", MALFORMED.values(), ids=MALFORMED)
 def test_what_is_no_authorization_is_malformed(said: bytes | None) -> None:
-    with pytest.raises(Malformed, match=r"expected \{lease, seq, proof\}"):
+    with pytest.raises(Malformed, match=r"^malformed authorization: expected \{lease, seq, proof\}$"):
         read(said)
+
+
+def test_whatever_order_its_fields_have_and_however_long_they_are_written_it_is_read() -> None:
+    lease, proven = (bytes([0xC6, 0, 0, 0, len(value)]) + value for value in (LEASE, PROOF))
+    number = b"\xcf" + bytes(7) + b"\x09"
+    long = b"\xdf\0\0\0\x03" + b"\xda\0\5lease" + lease + b"\xda\0\3seq" + number + b"\xda\0\5proof" + proven
+    for said in (ATTACHMENT, packed(dict(reversed(WHOLE.items()))), long, packed({**WHOLE, "more": "to come"})):
+        assert read(said) == Authorization(lease=LEASE, seq=9, proof=PROOF)
 
 
 @pytest.mark.parametrize("missing", ["lease", "token"])
@@ -102,26 +122,14 @@ def test_nothing_that_prints_shows_the_token() -> None:
     assert "'" not in printed
 
 
-def test_an_authorization_travels_with_three_fields() -> None:
-    said = Authorization(lease=LEASE, seq=7, proof=proof(TOKEN, DRIVE, 7))
-    assert read(shown(LEASE, TOKEN, DRIVE, 7)) == said
-
-
-def test_what_was_proven_is_noted_once_and_only_as_it_was() -> None:
-    verifier = Verifier(LEASE, TOKEN)
-    attachment = Signer(GRANTED).command(DRIVE, PAYLOAD)
-    said = read(attachment)
+def test_what_was_proven_is_noted_once_and_only_as_it_was_and_notes_are_bounded() -> None:
+    verifier, said = Verifier(LEASE, TOKEN), read(ATTACHMENT)
     for key, payload in (("fleet/r1/@cmd/motor/a", PAYLOAD), (DRIVE, PAYLOAD + b"\0")):
-        verifier.note(attachment, said, DRIVE, PAYLOAD)
-        assert verifier.noted(attachment, key, payload) is None
-    verifier.note(attachment, said, DRIVE, PAYLOAD)
-    assert verifier.noted(attachment, DRIVE, PAYLOAD) == said
-    assert verifier.noted(attachment, DRIVE, PAYLOAD) is None
-
-
-def test_notes_are_bounded() -> None:
-    verifier = Verifier(LEASE, TOKEN)
-    said = read(Signer(GRANTED).command(DRIVE, PAYLOAD))
+        verifier.note(ATTACHMENT, said, DRIVE, PAYLOAD)
+        assert verifier.noted(ATTACHMENT, key, payload) is None
+    verifier.note(ATTACHMENT, said, DRIVE, PAYLOAD)
+    assert verifier.noted(ATTACHMENT, DRIVE, PAYLOAD) == said
+    assert verifier.noted(ATTACHMENT, DRIVE, PAYLOAD) is None
     for number in range(3 * NOTES):
         verifier.note(number.to_bytes(4, "big"), said, DRIVE, PAYLOAD)
     assert len(verifier._notes) <= NOTES

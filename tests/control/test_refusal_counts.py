@@ -5,30 +5,30 @@ from zbridge.control.wishes import NAMED
 from zbridge.errors import Code, NotReady
 
 
-def test_equal_refusals_are_counted_and_the_last_counted_is_shown_last() -> None:
-    counts = RefusalCounts()
-    counts.add("drive", NotReady("away"), "ann", None, 1)
-    counts.add("mode", NotReady("away"), "ann", None, 1)
-    shown = counts.add("drive", NotReady("away"), "ann", None, 3)
+def test_equal_refusals_are_counted_what_differs_in_anything_is_counted_apart_and_the_newest_is_last() -> None:
+    counts, away = RefusalCounts(), NotReady("away")
+    for command, refusal, who, by, count in (
+        ("drive", away, "ann", None, 1),
+        ("mode", away, "ann", None, 1),
+        ("drive", away, "bob", None, 1),
+        ("drive", away, "ann", "hq.toy", 1),
+        ("drive", NotReady("gone"), "ann", None, 1),
+        ("drive", NotReady("away", Code.BUSY), "ann", None, 1),
+        ("drive", away, "ann", None, 3),
+    ):
+        shown = counts.add(command, refusal, who, by, count)
     assert (shown.command, shown.count, shown.code) == ("drive", 4, Code.NOT_READY)
-    assert [(refusal.command, refusal.count) for refusal in counts.shown()] == [("mode", 1), ("drive", 4)]
-
-
-def test_what_differs_in_anything_that_is_shown_is_counted_apart() -> None:
-    counts = RefusalCounts()
-    counts.add("drive", NotReady("away"), "ann", None, 1)
-    counts.add("drive", NotReady("away"), "bob", None, 1)
-    counts.add("drive", NotReady("away"), "ann", "hq.toy", 1)
-    counts.add("drive", NotReady("gone"), "ann", None, 1)
-    counts.add("drive", NotReady("away", Code.BUSY), "ann", None, 1)
-    assert [refusal.count for refusal in counts.shown()] == [1] * 5
+    assert [refusal.count for refusal in counts.shown()] == [1, 1, 1, 1, 1, 4]
+    assert counts.shown()[-1] == shown
 
 
 def test_a_new_refusal_replaces_the_one_that_was_counted_least_recently() -> None:
     counts = RefusalCounts()
-    for number in range(REFUSALS + 1):
+    for number in range(2 * REFUSALS):
+        counts.add("always", NotReady("away"), None, None, 1)
         counts.add(f"c{number}", NotReady("away"), None, None, 1)
-    assert [refusal.command for refusal in counts.shown()] == [f"c{number}" for number in range(1, REFUSALS + 1)]
+    last = [f"c{number}" for number in range(REFUSALS + 1, 2 * REFUSALS)]
+    assert [refusal.command for refusal in counts.shown()] == [*last[:-1], "always", last[-1]]
 
 
 def test_names_and_reasons_are_shortened() -> None:

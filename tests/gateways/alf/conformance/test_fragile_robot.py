@@ -104,11 +104,7 @@ def test_the_cut_does_not_depend_on_the_reads_and_random_bytes_never_make_the_ju
         (Times(), [1, 0] * 250, {}),
         (Times(), [1] * 5 + [0] * 100 + [1] * 100, {10: "no drive command for 0.12 s"}),
         (Times(), [0] * 20, {12: "no drive command for 0.26 s"}),
-        (
-            Times(cycle_s=0.03125),
-            [1, 0] * 32,
-            {31: "16 drive commands in 1.00 s", 63: "16 drive commands in 1.00 s"},
-        ),
+        (Times(cycle_s=0.03125), [1, 0] * 32, dict.fromkeys((31, 63), "16 drive commands in 1.00 s")),
     ],
     ids=["every 20 ms", "every 40 ms", "a gap is noted once", "the first has more time", "every 62 ms"],
 )
@@ -324,14 +320,14 @@ async def test_neither_judge_finds_fault_with_the_other(dialect: Dialect) -> Non
         task = asyncio.create_task(hq.run("127.0.0.1", scene.peer.port))
         await until(lambda: hq.scans >= 2, hq)
         hq.drive(80, 0, right, True)
-        await until(lambda: hq.scans >= 12 and len(hq.infos) == 2, hq)
+        await until(lambda: hq.scans >= 12 and len(hq.infos) >= 2, hq)
         await (hq if dialect == "text" else vehicle).end()
         await task
     assert hq.violations == vehicle.violations == []
     assert hq.scanner == pytest.approx((-135.0, 119.882812, 0.351562, 100, 20, 5600), rel=1e-5)
     scans = [(seconds, fields) for seconds, kind, fields in hq.received if kind == 1]
     assert [fields[0] for _, fields in scans] == list(range(hq.scans))
-    assert scans[10][0] - scans[0][0] == pytest.approx(1.0, abs=0.3)
+    assert scans[10][0] - scans[0][0] > 0.7, "ten a second"
     assert scans[-1][1][2:] == (44, 725)
     assert all(0 <= point <= 5600 for point in hq.last_scan.points)
     assert any(point >= 20 for point in hq.last_scan.points[44:726])
@@ -366,7 +362,7 @@ async def simulating(laser_port: int | None, dialect: Dialect = "text") -> list[
 
 async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.LogCaptureFixture) -> None:
     hq, eye = await simulating(0)
-    with contextlib.closing(hq.peer), contextlib.closing(eye.peer):
+    async with asyncio.timeout(4 * LONG_S):
         assert (await eye.read())[0] == "2"
         before = [int(point) for point in (await eye.read())[3 + 44 : 3 + 726]]
         await hq.play(["repeat GOOD 0.02", f"repeat {b'3|100|0|0|0;'.hex()} 0.5"])
@@ -380,6 +376,8 @@ async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.Log
         await until(lambda: len(caplog.records) == 1, "one violation")
         await hq.play(["cancel", "kind 255"])
         await eye.kind("255")
+    hq.peer.close()
+    eye.peer.close()
     assert caplog.records[0].getMessage().startswith("violation, laser: id 3, of which")
 
 

@@ -43,7 +43,6 @@ LIMIT = text_limit(769)
         (b"255|1", "without ';'"),
         (b"255|1|1;", "2 fields"),
         (b"255|0;", "expected 1"),
-        (b"3|fast|0|30|1;", "3 fields"),
         (b"3|-1|0|30|1;", "speed"),
         (b"3|2147483648|0|30|1;", "speed"),
         (b"3|80|256|30|1;", "direction"),

@@ -1,6 +1,5 @@
 """Sessions of ALF in both roles and dialects: texts and bytes from the protocol page, by hand; time is an argument."""
 
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -59,13 +58,6 @@ def test_a_drive_link_says_speed_0_at_once_a_new_command_at_once_and_the_last_ev
 ) -> None:
     sent = until(hq(dialect), 0.05, *((at, command[dialect]) for at, command in driven))
     assert [(round(at * 1000), frame) for at, frame in sent] == [(at, frame[dialect]) for at, frame in sent_ms]
-
-
-def test_a_command_is_repeated_for_as_long_as_the_link_stands() -> None:
-    sent = until(hq(), 120.0)
-    assert {frame for _, frame in sent} == {NEUTRAL[TEXT]}
-    assert max(later - earlier for (earlier, _), (later, _) in pairwise(sent)) < 0.0201
-    assert sent[-1][0] > 119.9
 
 
 def test_two_messages_keep_the_gap_that_is_configured() -> None:

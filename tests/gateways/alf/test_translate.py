@@ -190,13 +190,12 @@ def test_the_geometry_gives_the_points_and_an_absurd_one_is_a_protocol_error(ang
         assert points_of(ScannerInit(*angles, 100, 20, 5600)) == points
 
 
-@pytest.mark.parametrize(("from_scanner", "count", "other"), [(False, 769, 726), (True, 726, 769)])
-def test_the_number_of_points_is_what_is_configured_or_taken_from_the_scanner(from_scanner, count, other) -> None:
-    wire = Wire(points=769, points_from_scanner=from_scanner)
-    assert wire.one(INIT[TEXT]).points == count
-    assert len(wire.one(b"1|7|5000|" + b"1000|" * count + b"0|725;").ranges) == count
-    assert wire.told(b"1|8|5100|" + b"1000|" * other + b"0|725;") == []
-    assert wire.sessions[0].last_malformed == f"measurement of {other} points, expected {count}"
+def test_a_measurement_has_the_points_that_are_configured() -> None:
+    wire = Wire(points=769)
+    assert wire.one(INIT[TEXT]).points == 769
+    assert len(wire.one(b"1|7|5000|" + b"1000|" * 769 + b"0|725;").ranges) == 769
+    assert wire.told(b"1|8|5100|" + b"1000|" * 726 + b"0|725;") == []
+    assert wire.sessions[0].last_malformed == "measurement of 726 points, expected 769"
 
 
 @pytest.mark.parametrize(
@@ -206,7 +205,7 @@ def test_the_number_of_points_is_what_is_configured_or_taken_from_the_scanner(fr
         (BINARY, bytes.fromhex("01 07000000 88130000" + "e803000000000000" * 726 + "00000000 d5020000")),
     ],
 )
-def test_the_number_of_points_counts_from_the_first_measurement_on_however_the_stream_is_cut(
+def test_the_points_that_the_scanner_tells_count_from_the_first_measurement_on_however_the_stream_is_cut(
     dialect: Dialect, measurement: bytes
 ) -> None:
     """Binary framing depends on it: a measurement in the same read as its scanner init must not be cut wrong."""
@@ -215,6 +214,7 @@ def test_the_number_of_points_counts_from_the_first_measurement_on_however_the_s
         wire = Wire(links=2, dialect=dialect.value, points_from_scanner=True)
         told = wire.told(stream[:cut], link=1) + wire.told(stream[cut:], link=1)
         assert [type(message) for message in told] == [Scanner] + [Scan] * 3
+        assert told[0].points == len(told[1].ranges) == 726
         assert wire.sessions[1].traffic.malformed == 0
 
 
@@ -316,7 +316,7 @@ def test_a_stop_replaces_a_drive_that_waits() -> None:
 def test_only_the_drive_link_gets_commands_and_both_give_telemetry() -> None:
     wire = Wire(links=2)
     assert (wire.robot.link_names, Wire().robot.link_names) == (("drive", "laser"), ("vehicle",))
-    assert wire.robot.driving is wire.sessions[0]
+    assert (wire.robot.driving, wire.robot.dialect) == (wire.sessions[0], "text")
     assert wire.command("forward 0.5") == b"3|50|0|0|0;"
     wire.sessions[1].lost("closed by peer")
     wire.connect(1)

@@ -6,6 +6,7 @@ import logging
 import random
 import socket
 import time
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -16,6 +17,7 @@ from gateways.alf.conformance.fragile_hq import FragileHq
 from gateways.alf.conformance.fragile_robot import FragileVehicle, simulate_fragile
 from gateways.alf.conformance.machine import Machine
 from gateways.alf.conformance.parser import Dialect, Repeats, Times
+from tests.captures import payloads
 from tests.conformance.scene import LONG_S, Peer, serving, until
 from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, conversations
 
@@ -114,13 +116,21 @@ def test_a_rhythm_that_is_too_slow_is_noted(times: Times, commands: list[int], p
     assert {cycle: problem for cycle, problem in enumerate(told) if problem} == problems
 
 
-def test_a_seed_gives_the_same_vehicle_and_any_number_of_points_has_its_valid_indices_inside() -> None:
+def test_the_recorded_hq_is_not_reproached() -> None:
+    reader, repeats = parser.reader("text", {3, 255}, 100), Repeats(Times())
+    records = payloads("alf-drive.hex", destination=16668)
+    heard = [(record.seconds, one.problem) for record in records for one in reader.take(record.payload)]
+    assert [problem for _, problem in heard] == [""] * 115
+    cycles = Counter(int(seconds / 0.02) for seconds, _ in heard)
+    assert not any(repeats.cycle(0.02, cycles[number]) for number in range(116))
+
+
+def test_any_number_of_points_has_its_valid_indices_inside_and_a_seed_gives_the_same_measurement() -> None:
     for points in (1, 10, 726, 1081):
         one, two = (Machine(random.Random(5), points).measure() for _ in range(2))
-        *ranges, first, last = one
         assert one == two
-        assert len(ranges) == points
-        assert 0 <= first <= last < points
+        assert len(one) == points + 2
+        assert 0 <= one[-2] <= one[-1] < points
 
 
 # Conversations
@@ -249,22 +259,6 @@ send a laser nothing [laser, hasty]: wait 0.3 / kind 1 / quiet
 )
 async def test_an_hq_may(options: dict[str, Any], steps: list[str]) -> None:
     await played(options, steps)
-
-
-async def test_the_recorded_hq_is_not_reproached() -> None:
-    """Stretches of ``alf-drive.hex``: seconds between segments, and messages in a segment."""
-    idle = [(0.0201, 1)] * 14 + [(0.0202, 1), (0.0422, 2), (0.0182, 1)]
-    driving = [(0.0201, 1)] * 6 + [(0.0416, 2), (0.0189, 1), (0.0202, 1), (0.0201, 1), (0.0407, 2)]
-    driving += [(0.044, 2)] * 5 + [(0.044, 3), (0.0439, 2), (0.0363, 2)]
-    vehicle = FragileVehicle("text", laser=False, drive=True)
-    async with connected(vehicle) as hq:
-        for name, segments in (("GOOD", idle), ("FORWARD", driving)):
-            for seconds, count in segments:
-                await hq.peer.send_bytes(hq.raw(name) * count)
-                await asyncio.sleep(seconds)
-        await hq.play(["begin_end", "kind 255", "> END", "close", "end_ended", "ok"])
-    stands, drives, end = (3, (0, 0, 0, 0)), (3, (80, 0, 30, 1)), (255, (1,))
-    assert [(kind, fields) for _, kind, fields in vehicle.received] == [stands] * 18 + [drives] * 30 + [end]
 
 
 async def test_a_process_that_is_late_itself_reproaches_nobody() -> None:

@@ -23,6 +23,7 @@ def until(session: Any, end: float, *driven: tuple[float, DriveCommand]) -> list
     while now < end:
         while commands and commands[0][0] <= now:
             session.drive(commands.pop(0)[1], now)
+            assert session.deadline() == pytest.approx(now), "a new command goes out at once"
         sent += [(now, frame) for frame in drained(session, now)]
         due = min(session.deadline() or end, commands[0][0] if commands else end)
         assert due > now, "a timer that is due at once again"

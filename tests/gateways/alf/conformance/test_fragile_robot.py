@@ -71,7 +71,7 @@ UNKNOWN = ", of which this server knows nothing"
 )
 def test_what_is_wrong_in_a_message_is_told_and_whether_it_kills_a_vehicle(data: bytes, problem: str) -> None:
     (heard,) = parser.reader("text" if data[-1:] in b";|" else "binary", {3, 255}, 100).take(data)
-    assert "deadly: " * heard.deadly + heard.problem == problem
+    assert (heard.deadly, heard.problem) == (problem.startswith("deadly: "), problem.removeprefix("deadly: "))
 
 
 def test_full_speed_is_a_setting_and_a_laser_knows_no_commands() -> None:

@@ -1,16 +1,17 @@
 """The simulated vehicle itself: what commands make it do, what it sees, and what it says of itself."""
 
+import asyncio
 import math
 
 import numpy as np
 import pytest
 
 from gateways.alf import PROTOCOL
+from gateways.alf.conformance.fragile_hq import FragileHq
 from gateways.alf.messages import Dialect, DriveCommand, DriveInfo, ScannerInit
-from gateways.alf.session import HqRole, VehicleRole
 from gateways.alf.simulator import SCANNER, SPEED_M_S, TEMPERATURE, Car
-from tests.gateways.alf.golden import BINARY, TEXT, session
-from tests.gateways.rig import drained
+from tests.conformance.scene import until
+from tests.gateways.alf.golden import BINARY, TEXT
 from zbridge.errors import ConfigError
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Simulation
@@ -195,15 +196,21 @@ def test_info_says_how_fast_it_turns_and_what_pulls_it_to_the_side(right_deg: in
 
 
 @pytest.mark.parametrize("dialect", Dialect)
-@pytest.mark.parametrize("speed", [0, 255])
-def test_everything_it_says_can_be_sent_and_is_read_back(speed: int, dialect: Dialect) -> None:
-    told = car(dialect=dialect)
-    sender, reader = (session(kind, dialect, points=769) for kind in (VehicleRole, HqRole))
-    for right_deg in (-90, 90):
-        live(told, 0.5, command(speed, right_deg, dialect=dialect))
-        for message in (SCANNER, told.measure(), told.info()):
-            sender.send(message)
-            assert [type(one) for one in reader.receive(b"".join(drained(sender)), 0.0)] == [type(message)]
+async def test_the_judges_find_no_fault_with_its_two_links(dialect: Dialect) -> None:
+    ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    simulation = Simulation((Address("127.0.0.1", 0),) * 2, dialect=dialect.value, ready=ready.set_result)
+    driver = FragileHq(dialect=dialect.value, serves="drive")
+    viewer = FragileHq(dialect=dialect.value, serves="laser", repeat_s=None)
+    driver.drive(50, 0, 45)  # half right in text, half left in binary
+    async with asyncio.timeout(20.0), asyncio.TaskGroup() as tasks:
+        vehicle = tasks.create_task(PROTOCOL.simulate(simulation))
+        for judge, address in zip((driver, viewer), await ready, strict=True):
+            tasks.create_task(judge.run(address.host, address.port))
+        await until(lambda: driver.infos and driver.infos[-1][0] == 50 and viewer.scans > 2)
+        await driver.end()
+        await viewer.end()
+        vehicle.cancel()
+    assert driver.violations == viewer.violations == []
 
 
 async def test_what_a_vehicle_has_not_is_refused() -> None:

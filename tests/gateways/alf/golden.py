@@ -24,39 +24,50 @@ TEXT, BINARY = Dialect.TEXT, Dialect.BINARY
 OF_VEHICLE, OF_HQ = frozenset({1, 2, 4, 255}), frozenset({3, 255})
 ALL = OF_VEHICLE | OF_HQ
 
-MEASUREMENT_BYTES = bytes.fromhex(
-    "01 07000000 88130000"  # sequence 7, counter 5000
-    "e803000000000000 0000000000000000 fdffffffffffffff"  # 1000, 0, -3 mm
-    "01000000 02000000"
-)
-INIT_BYTES = bytes.fromhex("02 000007c3 00c4ef42 0000b43e 64000000 14000000 e0150000")
-DRIVE_BYTES = bytes.fromhex("03 50 00 78 01")
-INFO_BYTES = bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 00001242")
-END_BYTES = bytes.fromhex("ff 01")
+INIT = {
+    TEXT: b"2|-135.000000|119.882812|0.351562|100|20|5600;",
+    BINARY: bytes.fromhex("02 000007c3 00c4ef42 0000b43e 64000000 14000000 e0150000"),
+}
+"""In binary 119.8828125 and 0.3515625 degrees."""
+NEUTRAL = {TEXT: b"3|0|0|0|0;", BINARY: bytes.fromhex("03 00 00 5a 00")}
+DRIVE = {TEXT: b"3|80|0|30|1;", BINARY: bytes.fromhex("03 50 00 78 01")}
+INFO = {
+    TEXT: b"4|10|0.250000|-0.500000|0.987654|1.500000|-2.750000|123.456001|36.529999;",
+    BINARY: bytes.fromhex("04 0a fa00 0cfe e803 0f00 e5ff d204 00001242"),
+}
+END = {TEXT: b"255|1;", BINARY: bytes.fromhex("ff 01")}
 
-GOLDEN_TEXT: list[tuple[AlfMessage, bytes]] = [
-    (Measurement(7, 5000, np.array([1000, 0, 2147483647]), 1, 2), b"1|7|5000|1000|0|2147483647|1|2;"),
-    (ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600), b"2|-135.000000|119.882812|0.351562|100|20|5600;"),
-    (DriveCommand(80, 0, -30, True), b"3|80|0|-30|1;"),
-    (DriveCommand(255, 1, 90, False), b"3|255|1|90|0;"),
-    (
-        DriveInfo(10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999),
-        b"4|10|0.250000|-0.500000|0.987654|1.500000|-2.750000|123.456001|36.529999;",
-    ),
-    (End(), b"255|1;"),
-]
-GOLDEN_BINARY: list[tuple[AlfMessage, bytes]] = [
-    (Measurement(7, 5000, np.array([1000, 0, -3]), 1, 2), MEASUREMENT_BYTES),
-    (ScannerInit(-135.0, 119.8828125, 0.3515625, 100, 20, 5600), INIT_BYTES),
-    (DriveCommand(80, 0, 120, True), DRIVE_BYTES),
-    (DriveCommand(255, 1, 0, False), bytes.fromhex("03 ff 01 00 00")),
-    (DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5), INFO_BYTES),
-    (End(), END_BYTES),
-]
+STANDS = {TEXT: DriveCommand(0, 0, 0, False), BINARY: DriveCommand(0, 0, 90, False)}
+DRIVES = {TEXT: DriveCommand(80, 0, 30, True), BINARY: DriveCommand(80, 0, 120, True)}
+MOVES = {
+    TEXT: DriveInfo(10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999),
+    BINARY: DriveInfo(10, 250, -500, 1000, 15, -27, 1234, 36.5),
+}
+GOLDEN: dict[Dialect, list[tuple[AlfMessage, bytes]]] = {
+    TEXT: [
+        (Measurement(7, 5000, np.array([1000, 0, 2147483647]), 1, 2), b"1|7|5000|1000|0|2147483647|1|2;"),
+        (ScannerInit(-135.0, 119.882812, 0.351562, 100, 20, 5600), INIT[TEXT]),
+        (DRIVES[TEXT], DRIVE[TEXT]),
+        (DriveCommand(255, 1, -90, False), b"3|255|1|-90|0;"),
+        (MOVES[TEXT], INFO[TEXT]),
+        (End(), END[TEXT]),
+    ],
+    BINARY: [
+        (
+            Measurement(7, 5000, np.array([1000, 0, -3]), 1, 2),
+            bytes.fromhex("01 07000000 88130000 e803000000000000 0000000000000000 fdffffffffffffff 01000000 02000000"),
+        ),
+        (ScannerInit(-135.0, 119.8828125, 0.3515625, 100, 20, 5600), INIT[BINARY]),
+        (DRIVES[BINARY], DRIVE[BINARY]),
+        (DriveCommand(255, 1, 0, False), bytes.fromhex("03 ff 01 00 00")),
+        (MOVES[BINARY], INFO[BINARY]),
+        (End(), END[BINARY]),
+    ],
+}
 
 
-def session(kind: type[AlfSession], dialect: Dialect, points: int = 3) -> AlfSession:
-    made = kind(dialect, points=points)
+def session(kind: type[AlfSession], dialect: Dialect, *, points: int = 3, **options: Any) -> Any:
+    made = kind(dialect, points=points, **options)
     made.open(0.0)
     return made
 
@@ -68,9 +79,7 @@ def heard(by: AlfSession, *reads: bytes) -> list[list[Any]]:
 def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
     """What ``kind`` is sent."""
     sender, ids = ("vehicle", OF_VEHICLE) if kind is HqRole else ("hq", OF_HQ)
-    table, read, write = (
-        (GOLDEN_TEXT, read_text, write_text) if dialect is TEXT else (GOLDEN_BINARY, read_binary, write_binary)
-    )
+    read, write = (read_text, write_text) if dialect is TEXT else (read_binary, write_binary)
 
     def receiver() -> Receive:
         by = session(kind, dialect)
@@ -78,7 +87,7 @@ def _side(kind: type[AlfSession], dialect: Dialect) -> Side:
 
     return Side(
         f"alf-{dialect.value}-{sender}",
-        [(message, frame) for message, frame in table if message.spec.id in ids],
+        [(message, frame) for message, frame in GOLDEN[dialect] if message.spec.id in ids],
         lambda frame: read(frame, ids),
         write,
         receiver,

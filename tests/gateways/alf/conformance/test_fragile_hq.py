@@ -2,50 +2,109 @@
 
 import asyncio
 import contextlib
-import struct
-import time
-from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq, simulate_fragile_hq
+from gateways.alf.conformance.fragile_hq import FragileHq, Reader, simulate_fragile_hq
 from gateways.alf.conformance.parser import Dialect
 from tests.captures import stream
-from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
+from tests.conformance.scene import LONG_S, Listening, calling, until
+from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, conversations
 
-DIALECTS: tuple[Dialect, ...] = ("text", "binary")
 POINTS = 5
 """Of a measurement in most tests."""
-NAN, INFINITY = bytes.fromhex("00 00 c0 7f"), bytes.fromhex("00 00 80 7f")
-INIT: dict[Dialect, bytes] = {
-    "text": b"2|-135.000000|119.882812|0.351562|100|20|5600;",
-    "binary": bytes.fromhex("02 00 00 07 c3 00 c4 ef 42 00 00 b4 3e 64 00 00 00 14 00 00 00 e0 15 00 00"),
-}
-SCAN: dict[Dialect, bytes] = {
-    "text": b"1|7|5000|0|-1|20|5600|3|1|4;",
-    "binary": bytes.fromhex("01 07 00 00 00 88 13 00 00")
-    + struct.pack("<5q", 0, -1, 20, 5600, 3)
-    + bytes.fromhex("01 00 00 00 04 00 00 00"),
-}
-INFO: dict[Dialect, bytes] = {
-    "text": b"4|10|0.250000|-0.500000|0.987654|1.500000|-2.750000|123.456001|36.529999;",
-    "binary": bytes.fromhex("04 0a fa 00 0c fe e8 03 0f 00 e5 ff d2 04 00 00 12 42"),
-}
-END: dict[Dialect, bytes] = {"text": b"255|1;", "binary": b"\xff\x01"}
-NEUTRAL: dict[Dialect, bytes] = {"text": b"3|0|0|0|0;", "binary": bytes.fromhex("03 00 00 5a 00")}
+INFO = MESSAGES["INFO"]["text"]
+SCAN_BYTES, INFO_BYTES = MESSAGES["SCAN"]["binary"], MESSAGES["INFO"]["binary"]
+STANDARD = "not written as std::to_string prints numbers"
 
 
-class Vehicle(Listening):
-    send = Listening.send_bytes
+# Messages
 
 
-@contextlib.asynccontextmanager
-async def facing(hq: FragileHq) -> AsyncIterator[tuple[Vehicle, "asyncio.Task[None]"]]:
-    async with calling(hq, Vehicle(), Scene) as scene:
-        await scene.peer.accept()
-        await hq.connected.wait()
-        yield scene.peer, scene.task
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_the_cut_does_not_depend_on_the_reads(dialect: Dialect) -> None:
+    data = b"".join(MESSAGES[name][dialect] for name in ("INIT", "SCAN", "INFO", "END"))
+    infos = {
+        "text": (10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999),
+        "binary": (10, 250, -500, 1000, 15, -27, 1234, 36.5),
+    }
+    for size in (1, 2, 3, 10, 1000):
+        reader = Reader(dialect, POINTS)
+        told = [one for at in range(0, len(data), size) for one in reader.take(data[at : at + size])]
+        assert [(one.kind, one.problem) for one in told] == [(2, ""), (1, ""), (4, ""), (255, "")]
+        assert told[0].fields == pytest.approx((-135.0, 119.88, 0.351562, 100, 20, 5600), rel=1e-4)
+        assert [one.fields for one in told[1:]] == [(7, 5000, 0, -1, 20, 5600, 3, 1, 4), infos[dialect], (1,)]
+        assert reader.rest == b""
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"1|2147483647|2147483647|2147483647|0|0|0|0|0|0;", ""),
+        (b"4|0|-0.000000|3000000000.000000|0.000000|0.000000|0.000000|0.000000|0.000000;", ""),
+        (b"1|7|5000|0|-1|20|5600|1|4;", "8 fields instead of 9"),
+        (b"1|7|5000|0|-1|20|5600|3|1|5;", "valid indices 1 and 5 of 5 points"),
+        (b"1|7|5000|0|-1|20|5600|3|-1|4;", "valid indices -1 and 4 of 5 points"),
+        (b"1|-7|5000|0|-1|20|5600|3|1|4;", "sequence -7, timestamp 5000: below 0"),
+        (b"1|7|5000|0|-1|20.0|5600|3|1|4;", STANDARD),
+        (b"2|-135|119.882812|0.351562|100|20|5600;", STANDARD),
+        (INFO.replace(b"0.250000", b"0.25"), STANDARD),
+        (INFO.replace(b"0.250000", b"2.5e-01"), "9 fields instead of 8"),
+        (INFO.replace(b"0.250000", b"inf"), "7 fields instead of 8"),
+        (INFO.replace(b"4|10", b"4|010"), STANDARD),
+        (b"\n" + INFO, STANDARD),
+        (b"3|0|0|0|0;", "id 3, which no vehicle sends"),
+        (b"hello;", "a message without an id"),
+        (b"255|2;", "end 2 instead of 1"),
+        (SCAN_BYTES[:-4] + b"\5\0\0\0", "valid indices 1 and 5 of 5 points"),
+        (INFO_BYTES[:-4] + bytes.fromhex("0000807f"), "an infinite number"),
+        (b"\xff\x02", "end 2 instead of 1"),
+        (b"1|7|5000|0|-1|20|5600|3|3|1|4;", "deadly: 6 points instead of 5"),
+        (b"1|2147483648|5000|0|-1|20|5600|3|1|4;", "deadly: an integer over 2^31-1, 2147483648"),
+        (b"1|7|5000|0|-1|" + b"9" * 5000 + b"|5600|3|1|4;", "deadly: an integer over 2^31-1, 99999999999999999999"),
+        (INFO.replace(b"-0.500000", b"-.500000"), "deadly: a number without leading digit, -.500000"),
+        (INFO.replace(b"0.250000", b"-NaN"), "deadly: NaN"),
+        (b"1|" * 40_000, "deadly: a message without end, 80000 bytes"),
+        (INFO_BYTES[:-4] + bytes.fromhex("0000c07f"), "deadly: NaN"),
+        (b"\x01\0\0\0\x80" + SCAN_BYTES[5:], "deadly: an integer over 2^31-1, 2147483648"),
+        (SCAN_BYTES[:9] + b"\0\0\0\x80\0\0\0\0" + SCAN_BYTES[17:], "deadly: an integer over 2^31-1, 2147483648"),
+        (b"\x03\0\0\x5a\0", "deadly: id 3, which no vehicle sends: the framing is lost"),
+    ],
+)
+def test_what_is_wrong_in_a_message_is_told_and_whether_it_breaks_an_hq(data: bytes, problem: str) -> None:
+    (told,) = Reader("text" if data[-1:] in b";|" else "binary", POINTS).take(data)
+    assert (told.deadly, told.problem) == (problem.startswith("deadly: "), problem.removeprefix("deadly: "))
+
+
+# Conversations
+
+
+class Vehicle(AlfScene):
+    """A vehicle: what it sends and what it reads."""
+
+    async def reads(self, text: str) -> None:
+        await self.peer.read_until(self.raw(text))
+
+    async def scans(self, count: str) -> None:
+        await until(lambda: self.judge.scans >= int(count), self.judge.events)
+        assert self.judge.scans == int(count)
+
+    async def infos(self, count: str) -> None:
+        await until(lambda: len(self.judge.infos) >= int(count), self.judge.events)
+        assert len(self.judge.infos) == int(count)
+
+    async def drive(self, command: str) -> None:
+        self.judge.drive(*map(int, command.split()))
+
+    async def idle(self, _: str) -> None:
+        self.judge.idle()
+
+    async def fill(self, _: str) -> None:
+        """Send until the window of the HQ closes."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self.peer.tcp.send(bytes(65536))
 
 
 def viewer(dialect: Dialect = "text", **options: Any) -> FragileHq:
@@ -53,364 +112,112 @@ def viewer(dialect: Dialect = "text", **options: Any) -> FragileHq:
     return FragileHq(dialect=dialect, **{"points": POINTS, "repeat_s": None, "serves": "both", **options})
 
 
-async def after(data: bytes, hq: FragileHq) -> FragileHq:
-    """Send this, close, and give the HQ as it is then."""
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await vehicle.send(data)
-        vehicle.close()
-        await task
+async def played(hq: FragileHq, *steps: str) -> FragileHq:
+    """The HQ after a conversation."""
+    peer = Listening()
+    async with calling(hq, peer, Vehicle) as scene, asyncio.timeout(LONG_S):
+        await peer.accept()
+        await hq.connected.wait()
+        await scene.play(list(steps))
     return hq
 
 
-# A vehicle that behaves
+OPTIONS: dict[str, dict[str, Any]] = {
+    "binary": {"dialect": "binary"},
+    "hurried": {"answer_s": 0.05},
+    "driving": {"repeat_s": 0.002},
+    **{serves: {"serves": serves} for serves in ("auto", "drive", "laser")},
+    "late": {"flight_s": 0.0},
+    "early": {"flight_s": 60.0},
+    **{f"{deployed}_program": {"deployed": deployed} for deployed in ("driving", "scanning")},
+    "one_scan": {"stops_reading_after": 1},
+}
 
 
-@pytest.mark.parametrize("size", [1, 10, 1000])
-@pytest.mark.parametrize("dialect", DIALECTS)
-async def test_messages_may_come_split_or_joined(dialect: Dialect, size: int) -> None:
-    hq = viewer(dialect)
-    sent = INIT[dialect] + SCAN[dialect] + INFO[dialect] + SCAN[dialect] + END[dialect]
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        for start in range(0, len(sent), size):
-            await vehicle.send(sent[start : start + size])
-            await asyncio.sleep(0)
-        assert await vehicle.read_to_the_end() == END[dialect]
-        vehicle.close()
-        await task
-    assert hq.violations == []
-    assert hq.events == ["END", "the vehicle closed: EOF"]
-    assert hq.alive
-    assert hq.scans == 2
-    assert hq.last_scan == (7, 5000, (0, -1, 20, 5600, 3), 1, 4)
-    assert hq.scanner == pytest.approx((-135.0, 119.88, 0.351562, 100, 20, 5600), rel=1e-4)
-    assert [one[0] for one in hq.infos] == [10]
-    assert [one[1] for one in hq.received] == [2, 1, 4, 1, 255]
-    assert hq.received[1][2] == (7, 5000, 1, 4)
+@conversations(
+    """
+a measurement before the scanner init: > SCAN END / close / over / !! a measurement before the scanner init
+a close without END: > INIT / close / over / !! the vehicle closed without END: EOF
+a close within a message: say 4|10 / close / over / ! the connection ended within a message: '4|10'
+    / ! the vehicle closed without END / noted 2
+a reset: reset / over / !! the vehicle closed without END: ConnectionResetError
+a message after END: > END INFO / close / over / !! a message after END:
+no close after END [hurried]: > END / over / !! the vehicle did not close within 0.05 s of both ENDs
+no answer to END [hurried]: begin_end / over / rest END / !! no END within 0.05 s of the HQ's
+the laser from a drive listener [drive]: > INIT SCAN INFO END / close / over / ! message 2 from a listener
+    / ! message 1 from a listener / noted 2
+drive info from a laser listener [laser]: > INIT SCAN INFO END / close / over / !! message 4 from a listener
+drive info to who does not drive [auto]: > INIT SCAN INFO END / close / over / !! message 4 from a listener
+the laser to who drives [driving, auto, late]: reads GOOD / > INFO INIT SCAN INFO / infos 2 / ! message 2 from
+    / ! message 1 from / noted 2
+the laser to who drives, on its way [driving, auto, early]: reads GOOD / > INIT SCAN INFO / infos 1 / ok
+drive info to the scanning program [scanning_program]: > INIT SCAN INFO SCAN END / close / over / scans 1
+    / !! message 4 taken as END, it shows nothing more:
+the laser to the scanning program, which sends no commands [scanning_program, driving]: > INIT SCAN SCAN / scans 2
+    / cancel / rest END / ok
+an integer over 2^31-1: > INIT / say 99999999999|1; / died an integer over 2^31-1, 99999999999: '99999999999|1;' / rest
+""",
+    **OPTIONS,
+)
+async def test_what_the_judge_says_of(options: dict[str, Any], steps: list[str]) -> None:
+    await played(viewer(**options), *steps)
 
 
-async def test_the_fields_of_an_info() -> None:
-    text = await after(INFO["text"], viewer())
-    assert text.infos == [(10, 0.25, -0.5, 0.987654, 1.5, -2.75, 123.456001, 36.529999)]
-    binary = await after(INFO["binary"], viewer("binary"))
-    assert binary.infos == [(10, 250, -500, 1000, 15, -27, 1234, 36.5)]
+@conversations(
+    """
+stands at first and repeats its command for ever [driving]: < GOOD GOOD GOOD / drive 80 0 30 1 / reads FORWARD FORWARD
+    / idle / reads GOOD GOOD
+stands at first and repeats its command for ever [driving, binary]: < GOOD GOOD / drive 80 0 120 1
+    / reads FORWARD FORWARD
+answers END: > INIT SCAN INFO SCAN END / rest END / close / over / ok / scans 2 / infos 1 / ? END
+    / ? the vehicle closed: EOF / told 2
+answers END [binary]: > INIT SCAN END / rest END / close / over / ok
+ends with END and takes the answer: begin_end / < END / > INFO END / rest / close / over / end_ended / infos 1 / ok
+    / begin_end / end_ended
+ends with END and takes the answer [binary]: begin_end / < END / > INFO END / rest / close / over / end_ended / ok
+leaves with END when cancelled: cancel / rest END / ok
+reads no more after ten measurements and goes on driving [driving_program, driving]:
+    > INIT SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN SCAN / say 1|broken;nan; / > END / scans 10 / reads GOOD GOOD
+    / fill / close / over / scans 10 / ok / ? it reads no more, after 10 measurements
+ends although it reads no more [one_scan]: > INIT SCAN / scans 1 / begin_end / end_ended / over / rest END / ok
+""",
+    **OPTIONS,
+)
+async def test_the_program(options: dict[str, Any], steps: list[str]) -> None:
+    await played(viewer(**options), *steps)
 
 
 @pytest.mark.parametrize(("name", "port", "scans"), [("alf-drive.hex", 16668, 0), ("alf-laser.hex", 16667, 6)])
 async def test_the_captures_have_no_violation(name: str, port: int, scans: int) -> None:
-    hq = await after(stream(name, source=port), FragileHq(repeat_s=None, serves="laser" if scans else "drive"))
-    assert hq.violations == []
-    assert hq.scans == scans
-    assert len(hq.infos) == (0 if scans else 6)
+    hq = FragileHq(repeat_s=None, serves="laser" if scans else "drive")
+    await played(hq, f"> {stream(name, source=port).hex()}", "close", "over", "ok")
+    assert (hq.scans, len(hq.infos)) == (scans, 0 if scans else 6)
+    assert [kind for _, kind, _ in hq.received] == ([2] + [1] * 6 if scans else [4] * 6) + [255]
 
 
-async def test_the_largest_numbers_break_nothing() -> None:
-    scan = b"1|2147483647|2147483647|2147483647|0|0|0|0|0|0;"
-    info = b"4|0|-0.000000|3000000000.000000|0.000000|0.000000|0.000000|0.000000|0.000000;"
-    hq = await after(INIT["text"] + scan + info + END["text"], viewer())
-    assert hq.violations == []
-    assert hq.infos[0][2] == 3e9
+def test_it_is_no_other_hq_and_sends_nothing_that_none_sends() -> None:
+    for options in ({"dialect": "morse"}, {"serves": "tea"}):
+        with pytest.raises(ValueError, match="no such HQ"):
+            FragileHq(**options)  # type: ignore[arg-type]
+    for hq, *command in ((viewer(), 256), (viewer(), 0, 2), (viewer(), 0, 0, 91), (viewer("binary"), 0, 0, -1)):
+        with pytest.raises(ValueError, match="speed"):
+            hq.drive(*command)
 
 
-# A vehicle that does not
-
-
-@pytest.mark.parametrize(
-    ("dialect", "data", "words"),
-    [
-        ("text", SCAN["text"], "a measurement before the scanner init"),
-        ("text", INIT["text"] + b"1|7|5000|0|-1|20|5600|1|4;", "8 fields instead of 9: "),
-        ("text", INIT["text"] + b"1|7|5000|0|-1|20|5600|3|1|5;", "valid indices 1 and 5 of 5 points"),
-        ("text", INIT["text"] + b"1|7|5000|0|-1|20|5600|3|5|4;", "valid indices 5 and 4 of 5 points"),
-        ("text", INIT["text"] + b"1|7|5000|0|-1|20|5600|3|-1|4;", "valid indices -1 and 4 of 5 points"),
-        ("text", INIT["text"] + b"1|-7|5000|0|-1|20|5600|3|1|4;", "sequence -7, timestamp 5000: below 0"),
-        ("text", INIT["text"] + b"1|7|5000|0|-1|20.0|5600|3|1|4;", "not written as std::to_string"),
-        ("text", INIT["text"][:-1] + b"|1;", "7 fields instead of 6"),
-        ("text", b"2|-135|119.882812|0.351562|100|20|5600;", "not written as std::to_string"),
-        ("text", INFO["text"].replace(b"0.250000", b"0.25"), "not written as std::to_string"),
-        ("text", INFO["text"].replace(b"0.250000", b"2.5e-01"), "9 fields instead of 8"),
-        ("text", INFO["text"].replace(b"0.250000", b"inf"), "7 fields instead of 8"),
-        ("text", INFO["text"].replace(b"4|10", b"4|10.000000"), "not written as std::to_string"),
-        ("text", INFO["text"].replace(b"4|10", b"4|010"), "not written as std::to_string"),
-        ("text", b"\n" + INFO["text"], "not written as std::to_string"),
-        ("text", b"3|0|0|0|0;", "id 3, which no vehicle sends"),
-        ("text", b"hello;", "a message without an id"),
-        ("text", b"255|2;", "end 2 instead of 1"),
-        ("binary", SCAN["binary"], "a measurement before the scanner init"),
-        ("binary", INIT["binary"] + SCAN["binary"][:-4] + b"\5\0\0\0", "valid indices 1 and 5 of 5 points"),
-        ("binary", INFO["binary"][:-4] + INFINITY, "an infinite number"),
-        ("binary", b"\xff\x02", "end 2 instead of 1"),
-    ],
-)
-async def test_what_the_page_forbids_is_a_violation(dialect: Dialect, data: bytes, words: str) -> None:
+async def test_lists_are_bounded_and_every_violation_is_told() -> None:
     told: list[str] = []
-    end = b"" if words.startswith("end") else END[dialect]
-    hq = await after(data + end, viewer(dialect, note=told.append))
-    assert len(hq.violations) == 1, hq.violations
-    assert hq.violations[0].startswith(words)
-    assert told == hq.violations
-    assert hq.alive
+    hq = await played(
+        viewer(keep=3, note=told.append), "say " + "3|1;" * 10, "> INFO INFO INFO INFO END", "close", "over"
+    )
+    assert (len(hq.violations), len(hq.received), len(hq.infos), len(told)) == (3, 3, 3, 10)
 
 
-@pytest.mark.parametrize(
-    ("dialect", "data", "words"),
-    [
-        ("text", b"1|7|5000|0|-1|20|5600|3|3|1|4;", "6 points instead of 5"),
-        ("text", b"1|2147483648|5000|0|-1|20|5600|3|1|4;", "an integer over 2^31-1, 2147483648"),
-        ("text", b"1|7|4294967295|0|-1|20|5600|3|1|4;", "an integer over 2^31-1, 4294967295"),
-        ("text", b"1|7|5000|0|-1|" + b"9" * 5000 + b"|5600|3|1|4;", "an integer over 2^31-1, 99999"),
-        ("text", b"99999999999|1;", "an integer over 2^31-1, 99999999999"),
-        ("text", INFO["text"].replace(b"0.250000", b".250000"), "a number without leading digit, .250000"),
-        ("text", INFO["text"].replace(b"-0.500000", b"-.500000"), "a number without leading digit, -.500000"),
-        ("text", INFO["text"].replace(b"0.250000", b"nan"), "NaN"),
-        ("text", INFO["text"].replace(b"0.250000", b"-NaN"), "NaN"),
-        ("text", b"1|" * 40_000, "a message without end, 80000 bytes"),
-        ("binary", INFO["binary"][:-4] + NAN, "NaN"),
-        ("binary", b"\x02" + NAN + INIT["binary"][5:], "NaN"),
-        ("binary", b"\x01\0\0\0\x80" + SCAN["binary"][5:], "an integer over 2^31-1, 2147483648"),
-        ("binary", SCAN["binary"][:9] + b"\0\0\0\x80\0\0\0\0" + SCAN["binary"][17:], "an integer over 2^31-1"),
-        ("binary", b"\x03\0\0\x5a\0", "id 3, which no vehicle sends: the framing is lost"),
-        ("binary", SCAN["binary"] + b"\0" * 8, "id 0, which no vehicle sends: the framing is lost"),
-    ],
-)
-async def test_what_an_hq_breaks_on_kills_it(dialect: Dialect, data: bytes, words: str) -> None:
-    hq = viewer(dialect)
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await vehicle.send(INIT[dialect] + data)
-        await task
-        assert await vehicle.read_to_the_end() == b""
-    assert not hq.alive
-    assert hq.death.startswith(words)
-    assert hq.violations[-1] == hq.death
-    assert hq.events[-1] == f"died: {hq.death}"
-
-
-async def test_the_deployed_hq_has_room_for_769_points_and_no_more() -> None:
-    scan = b"1|0|0|" + b"1000|" * 769 + b"44|725;"
-    hq = await after(INIT["text"] + scan + END["text"], FragileHq(repeat_s=None))
-    assert (hq.violations, hq.scans) == ([], 1)
-    hq = await after(INIT["text"] + scan.replace(b"|44|", b"|1000|44|"), FragileHq(repeat_s=None))
-    assert hq.death.startswith("770 points instead of 769")
-
-
-@pytest.mark.parametrize("dialect", DIALECTS)
-async def test_an_end_of_the_connection_without_end_is_a_violation(dialect: Dialect) -> None:
-    hq = await after(INIT[dialect], viewer(dialect))
-    assert hq.violations == ["the vehicle closed without END: EOF"]
-    assert hq.alive
-
-
-async def test_an_end_of_the_connection_within_a_message_is_a_violation_more() -> None:
-    hq = await after(INIT["text"] + b"4|10", viewer())
-    assert hq.violations == ["the connection ended within a message: '4|10'", "the vehicle closed without END: EOF"]
-
-
-async def test_a_reset_without_end_is_a_violation() -> None:
-    hq = viewer()
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        vehicle.reset()
-        await task
-    assert len(hq.violations) == 1
-    assert hq.violations[0].startswith("the vehicle closed without END: ConnectionResetError")
-
-
-async def test_a_message_after_end_is_a_violation() -> None:
-    hq = await after(END["text"] + INFO["text"], viewer())
-    assert len(hq.violations) == 1
-    assert hq.violations[0].startswith("a message after END: ")
-
-
-async def test_a_vehicle_has_to_close_after_both_ends() -> None:
-    hq = viewer(answer_s=0.05)
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await vehicle.send(END["text"])
-        await task
-    assert hq.violations == ["the vehicle did not close within 0.05 s of both ENDs"]
-
-
-@pytest.mark.parametrize(("serves", "kinds"), [("drive", [2, 1]), ("laser", [4]), ("both", []), ("auto", [4])])
-async def test_a_listener_sends_only_what_it_serves(serves: str, kinds: list[int]) -> None:
-    hq = await after(INIT["text"] + SCAN["text"] + INFO["text"] + END["text"], viewer(serves=serves))
-    assert [one[:40] for one in hq.violations] == [
-        f"message {kind} from a listener that does not serve it"[:40] for kind in kinds
-    ]
-
-
-async def test_with_auto_4_comes_after_the_first_command_and_1_and_2_before_it() -> None:
-    hq = FragileHq(points=POINTS, repeat_s=0.002, flight_s=0.0)
-    async with facing(hq) as (vehicle, _):
-        await vehicle.read_until(NEUTRAL["text"])
-        await vehicle.send(INFO["text"] + INIT["text"] + SCAN["text"] + INFO["text"])
-        await until(lambda: len(hq.infos) == 2, hq)
-    assert [one[:10] for one in hq.violations] == ["message 2 ", "message 1 "]
-
-
-async def test_what_was_on_its_way_when_the_first_command_was_sent_is_excused() -> None:
-    hq = FragileHq(points=POINTS, repeat_s=0.002, flight_s=60.0)
-    async with facing(hq) as (vehicle, _):
-        await vehicle.read_until(NEUTRAL["text"])
-        await vehicle.send(INIT["text"] + SCAN["text"] + INFO["text"])
-        await until(lambda: hq.infos, hq)
-    assert hq.violations == []
-
-
-# The deployed programs
-
-
-@pytest.mark.parametrize("serves", ["auto", "laser", "both"])
-async def test_the_scanning_program_takes_whatever_is_not_1_or_2_as_end_and_shows_nothing_more(serves: str) -> None:
-    sent = INIT["text"] + SCAN["text"] + INFO["text"] + SCAN["text"]
-    hq = await after(sent + END["text"], viewer(deployed="scanning", serves=serves))
-    assert (hq.scans, hq.infos) == (1, [])
-    assert hq.violations[-1].startswith("message 4 taken as END, it shows nothing more: ")
-    quiet = await after(sent.replace(INFO["text"], b"") + END["text"], viewer(deployed="scanning", serves=serves))
-    assert (quiet.scans, quiet.violations) == (2, [])
-
-
-async def test_the_scanning_program_sends_no_commands() -> None:
-    hq = FragileHq(deployed="scanning", repeat_s=0.002)
-    async with facing(hq) as (vehicle, task):
-        task.cancel()
-        assert await vehicle.read_to_the_end() == END["text"]
-
-
-async def test_the_driving_program_stops_reading_after_ten_measurements() -> None:
-    hq = FragileHq(points=POINTS, repeat_s=0.002, deployed="driving", serves="both")
-    async with facing(hq) as (vehicle, _), asyncio.timeout(LONG_S):
-        await vehicle.send(INIT["text"] + SCAN["text"] * 10 + INFO["text"])
-        await until(lambda: hq.scans == 10, hq)
-        await vehicle.read(100)
-    assert hq.infos == []
-    assert hq.events[0] == "it reads no more, after 10 measurements"
-
-
-# Commands
-
-
-@pytest.mark.parametrize("dialect", DIALECTS)
-async def test_it_stands_at_first_and_repeats_its_command_for_ever(dialect: Dialect) -> None:
-    hq = FragileHq(dialect=dialect, repeat_s=0.002)
-    async with facing(hq) as (vehicle, _):
-        size = len(NEUTRAL[dialect])
-        assert await vehicle.read(5 * size) >= 5 * NEUTRAL[dialect]
-
-
-@pytest.mark.parametrize(
-    ("dialect", "told"), [("text", b"3|255|1|-90|1;"), ("binary", bytes.fromhex("03 64 01 00 01"))]
-)
-async def test_drive_and_idle_change_what_is_repeated(dialect: Dialect, told: bytes) -> None:
-    hq = FragileHq(dialect=dialect, repeat_s=0.002)
-    async with facing(hq) as (vehicle, _), asyncio.timeout(LONG_S):
-        hq.drive(255 if dialect == "text" else 100, 1, -90 if dialect == "text" else 0, True)
-        await vehicle.read_until(told + told)
-        hq.idle()
-        await vehicle.read_until(2 * NEUTRAL[dialect])
-
-
-async def test_it_repeats_every_20_ms() -> None:
-    hq = FragileHq()
-    async with facing(hq) as (vehicle, _):
-        began = time.monotonic()
-        await vehicle.read(11 * len(NEUTRAL["text"]))
-        assert 0.15 < time.monotonic() - began < 2
-
-
-@pytest.mark.parametrize(
-    ("dialect", "command"),
-    [("text", (256,)), ("text", (0, 2)), ("text", (0, 0, 91)), ("binary", (101,)), ("binary", (0, 0, -1))],
-)
-def test_it_sends_nothing_that_no_hq_sends(dialect: Dialect, command: Any) -> None:
-    with pytest.raises(ValueError, match="speed"):
-        FragileHq(dialect=dialect).drive(*command)
-
-
-@pytest.mark.parametrize("options", [{"dialect": "morse"}, {"serves": "tea"}])
-def test_there_are_no_other_hqs(options: Any) -> None:
-    with pytest.raises(ValueError, match="no such HQ"):
-        FragileHq(**options)
-
-
-# Its end
-
-
-@pytest.mark.parametrize("dialect", DIALECTS)
-async def test_it_ends_with_end_and_takes_the_answer(dialect: Dialect) -> None:
-    hq = viewer(dialect)
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        ending = asyncio.create_task(hq.end())
-        assert await vehicle.read(len(END[dialect])) == END[dialect]
-        await vehicle.send(INFO[dialect] + END[dialect])
-        assert await vehicle.recv() == b""
-        vehicle.close()
-        await ending
-        await task
-        await hq.end()
-    assert hq.violations == []
-    assert len(hq.infos) == 1
-
-
-async def test_an_end_that_is_not_answered_is_a_violation() -> None:
-    hq = viewer(answer_s=0.05)
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await hq.end()
-        await task
-        assert await vehicle.read_to_the_end() == END["text"]
-    assert hq.violations == ["no END within 0.05 s of the HQ's"]
-
-
-async def test_it_leaves_with_end_when_cancelled() -> None:
-    hq = viewer()
-    async with facing(hq) as (vehicle, task):
-        task.cancel()
-        assert await vehicle.read_to_the_end() == END["text"]
-    assert hq.violations == []
-
-
-async def test_it_can_stop_reading_for_good_and_goes_on_driving() -> None:
-    hq = FragileHq(points=POINTS, repeat_s=0.002, stops_reading_after=10, serves="both")
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await vehicle.send(INIT["text"] + SCAN["text"] * 10 + b"1|broken;nan;" + END["text"])
-        await until(lambda: hq.scans == 10, hq)
-        await vehicle.read(100)
-        assert not task.done()
-        with contextlib.suppress(BlockingIOError):  # until its window closes
-            while True:
-                vehicle.tcp.send(bytes(65536))
-        vehicle.close()
-        await task
-    assert hq.scans == 10
-    assert hq.violations == []
-    assert hq.events[0] == "it reads no more, after 10 measurements"
-
-
-async def test_it_ends_although_it_reads_no_more() -> None:
-    hq = viewer(stops_reading_after=1)
-    async with facing(hq) as (vehicle, task), asyncio.timeout(LONG_S):
-        await vehicle.send(INIT["text"] + SCAN["text"])
-        await until(lambda: hq.scans == 1, hq)
-        await hq.end()
-        await task
-        assert await vehicle.read_to_the_end() == END["text"]
-    assert hq.violations == []
-
-
-async def test_lists_are_bounded() -> None:
-    hq = await after(b"3|1;" * 10 + INFO["text"] * 10 + END["text"], viewer(keep=3))
-    assert (len(hq.violations), len(hq.received), len(hq.infos)) == (3, 3, 3)
-
-
-async def test_nobody_listening_is_an_error() -> None:
-    vehicle = Vehicle()
-    vehicle.close()
-    with pytest.raises(ConnectionRefusedError):
-        await viewer().run("127.0.0.1", vehicle.port)
-
-
-async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
-    vehicle = Vehicle()
+async def test_the_program_logs_and_prints_what_it_died_of_and_nobody_listening_is_an_error(capsys, caplog) -> None:
+    vehicle = Listening()
     task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", vehicle.port, dialect="text", points=POINTS))
     async with asyncio.timeout(LONG_S):
         await vehicle.accept()
-        await vehicle.send(b"3|1;4|nan;")
+        await vehicle.send_bytes(b"3|1;4|nan;")
         await task
     vehicle.close()
     assert capsys.readouterr().out == "died: NaN: '4|nan;'\n"
@@ -418,3 +225,5 @@ async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> No
         "violation: id 3, which no vehicle sends: '3|1;'",
         "violation: NaN: '4|nan;'",
     ]
+    with pytest.raises(ConnectionRefusedError):
+        await viewer().run("127.0.0.1", vehicle.port)

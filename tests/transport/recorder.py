@@ -1,10 +1,17 @@
-"""A receiver that keeps what a link brings."""
+"""A receiver that keeps what a link brings, and links over loopback that end at one."""
 
 import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 
+from zbridge.protocol.address import Address
 from zbridge.transport.link import Link, Receiver
+from zbridge.transport.tcp import TcpLink, connect, listen
 
 SOON_S = 5.0
+LOCAL = Address("127.0.0.1", 0)
 
 
 class Recorder(Receiver):
@@ -69,3 +76,57 @@ class Recorder(Receiver):
             while call not in self.calls or len(self.data) < received or len(self.datagrams) < datagrams:
                 self._changed.clear()
                 await self._changed.wait()
+
+
+@dataclass
+class Pair:
+    """Both ends of one connection: ``here`` connected, ``there`` was accepted."""
+
+    address: Address
+    here: TcpLink
+    near: Recorder
+    far: Recorder
+
+    @property
+    def there(self) -> TcpLink:
+        assert isinstance(self.far.link, TcpLink)
+        return self.far.link
+
+
+def socket_of(link: TcpLink) -> socket.socket:
+    assert link._transport is not None
+    found: socket.socket = link._transport.get_extra_info("socket")
+    return found
+
+
+@contextlib.asynccontextmanager
+async def connected() -> AsyncIterator[Pair]:
+    near, far = Recorder(), Recorder()
+    async with listen(LOCAL, lambda: far) as address:
+        here = await connect(address, near)
+        await far.until("attached")
+        pair = Pair(address, here, near, far)
+        yield pair
+        here.abort()
+        pair.there.abort()
+        await near.until("lost")
+        await far.until("lost")
+
+
+def udp_socket(address: tuple[str, int]) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    made.bind(address)
+    return made
+
+
+async def heard_by(listening: socket.socket) -> tuple[bytes, tuple[str, int]]:
+    async with asyncio.timeout(SOON_S):
+        return await asyncio.get_running_loop().sock_recvfrom(listening, 65_536)
+
+
+async def until(happened: Callable[[], bool]) -> None:
+    """Wait for what nothing tells."""
+    async with asyncio.timeout(SOON_S):
+        while not happened():  # noqa: ASYNC110
+            await asyncio.sleep(0.001)

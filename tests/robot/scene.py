@@ -3,6 +3,7 @@
 A scene may be written down as a script, which :meth:`Rig.play` acts out line by line::
 
     left 0.1 > left                 the driver commands motion to the left, 0.1 s pass: the packet of the motion left
+    with deadman_s=0.6              the first line may say how the device or the scene differs
     lost 1 established >            the connection is lost, the robot returns: nothing left
     other:takeover 2 > stop x9-10   another program takes over, 2 s pass: 9 or 10 stops left, and nothing else
     neutral 3*turn >> turn          the last packet that left is the turn
@@ -17,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import struct
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -31,7 +33,6 @@ from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
@@ -149,8 +150,8 @@ class Program:
     def command(self, name: str, fields: dict[str, Any] | bytes = NEUTRAL) -> None:
         """Command the robot, with the lease where there is one and the command needs it."""
         payload = fields if isinstance(fields, bytes) else packed(fields)
-        proven = self.held is not None and name.split("/")[0] in NEED_A_LEASE
-        self.put(name, payload, self.held.attachment(name, payload) if proven and self.held else None)
+        needed = name.split("/")[0] in NEED_A_LEASE
+        self.put(name, payload, self.held.attachment(name, payload) if needed and self.held is not None else None)
 
     def put(self, name: str, fields: dict[str, Any] | bytes, attachment: bytes | None) -> None:
         """Command the robot with this attachment."""
@@ -161,16 +162,7 @@ class Program:
 class Rig:
     """A device with everything around it played by the test; ``driver`` is the program that commands it."""
 
-    def __init__(
-        self,
-        options: Options | None = None,
-        *,
-        lease_s: float = FOREVER_S,
-        deadman_s: float = 2.0,
-        limits: MotionLimits | None = None,
-        idle_stop_s: float = 0.0,
-        bus: OpenBus | None = None,
-    ) -> None:
+    def __init__(self, *, lease_s: float = FOREVER_S, deadman_s: float = 2.0, bus: OpenBus | None = None, **more: Any):
         self.loop = asyncio.get_running_loop()
         self.bus = bus or OpenBus()
         self.hq = self.bus.join("2")
@@ -182,7 +174,7 @@ class Rig:
         self.settings = SETTINGS
         self.audit_lines: list[str] = []
         self.device = Device(
-            TcpUdpRobot(options or Options()),
+            TcpUdpRobot(Options()),
             (ADDRESS,),
             protocol="tcpudp",
             keys=KeySpace("fleet", "r1"),
@@ -191,10 +183,9 @@ class Rig:
             manager=self.manager,
             metrics=self.metrics,
             audit=Audit("r1", self.audit_lines.append),
-            limits=limits,
-            idle_stop_s=idle_stop_s,
             connect=self._connect,
             clock_ns=lambda: 1234,
+            **{"idle_stop_s": 0.0, **more},
         )
         self.driver, self.other = Program(self, "driver"), Program(self, "other")
         self.hold = self.driver.acquire
@@ -264,15 +255,15 @@ class Rig:
         """What ``control`` shows, without the refusals."""
         return {name: value for name, value in self.last("control").items() if name != "refusals"}
 
-    async def refusals(self) -> list[tuple[str, str, int]]:
-        """What ``control`` shows: command, reason, count."""
-        return [(command, reason, count) for _, command, reason, count in await self.refused()]
-
     async def refused(self) -> list[tuple[str | None, str, str, int]]:
         """What ``control`` shows: who, command, reason, count."""
         await asyncio.sleep(0.06)
         shown = self.last("control")["refusals"]
         return [(entry["who"], entry["command"], entry["reason"], entry["count"]) for entry in shown]
+
+    async def refusals(self) -> list[tuple[str, str, int]]:
+        """The same without who."""
+        return [entry[1:] for entry in await self.refused()]
 
     @property
     def audited(self) -> list[dict[str, Any]]:
@@ -286,14 +277,11 @@ class Rig:
         """Act out a script; see above."""
         for line in filter(None, map(str.strip, script.splitlines())):
             what, _, expected = line.partition(" ")
-            if what == "with":
-                continue
             if what == "control":
-                holder = self.control["holder"]
-                assert " ".join([self.control["state"], *([holder] if holder else [])]) == expected, line
+                assert f"{self.control['state']} {self.control['holder'] or ''}".strip() == expected, line
             elif what == "refused":
-                self._compare_refusals(await self.refused(), [entry.strip() for entry in expected.split("|")])
-            else:
+                self._compare_refusals(await self.refused(), expected)
+            elif what != "with":
                 acts, looks, expected = line.partition(">")
                 for act in acts.split():
                     await self._act(act)
@@ -338,29 +326,28 @@ class Rig:
         words, _, times = expected.removeprefix(">").partition(" x")
         one = words.split()
         if times:
-            least, _, most = times.rstrip("+").partition("-")
+            least, _, most = times.partition("-")
             count = len(left) // len(one)
             assert left == one * count, line
-            assert int(least) <= count <= (count if times.endswith("+") else int(most or least)), (line, count)
+            assert int(least) <= count <= int(most or least), (line, count)
         else:
             assert (left[-len(one) :] if expected.startswith(">") else left) == one, line
 
     @staticmethod
-    def _compare_refusals(shown: list[tuple[str | None, str, str, int]], expected: list[str]) -> None:
-        assert len(shown) == (len(expected) if expected != [""] else 0), shown
-        for (who, command, reason, count), entry in zip(shown, expected, strict=False):
+    def _compare_refusals(shown: list[tuple[str | None, str, str, int]], expected: str) -> None:
+        entries = expected.split(" | ") if expected else []
+        assert len(shown) == len(entries), shown
+        for (who, command, reason, count), entry in zip(shown, entries, strict=True):
             names, _, rest = entry.partition(": ")
-            part, _, times = rest.rpartition(" x") if rest[-1].isdigit() and " x" in rest else (rest, "", "1")
-            assert (f"{who or '-'} {command}", count) == (names, int(times)), shown
+            part, _, times = re.fullmatch(r"(.*?)( x(\d+))?", rest).groups()  # type: ignore[union-attr]
+            assert (f"{who or '-'} {command}", count) == (names, int(times or 1)), shown
             assert part in reason, shown
 
 
 @contextlib.asynccontextmanager
-async def serving(
-    options: Options | None = None, *, unreachable: str | None = None, hold: bool = True, **more: Any
-) -> AsyncIterator[Rig]:
+async def serving(*, unreachable: str | None = None, hold: bool = True, **more: Any) -> AsyncIterator[Rig]:
     """Run a device; unless told otherwise, a program holds the lease."""
-    rig = Rig(options, **more)
+    rig = Rig(**more)
     rig.unreachable = unreachable
     task = asyncio.create_task(rig.device.run())
     try:
@@ -375,7 +362,7 @@ async def serving(
 
 
 @contextlib.asynccontextmanager
-async def established(options: Options | None = None, **more: Any) -> AsyncIterator[Rig]:
-    async with serving(options, **more) as rig:
+async def established(**more: Any) -> AsyncIterator[Rig]:
+    async with serving(**more) as rig:
         await rig.establish()
         yield rig

@@ -81,12 +81,9 @@ async def test_the_only_gateway_takes_the_robot_and_shows_it_until_it_releases_i
     claim.release()
     assert (await bus.alive(TOKEN), await bus.ask(CLAIM)) == ([], [])
     await asyncio.wait_for(claim.take(), 1.0)
-
-
-async def test_a_gateway_starts_although_nobody_else_is_on_the_bus_yet() -> None:
-    bus = FakeBus("1")
-    bus.connection(False)
-    await owned(bus)
+    alone = FakeBus("1")
+    alone.connection(False)
+    await owned(alone)  # nobody is on the bus yet
 
 
 async def test_a_second_gateway_waits_until_the_first_goes_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -125,9 +122,6 @@ async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hun
             await asyncio.sleep(rng.uniform(0.0, 0.2))
         await asyncio.sleep(10.0)
         settled.append([take.done() for take in takes].count(True))
-        for take in takes:
-            take.cancel()
-        await asyncio.gather(*takes, return_exceptions=True)
     assert settled == [1] * 100
 
 
@@ -138,24 +132,10 @@ async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id_that_doe
     await kept_waiting(bus.join("1"))
 
 
-class Watch:
-    """A claim that is held and watched, and what was told of others."""
-
-    def __init__(self, claim: Ownership, *, has: bool) -> None:
-        self.told: list[tuple[str, ...]] = []
-        self._task = asyncio.create_task(claim.watch(lambda: has, self.told.append))
-
-    @property
-    def over(self) -> bool:
-        """Whether the robot was left to another."""
-        return self._task.done()
-
-    async def __aenter__(self) -> "Watch":
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+def watched(claim: Ownership, *, has: bool) -> tuple[list[tuple[str, ...]], asyncio.Task[None]]:
+    """Watch a claim; give what is told of others, and what ends when the robot was left to another."""
+    told: list[tuple[str, ...]] = []
+    return told, asyncio.create_task(claim.watch(lambda: has, told.append))
 
 
 # Forged claims
@@ -186,10 +166,9 @@ IMPLAUSIBLE = [
 async def test_what_nobody_can_claim_is_no_claim(claim: Any) -> None:
     bus = FakeBus("5")
     forge(bus.join("1"), claim)
-    async with Watch(await owned(bus), has=False) as watch:
-        await asyncio.sleep(3 * WATCH_S)
-        assert not watch.over
-        assert set(watch.told) == {()}
+    told, watching = watched(await owned(bus), has=False)
+    await asyncio.sleep(3 * WATCH_S)
+    assert (set(told), watching.done()) == ({()}, False)
 
 
 async def test_whoever_goes_on_answering_delays_a_start_and_nothing_else() -> None:
@@ -209,9 +188,9 @@ async def test_whose_claim_it_is_the_bus_tells_and_no_payload() -> None:
 async def test_what_one_answers_several_times_counts_once() -> None:
     bus, evil = FakeBus("5"), {"held_s": 3600.0, "has": True}
     forge(bus.join("9"), {"held_s": 0.0}, evil, evil)
-    async with Watch(await owned(bus), has=True) as watch:
-        await asyncio.sleep(WATCH_S + 1.0)
-        assert set(watch.told) == {()}
+    told, _ = watched(await owned(bus), has=True)
+    await asyncio.sleep(WATCH_S + 1.0)
+    assert set(told) == {()}
 
 
 async def test_a_crowd_of_weak_claims_hides_no_good_one() -> None:
@@ -253,32 +232,29 @@ async def test_a_gateway_that_does_not_answer_at_once_is_waited_for() -> None:
 @pytest.mark.parametrize("claim", [{"held_s": MOST_S, "has": True}, {"held_s": 1e-6}])
 async def test_a_gateway_that_has_its_robot_leaves_it_to_nobody_and_tells_of_them(claim: dict[str, Any]) -> None:
     bus = FakeBus("5")
-    async with Watch(await owned(bus), has=True) as watch:
+    told, watching = watched(await owned(bus), has=True)
+    await asyncio.sleep(1.0)
+    forged = forge(bus.join("1"), claim)
+    await asyncio.sleep(WATCH_S + 1.0)
+    assert told[-1] == ("1",), "found while the bus stays"
+    for up in (False, True):
+        bus.connection(up)
         await asyncio.sleep(1.0)
-        forged = forge(bus.join("1"), claim)
-        await asyncio.sleep(WATCH_S + 1.0)
-        assert watch.told[-1] == ("1",), "found while the bus stays"
-        for up in (False, True):
-            bus.connection(up)
-            await asyncio.sleep(1.0)
-            assert watch.told[-1] == ("1",)
-        forged.close()
-        await asyncio.sleep(WATCH_S + 1.0)
-        assert watch.told[-1] == ()
-        assert not watch.over
-    assert await bus.alive(TOKEN) == [TOKEN]
+        assert told[-1] == ("1",)
+    forged.close()
+    await asyncio.sleep(WATCH_S + 1.0)
+    assert (told[-1], watching.done(), await bus.alive(TOKEN)) == ((), False, [TOKEN])
 
 
-HEALED = [
-    # who has the robot: the one that served it longer, with the higher id; the other one; and who lets go
-    (True, False, (False, True)),
-    (False, True, (True, False)),
-    (True, True, (False, False)),
-    (False, False, (False, True)),
-]
-
-
-@pytest.mark.parametrize(("first_has", "second_has", "left"), HEALED)
+@pytest.mark.parametrize(
+    ("first_has", "second_has", "left"),  # the first served the robot longer, and has the higher id
+    [
+        (True, False, (False, True)),
+        (False, True, (True, False)),
+        (True, True, (False, False)),
+        (False, False, (False, True)),
+    ],
+)
 async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it(first_has, second_has, left) -> None:
     bus, other = FakeBus("9"), FakeBus("1")
     clock = asyncio.get_running_loop().time
@@ -286,19 +262,19 @@ async def test_when_two_see_each_other_again_the_one_that_has_the_robot_keeps_it
     await first.take()
     await asyncio.sleep(30.0)
     await second.take()
-    async with Watch(first, has=first_has) as one, Watch(second, has=second_has) as two:
-        await asyncio.sleep(1.0)
-        for session in (bus, other):
-            session.connection(False)
-        bus._shared.queryables += other._shared.queryables
-        bus._shared.tokens += other._shared.tokens
-        other._shared = bus._shared
-        for session in (bus, other):
-            session.connection(True)
-        await asyncio.sleep(2 * WATCH_S)
-        assert (one.over, two.over) == left
-        if left == (False, False):
-            assert (one.told[-1], two.told[-1]) == (("1",), ("9",))
+    (told, one), (told_other, two) = watched(first, has=first_has), watched(second, has=second_has)
+    await asyncio.sleep(1.0)
+    for session in (bus, other):
+        session.connection(False)
+    bus._shared.queryables += other._shared.queryables
+    bus._shared.tokens += other._shared.tokens
+    other._shared = bus._shared
+    for session in (bus, other):
+        session.connection(True)
+    await asyncio.sleep(2 * WATCH_S)
+    assert (one.done(), two.done()) == left
+    if left == (False, False):
+        assert (told[-1], told_other[-1]) == (("1",), ("9",))
 
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:

@@ -9,7 +9,7 @@ import struct
 import pytest
 
 from tests.e2e.conftest import free_port
-from tests.transport.recorder import LOCAL, Recorder, connected, socket_of, udp_socket, until
+from tests.transport.recorder import LOCAL, SOON_S, Recorder, connected, socket_of, udp_socket, until
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address
 from zbridge.transport import tcp
@@ -29,12 +29,9 @@ async def test_both_ends_are_attached_first_know_their_peer_and_exchange_bytes()
         pair.there.write(b"pong")
         await pair.near.until("received", received=4)
         assert pair.near.data == b"pong"
-
-
-async def test_every_write_is_a_segment_and_a_robots_connection_is_kept_for_longer_than_a_programs() -> None:
-    async with connected() as pair:
-        for sock, give_up_ms in ((socket_of(pair.here), 60_000), (socket_of(pair.there), 10_000)):
-            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        for link, give_up_ms in ((pair.here, 60_000), (pair.there, 10_000)):  # a robot's connection is kept for longer
+            sock = socket_of(link)
+            assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY), "every write is a segment"
             assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
             assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == give_up_ms
         with contextlib.suppress(OSError):  # a kernel before 6.15; what was lost is sent again within a second
@@ -64,7 +61,7 @@ async def test_a_peer_that_breaks_off_is_noticed_with_the_reason() -> None:
         assert (pair.near.reason or "").startswith("connection lost: ")
 
 
-async def test_a_paused_link_reads_nothing_until_it_is_resumed_and_its_machine_is_not_silent() -> None:
+async def test_a_paused_link_reads_nothing_until_it_is_resumed_and_its_machine_is_not_silent(monkeypatch) -> None:
     async with connected() as pair:
         for _ in range(2):
             pair.here.pause()
@@ -72,6 +69,8 @@ async def test_a_paused_link_reads_nothing_until_it_is_resumed_and_its_machine_i
         await asyncio.sleep(0.05)
         assert pair.near.data == b""
         assert pair.there.silent_s == pair.here.silent_s == 0.0
+        monkeypatch.setattr(tcp, "KEEPALIVE_S", 0.0)  # as if the kernel had asked for a sign of life meanwhile
+        assert 0.0 < pair.there.silent_s < SOON_S
         for _ in range(2):
             pair.here.resume()
         await pair.near.until("received", received=5)
@@ -197,14 +196,10 @@ async def test_bytes_that_arrive_do_not_wait_for_the_program_to_read_them() -> N
             pair.here.write(b"x")
             await asyncio.sleep(0.02)
         assert pair.here.unacknowledged_s <= STALLED_S
-
-
-async def test_only_a_robots_link_is_watched() -> None:
-    async with connected() as pair:
         pair.here.pause()
         pair.there.write(b"x" * 10_000_000)
         await asyncio.sleep(STALLED_S + 0.1)
-        assert pair.there.unacknowledged_s == 0.0
+        assert pair.there.unacknowledged_s == 0.0, "only a robot's link is watched"
 
 
 async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkeypatch, caplog) -> None:

@@ -51,7 +51,7 @@ PLAIN_SETTINGS = bytes.fromhex("21000000 01 02 02") + LISTED + bytes.fromhex("00
 STOP = bytes.fromhex("02000000 02 0d")
 NEUTRAL: dict[str, Any] = {}
 TWO_METRES = struct.pack("<360f", *([2.0] * 360))
-TURN_OF_SCAN = {"angle_min": 0.0, "angle_increment": 0.017453292519943295, "range_min": 0.1, "range_max": 9.0}
+SCAN = {"angle_min": 0.0, "angle_increment": 0.017453292519943295, "range_min": 0.1, "range_max": 9.0}
 
 COMMANDS: dict[str, tuple[str, dict[str, Any], bytes]] = {
     "left": ("drive", {"left": 1.0}, bytes.fromhex("0e000000 02 0b 000080bf 00000000 0000803f")),
@@ -64,9 +64,7 @@ COMMANDS: dict[str, tuple[str, dict[str, Any], bytes]] = {
     "text": ("text", {"text": "hi"}, bytes.fromhex("08000000 02 01 02000000 6869")),
     "lidar": ("lidar", {"on": True}, bytes.fromhex("06000000 02 32 01000000")),
     "raw": ("raw/tcpudp", {"id": 21, "body": b"\x01"}, bytes.fromhex("03000000 02 15 01")),
-    "scan": (  # 200 cm
-        "scan", {**TURN_OF_SCAN, "ranges": TWO_METRES}, bytes.fromhex("a6050000 02 3d 68010000" + "00004843" * 360)
-    ),
+    "scan": ("scan", {**SCAN, "ranges": TWO_METRES}, bytes.fromhex("a6050000 02 3d 68010000" + "00004843" * 360)),
     "motor": ("motor/left", {"value": 1.0}, b""),  # this robot has none
     "dance": ("dance", {}, b""),
     "too_fast": ("drive", {"left": 9.0}, b""),

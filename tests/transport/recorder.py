@@ -28,21 +28,20 @@ class Recorder(Receiver):
         self.foreign = 0
         self.reason: str | None = None
         self.calls: list[str] = []
-        self._changed = asyncio.Event()
 
     def attached(self, link: Link) -> None:
         self.link = link
-        self._note("attached")
+        self.calls.append("attached")
 
     def received(self, data: bytes) -> None:
         assert type(data) is bytes
         self.data += data
-        self._note("received")
+        self.calls.append("received")
 
     def received_datagram(self, datagram: bytes) -> None:
         assert type(datagram) is bytes
         self.datagrams.append(datagram)
-        self._note("datagram")
+        self.calls.append("datagram")
 
     def claims(self, datagram: bytes, port: int) -> bool:
         self.asked.append(port)
@@ -50,32 +49,26 @@ class Recorder(Receiver):
 
     def rivalled(self) -> None:
         self.mark = b""
-        self._note("rivalled")
+        self.calls.append("rivalled")
 
     def stray_datagram(self, datagram: bytes) -> None:
         self.stray.append(datagram)
-        self._note("stray")
+        self.calls.append("stray")
 
     def foreign_datagram(self) -> None:
         self.foreign += 1
-        self._note("foreign")
+        self.calls.append("foreign")
 
     def lost(self, reason: str) -> None:
         self.reason = reason
-        self._note("lost")
+        self.calls.append("lost")
 
     def writable(self) -> None:
-        self._note("writable")
-
-    def _note(self, call: str) -> None:
-        self.calls.append(call)
-        self._changed.set()
+        self.calls.append("writable")
 
     async def until(self, call: str, *, received: int = 0, datagrams: int = 0) -> None:
-        async with asyncio.timeout(SOON_S):
-            while call not in self.calls or len(self.data) < received or len(self.datagrams) < datagrams:
-                self._changed.clear()
-                await self._changed.wait()
+        """Wait until this was called, and so many bytes and datagrams have come."""
+        await until(lambda: call in self.calls and len(self.data) >= received and len(self.datagrams) >= datagrams)
 
 
 @dataclass

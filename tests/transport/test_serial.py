@@ -42,10 +42,9 @@ class Line:
         data = b""
         async with asyncio.timeout(SOON_S):
             while len(data) < size:
-                try:
+                with contextlib.suppress(BlockingIOError):
                     data += os.read(self.fd, size - len(data))
-                except BlockingIOError:
-                    await asyncio.sleep(0.001)
+                await asyncio.sleep(0.001)
         return data
 
     def fill(self) -> int:
@@ -126,7 +125,8 @@ async def test_an_unplugged_device_is_lost_once_with_a_reason_and_not_within_a_w
     assert (line.link.ready, line.link.unacknowledged_s, line.recorder.calls.count("lost")) == (False, 0.0, 1)
 
 
-async def test_close_writes_what_waits_first(line: Line) -> None:
+async def test_close_writes_what_waits_first(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial, "CLOSE_S", SOON_S)
     sent = line.fill()
     line.link.close()
     line.link.close()

@@ -216,10 +216,6 @@ SCENES = {
         refused driver drive: deadman: send a neutral drive first
         2 > stop x9-10
         neutral 0.1 turn >> turn""",
-    "a neutral after the deadman time is taken behind the stop that was due": """
-        with deadman_s=0.6
-        left 0.1 > left
-        frozen neutral turn 0.05 > stop turn""",
     # Who may drive
     **{
         f"{word} is carried out for the holder of the lease alone": f"""
@@ -248,9 +244,19 @@ SCENES = {
         control held other"""
         for how in ("takeover", "outrank")
     },
-    "a standing robot that changes hands and is released is sent nothing": """
-        other:takeover 1 other:release 1 >
-        control free""",
+    "a standing robot that changes hands, is released, or whose holder's lease expires is sent nothing": """
+        with lease_s=1 hold=0
+        acquire other:takeover 0.5 other:release 0.5 >
+        control free
+        acquire manual 0.1 > manual
+        3 >
+        control stopped""",
+    "renewing keeps a robot going that moves on its own, but a frozen gateway finds the lease expired": """
+        with lease_s=1 deadman_s=0.3 hold=0
+        acquire autonomous 0.9 renew 0.9 renew 0.9 renew 0.9 > autonomous
+        control held driver
+        frozen left 0.01 > none stop
+        refused driver drive: the lease has ended (lease expired)""",
     "a moving robot that is released is stopped for a second and free": """
         left 0.1 > left
         release > stop
@@ -272,24 +278,6 @@ SCENES = {
         refused driver drive: the lease has ended (lease expired) x2
         acquire left > left"""
         for word, stop in (("left", "stop"), ("autonomous", "none stop"), ("raw", "stop"))
-    },
-    "a lease that expires sends a standing robot nothing": """
-        with lease_s=1 hold=0
-        acquire manual 0.1 > manual
-        3 >
-        control stopped""",
-    "renewing keeps a robot going that moves on its own": """
-        with lease_s=1 deadman_s=0.3 hold=0
-        acquire autonomous 0.9 renew 0.9 renew 0.9 renew 0.9 > autonomous
-        control held driver""",
-    **{
-        f"a {word} after the lease has expired in a frozen gateway comes too late": f"""
-        with lease_s=3 hold=0
-        acquire autonomous 0.1 > autonomous
-        frozen {word} 0.01 > none stop
-        refused driver {name}: the lease has ended (lease expired)
-        control stopped"""
-        for word, name in (("left", "drive"), ("renew", "renew"), ("release", "release"))
     },
     # The robot goes and comes
     "a robot lost while moving keeps its holder, needs neutral when it returns and gets no old motion": """

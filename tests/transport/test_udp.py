@@ -193,8 +193,7 @@ async def test_a_hub_gives_a_source_to_a_link_of_its_own_host_only() -> None:
 
 
 @jumping
-async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() -> None:
-    """So a flood costs little, however many links its host has."""
+async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment_and_a_flood_costs_little() -> None:
     hub, recorder = Hub(), Recorder(b"a")
     hub.add(FakeLink(), "10.0.0.1", recorder)
     for _ in range(1000):
@@ -205,13 +204,8 @@ async def test_a_source_that_nobody_claimed_is_not_listened_to_for_a_moment() ->
     await asyncio.sleep(udp.STRAY_S)
     hub._take(b"b5", ("10.0.0.1", 1))
     assert recorder.stray == [b"b5", b"b5"]
-
-
-async def test_what_links_are_shown_of_strays_and_what_is_kept_of_them_is_bounded() -> None:
-    hub, recorder = Hub(), Recorder(b"a")
-    hub.add(FakeLink(), "10.0.0.1", recorder)
-    for port in range(5000):
+    for port in range(2000, 7000):
         hub._take(b"b5", ("10.0.0.1", port))
-    assert len(recorder.asked) == hub.foreign.value == 5000
-    assert udp.STRAYS_HZ <= len(recorder.stray) <= 10 * udp.STRAYS_HZ
+    assert len(recorder.asked) == 5003
+    assert len(recorder.stray) <= 2 + udp.STRAYS_HZ
     assert len(hub._deaf_until) <= udp.STRAY_SOURCES

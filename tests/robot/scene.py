@@ -48,6 +48,7 @@ LISTED = b"\x0b\x00\x00\x001.1,1.2,1.3"
 # client id 2; cam, joystick, chat, lidar, lidar sim, map yes, UDP no; map size 30, interval 10
 SETTINGS = bytes.fromhex("21000000 01 02 02") + LISTED + bytes.fromhex("00010101010101 1e000000 0a000000")
 PLAIN_SETTINGS = bytes.fromhex("21000000 01 02 02") + LISTED + bytes.fromhex("00000000000000 00000000 00000000")
+START_UDP = bytes.fromhex("02000000 01 04")  # unasked: the robot takes nothing for two seconds
 STOP = bytes.fromhex("02000000 02 0d")
 NEUTRAL: dict[str, Any] = {}
 TWO_METRES = struct.pack("<360f", *([2.0] * 360))
@@ -311,6 +312,7 @@ class Rig:
             "unreachable": lambda: setattr(self, "unreachable", "no route"),
             "reachable": lambda: setattr(self, "unreachable", None),
             "announces_nothing": lambda: setattr(self, "settings", PLAIN_SETTINGS),
+            "asks_for_datagrams": lambda: self.sends(START_UDP),
             "frozen": lambda: self.freeze(5.0),
             "bus_lost": lambda: self.bus.connection(False),
             "bus_back": lambda: self.bus.connection(True),

@@ -117,15 +117,22 @@ async def test_an_unfinished_handshake_ends_the_conversation_and_its_link(rig) -
     assert rig.happened == [State.HANDSHAKING, State.CLOSED]
 
 
-async def test_a_lost_link_ends_the_conversation_and_nothing_happens_after_it(up: Rig) -> None:
-    up.conversation.lost("closed by peer")
-    assert up.conversation.ended.done()
-    assert up.session.reason == "closed by peer"
+@pytest.mark.parametrize("abandoned", [False, True])
+async def test_a_lost_link_or_abandoning_ends_the_conversation_and_nothing_happens_after_it(up, abandoned) -> None:
+    up.session.send(b"a")
+    if abandoned:
+        up.conversation.abandon()
+        up.conversation.abandon()
+    else:
+        up.conversation.lost("closed by peer")
+    assert (up.conversation.ended.done(), up.link.closed) == (True, abandoned)
+    assert up.session.reason == ("abandoned" if abandoned else "closed by peer")
     up.conversation.pump()
     up.conversation.received(b"\x01a")
     up.conversation.pause()
     await asyncio.sleep(100)
     assert (up.happened, up.link.written, up.link.paused) == ([State.CLOSED], [], False)
+    Rig().conversation.abandon()  # it never had a link
 
 
 @pytest.mark.parametrize(("ready", "written", "lasts_s"), [(True, [b"\x01a", b"\x01b"], 0.02), (False, [], LINGER_S)])
@@ -152,14 +159,6 @@ async def test_messages_before_the_end_are_delivered_before_it_is_told_and_later
     await up.conversation.ended
     assert up.happened == [[b"a"], *states]
     assert (up.link.written, up.link.closed) == (written, True)
-
-
-async def test_abandoning_ends_everything_at_once_in_any_state_and_twice_does_no_harm(rig: Rig, up: Rig) -> None:
-    up.session.send(b"a")
-    for conversation in (up.conversation, up.conversation, rig.conversation):
-        conversation.abandon()
-        assert conversation.ended.done()
-    assert (up.link.closed, up.link.written, up.session.state) == (True, [], State.CLOSED)
 
 
 # What is malformed, and datagrams

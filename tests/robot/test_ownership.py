@@ -173,22 +173,20 @@ async def test_what_nobody_can_claim_is_no_claim(claim: Any) -> None:
 
 async def test_whoever_goes_on_answering_delays_a_start_and_nothing_else() -> None:
     bus = FakeBus("1")
-    forged = forge(bus.join("9"), {"held_s": 3600.0, "has": True})
+    forged = forge(bus.join("9"), EVIL)
     taking = await kept_waiting(bus)
     forged.close()
     await asyncio.wait_for(taking, 1.0)
 
 
-async def test_whose_claim_it_is_the_bus_tells_and_no_payload() -> None:
+EVIL = {"held_s": 3600.0, "has": True}
+
+
+@pytest.mark.parametrize("claims", [[{"held_s": 0.0, "zid": "1"}], [{"held_s": 0.0}, EVIL, EVIL]])
+async def test_whose_claim_it_is_the_bus_tells_and_no_payload_and_only_the_first_counts(claims: list[Any]) -> None:
     bus = FakeBus("5")
-    forge(bus.join("9"), {"held_s": 0.0, "zid": "1"})
-    await owned(bus)  # of two that begin the lower one goes on: 5
-
-
-async def test_what_one_answers_several_times_counts_once() -> None:
-    bus, evil = FakeBus("5"), {"held_s": 3600.0, "has": True}
-    forge(bus.join("9"), {"held_s": 0.0}, evil, evil)
-    told, _ = watched(await owned(bus), has=True)
+    forge(bus.join("9"), *claims)
+    told, _ = watched(await owned(bus), has=True)  # of two that begin the lower one goes on: 5
     await asyncio.sleep(WATCH_S + 1.0)
     assert set(told) == {()}
 

@@ -18,9 +18,9 @@ pytestmark = pytest.mark.jumping
 
 
 class Rig:
-    def __init__(self, session: Toy | None = None, **more: Any) -> None:
+    def __init__(self, **more: Any) -> None:
         self.loop = asyncio.get_running_loop()
-        self.session = session or Toy(LIMITS, name="robot")
+        self.session = Toy(LIMITS, name="robot")
         self.link = FakeLink("tcp://toy.test:1")
         self.happened: list[object] = []
         self.conversation = Conversation(
@@ -177,27 +177,22 @@ async def test_malformed_messages_are_counted_and_logged_ever_more_rarely(caplog
     assert "what is ?" in caplog.text
 
 
-async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say() -> None:
-    class Wary(Toy):
-        def claims(self, datagram: bytes, port: int) -> bool:
-            return (datagram, port) == (b"mine", 11000)
-
-        def rivalled(self, now: float) -> None:
-            self.close("rivalled", now)
-
-        def stray(self, datagram: bytes) -> None:
-            if datagram == b"in its name":
-                raise NotReady("not taken")
+async def test_what_becomes_of_datagrams_that_are_nobodys_is_the_sessions_to_say(monkeypatch) -> None:
+    def stray(datagram: bytes) -> None:
+        if datagram == b"in its name":
+            raise NotReady("not taken")
 
     rivals, foreign, refused = Count(), Count(), list[object]()
-    up = Rig(Wary(LIMITS, name="robot"), rivals=rivals, foreign=foreign, refused=refused.append).begin()
+    up = Rig(rivals=rivals, foreign=foreign, refused=refused.append).begin()
+    monkeypatch.setattr(up.session, "claims", lambda datagram, port: (datagram, port) == (b"mine", 11000))
     assert [up.conversation.claims(b"mine", port) for port in (11000, 11001)] == [True, False]
-    up.conversation.stray_datagram(b"somebody's")
-    assert refused == []
-    up.conversation.stray_datagram(b"in its name")
+    monkeypatch.setattr(up.session, "stray", stray)
+    for datagram in (b"somebody's", b"in its name"):
+        up.conversation.stray_datagram(datagram)
     assert [str(refusal) for refusal in refused] == ["not taken"]
     up.conversation.foreign_datagram()
     assert (foreign.value, up.session.traffic.foreign) == (1, 1)
+    monkeypatch.setattr(up.session, "rivalled", lambda now: up.session.close("rivalled", now))
     up.conversation.rivalled()
     await up.conversation.ended
     assert (rivals.value, up.session.reason) == (1, "rivalled")

@@ -147,16 +147,10 @@ async def test_every_peer_of_a_listener_has_a_receiver_of_its_own_and_its_addres
             pass  # without datagrams it serves no UDP
 
 
-@pytest.mark.parametrize("error", [FileNotFoundError(2, "no such file"), TimeoutError()])
-async def test_what_goes_wrong_inside_is_not_the_listeners(error: OSError) -> None:
-    with pytest.raises(type(error)):
-        async with listen(LOCAL, Recorder):
-            raise error
-
-
 async def test_a_listener_that_ends_takes_no_more_peers_and_frees_its_ports() -> None:
-    async with listen(LOCAL, Recorder, datagrams=True) as address:
-        pass
+    with pytest.raises(FileNotFoundError):  # what goes wrong inside is not the listener's
+        async with listen(LOCAL, Recorder, datagrams=True) as address:
+            raise FileNotFoundError(2, "no such file")
     with pytest.raises(LinkError):
         await connect(address, Recorder())
     with contextlib.closing(udp_socket((address.host, address.port))):

@@ -33,21 +33,14 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
     return Rig()
 
 
-def test_a_publisher_is_made_once_for_each_topic(rig: Rig) -> None:
-    rig.read("front")
-    rig.read("front")
-    assert rig.publishers.get(topics.SENSOR("front")) is rig.publishers.known["sensor/front"]
-    assert (rig.shown("sensor/front"), len(rig.publishers)) == (2, 1)
-
-
-def test_names_above_the_bound_are_dropped_and_shown_until_the_hour_is_over(rig: Rig) -> None:
-    for name in ("a", "b", "c", "a"):
+def test_names_above_the_bound_are_dropped_and_shown_until_the_hour_since_the_first_is_over(rig: Rig) -> None:
+    for rig.now, name in ((10.0, "a"), (20.0, "b"), (20.0, "c"), (30.0, "a")):
         rig.read(name)
     assert [rig.shown(f"sensor/{name}") for name in "abc"] == [2, 1, 0]
-    assert rig.conditions.texts, "status says so"
-    rig.now = names.HOUR_S
-    rig.publishers.expire()
-    assert not rig.conditions.texts
+    assert len(rig.publishers) == 2, "one for each topic"
+    for rig.now, over in ((names.HOUR_S + 9.9, True), (names.HOUR_S + 10.0, False)):
+        rig.publishers.expire()
+        assert bool(rig.conditions.texts) is over, "status says so"
     rig.read("c")
     assert rig.shown("sensor/c") == 1
 

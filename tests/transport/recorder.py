@@ -1,10 +1,17 @@
-"""A receiver that keeps what a link brings."""
+"""A receiver that keeps what a link brings, and links over loopback that end at one."""
 
 import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 
+from zbridge.protocol.address import Address
 from zbridge.transport.link import Link, Receiver
+from zbridge.transport.tcp import TcpLink, connect, listen
 
 SOON_S = 5.0
+LOCAL = Address("127.0.0.1", 0)
 
 
 class Recorder(Receiver):
@@ -21,21 +28,20 @@ class Recorder(Receiver):
         self.foreign = 0
         self.reason: str | None = None
         self.calls: list[str] = []
-        self._changed = asyncio.Event()
 
     def attached(self, link: Link) -> None:
         self.link = link
-        self._note("attached")
+        self.calls.append("attached")
 
     def received(self, data: bytes) -> None:
         assert type(data) is bytes
         self.data += data
-        self._note("received")
+        self.calls.append("received")
 
     def received_datagram(self, datagram: bytes) -> None:
         assert type(datagram) is bytes
         self.datagrams.append(datagram)
-        self._note("datagram")
+        self.calls.append("datagram")
 
     def claims(self, datagram: bytes, port: int) -> bool:
         self.asked.append(port)
@@ -43,29 +49,77 @@ class Recorder(Receiver):
 
     def rivalled(self) -> None:
         self.mark = b""
-        self._note("rivalled")
+        self.calls.append("rivalled")
 
     def stray_datagram(self, datagram: bytes) -> None:
         self.stray.append(datagram)
-        self._note("stray")
+        self.calls.append("stray")
 
     def foreign_datagram(self) -> None:
         self.foreign += 1
-        self._note("foreign")
+        self.calls.append("foreign")
 
     def lost(self, reason: str) -> None:
         self.reason = reason
-        self._note("lost")
+        self.calls.append("lost")
 
     def writable(self) -> None:
-        self._note("writable")
-
-    def _note(self, call: str) -> None:
-        self.calls.append(call)
-        self._changed.set()
+        self.calls.append("writable")
 
     async def until(self, call: str, *, received: int = 0, datagrams: int = 0) -> None:
-        async with asyncio.timeout(SOON_S):
-            while call not in self.calls or len(self.data) < received or len(self.datagrams) < datagrams:
-                self._changed.clear()
-                await self._changed.wait()
+        """Wait until this was called, and so many bytes and datagrams have come."""
+        await until(lambda: call in self.calls and len(self.data) >= received and len(self.datagrams) >= datagrams)
+
+
+@dataclass
+class Pair:
+    """Both ends of one connection: ``here`` connected, ``there`` was accepted."""
+
+    address: Address
+    here: TcpLink
+    near: Recorder
+    far: Recorder
+
+    @property
+    def there(self) -> TcpLink:
+        assert isinstance(self.far.link, TcpLink)
+        return self.far.link
+
+
+def socket_of(link: TcpLink) -> socket.socket:
+    assert link._transport is not None
+    found: socket.socket = link._transport.get_extra_info("socket")
+    return found
+
+
+@contextlib.asynccontextmanager
+async def connected() -> AsyncIterator[Pair]:
+    near, far = Recorder(), Recorder()
+    async with listen(LOCAL, lambda: far) as address:
+        here = await connect(address, near)
+        await far.until("attached")
+        pair = Pair(address, here, near, far)
+        yield pair
+        here.abort()
+        pair.there.abort()
+        await near.until("lost")
+        await far.until("lost")
+
+
+def udp_socket(address: tuple[str, int]) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    made.bind(address)
+    return made
+
+
+async def heard_by(listening: socket.socket) -> tuple[bytes, tuple[str, int]]:
+    async with asyncio.timeout(SOON_S):
+        return await asyncio.get_running_loop().sock_recvfrom(listening, 65_536)
+
+
+async def until(happened: Callable[[], bool]) -> None:
+    """Wait for what nothing tells."""
+    async with asyncio.timeout(SOON_S):
+        while not happened():  # noqa: ASYNC110
+            await asyncio.sleep(0.001)

@@ -3,30 +3,15 @@
 from zbridge.transport.backlog import ENTRIES, Backlog
 
 
-def test_nothing_written_waits_for_nothing() -> None:
-    backlog = Backlog()
-    assert backlog.since is None
-    backlog.settle(0)
-    assert backlog.since is None
-
-
 def test_the_oldest_unacknowledged_write_counts_and_a_part_of_it_too() -> None:
     backlog = Backlog()
-    backlog.written(6, 1.0)
-    backlog.written(10, 2.0)
-    backlog.written(6, 3.0)
-    backlog.settle(22)
-    assert backlog.since == 1.0
-    backlog.settle(17)  # a byte of the first is acknowledged
-    assert backlog.since == 1.0
-    backlog.settle(16)
-    assert backlog.since == 2.0
-    backlog.settle(7)
-    assert backlog.since == 2.0
-    backlog.settle(6)
-    assert backlog.since == 3.0
     backlog.settle(0)
     assert backlog.since is None
+    for size, now in ((6, 1.0), (10, 2.0), (6, 3.0)):
+        backlog.written(size, now)
+    for outstanding, since in ((22, 1.0), (17, 1.0), (16, 2.0), (7, 2.0), (6, 3.0), (0, None)):
+        backlog.settle(outstanding)
+        assert backlog.since == since
 
 
 def test_a_steady_stream_that_is_acknowledged_late_is_never_old() -> None:
@@ -44,9 +29,6 @@ def test_what_is_kept_is_bounded_and_the_oldest_stays_true() -> None:
     for number in range(10 * ENTRIES):
         backlog.written(1, float(number))
     assert backlog.since == 0.0
-    backlog.settle(10 * ENTRIES - 1)
-    assert backlog.since == 1.0
-    backlog.settle(1)
-    assert backlog.since == float(ENTRIES - 1)
-    backlog.settle(0)
-    assert backlog.since is None
+    for outstanding, since in ((10 * ENTRIES - 1, 1.0), (1, float(ENTRIES - 1)), (0, None)):
+        backlog.settle(outstanding)
+        assert backlog.since == since

@@ -123,10 +123,7 @@ async def test_an_unplugged_device_is_lost_once_with_a_reason_and_not_within_a_w
     assert (line.link.ready, line.link.unacknowledged_s, line.recorder.calls.count("lost")) == (False, 0.0, 1)
 
 
-async def test_close_writes_what_waits_first(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        serial, "LOOK_S", 0.5
-    )  # a pseudo-terminal counts nothing as unsent, and drops it with the close
+async def test_close_writes_what_waits_first(line: Line) -> None:
     sent = line.fill()
     line.link.close()
     line.link.close()

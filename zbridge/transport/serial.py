@@ -172,9 +172,10 @@ class SerialLink:
         self.pause()
         if self._unwritten:
             self._loop.remove_writer(self._fd)
+        if self._unsent():  # else the kernel waits in close for bytes that nobody takes
+            with contextlib.suppress(OSError, termios.error):  # the device is gone, and its output queue with it
+                termios.tcflush(self._fd, termios.TCOFLUSH)
         self._open, self._unwritten = False, b""
-        with contextlib.suppress(OSError, termios.error):  # the device is gone, and its output queue with it
-            termios.tcflush(self._fd, termios.TCOFLUSH)  # else the kernel waits in close for bytes that nobody takes
         with contextlib.suppress(OSError):
             self._port.close()
         self._loop.call_soon(self._receiver.lost, reason)

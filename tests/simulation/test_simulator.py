@@ -15,14 +15,11 @@ from zbridge.simulation.simulator import Simulator
 from zbridge.transport.conversation import Conversation
 
 SOON_S = 5.0
-Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 def line_end(data: bytes, start: int) -> int:
     end = data.find(b"\n", start)
-    if end < 0:
-        return len(data) + 1
-    return end + 1
+    return len(data) + 1 if end < 0 else end + 1
 
 
 class Lines(Session[str]):
@@ -75,9 +72,9 @@ class Toy(Simulator[str]):
 
 
 @contextlib.asynccontextmanager
-async def living(toy: Toy, links: int = 2) -> AsyncIterator[tuple[Address, ...]]:
+async def living(toy: Toy) -> AsyncIterator[tuple[Address, ...]]:
     ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
-    simulation = Simulation(tuple(Address("127.0.0.1", 0) for _ in range(links)), ready=ready.set_result)
+    simulation = Simulation(tuple(Address("127.0.0.1", 0) for _ in range(2)), ready=ready.set_result)
     task = asyncio.create_task(toy.run(simulation))
     try:
         async with asyncio.timeout(SOON_S):
@@ -88,41 +85,28 @@ async def living(toy: Toy, links: int = 2) -> AsyncIterator[tuple[Address, ...]]
             await task
 
 
-async def connect(address: Address) -> Streams:
+async def connect(address: Address) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     return await asyncio.open_connection(address.host, address.port)
 
 
-async def test_each_link_greets_first_and_is_told_its_own() -> None:
+async def test_each_link_greets_first_is_told_its_own_and_answers_up_to_what_may_not_be_sent() -> None:
     async with living(Toy()) as (first, second):
         for address, lines in ((first, [b"hello drive\n", b"first\n"]), (second, [b"hello laser\n", b"second\n"])):
             reader, writer = await connect(address)
             assert [await reader.readline() for _ in lines] == lines
+            writer.write(b"one\n")
+            assert {await reader.readline() for _ in range(3)} == {lines[1], b"echo one\n"}
             writer.close()
 
 
-async def test_a_client_is_answered_up_to_what_it_may_not_be_sent() -> None:
-    async with living(Toy()) as (first, _):
-        reader, writer = await connect(first)
-        writer.write(b"one\n")
-        answers = {await reader.readline() for _ in range(4)}
-        assert answers == {b"hello drive\n", b"echo one\n", b"first\n"}
-        writer.close()
-
-
-async def test_who_finds_no_place_is_closed() -> None:
+async def test_who_finds_no_place_is_closed_and_the_end_closes_every_conversation() -> None:
     async with living(Toy()) as (first, _):
         served = [await connect(first), await connect(first)]
         for reader, _ in served:
             assert await reader.readline() == b"hello drive\n"
         reader, writer = await connect(first)
         assert await reader.read() == b""
-        for _, one in [*served, (reader, writer)]:
-            one.close()
-
-
-async def test_its_end_closes_every_conversation() -> None:
-    async with living(Toy()) as (first, _):
-        reader, writer = await connect(first)
-        assert await reader.readline() == b"hello drive\n"
-    assert (await reader.read()).strip(b"first\n") == b""
-    writer.close()
+        writer.close()
+    for reader, writer in served:
+        assert (await reader.read()).strip(b"first\n") == b""
+        writer.close()

@@ -27,16 +27,10 @@ LEASE, TOKEN, PROOF = b"\x01" * 8, b"\x02" * 32, b"\x03" * 16
 OFFLINE = m.Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2)
 OFFLINE_SENT = {"who": None, "command": "drive", "code": "not_ready", "reason": "offline", "count": 2, "by": None}
 LINK = {"name": "robot", "state": "established", "peer": "tcp://a:1"}
-SESSION = {"name": "ground.2", "peer": "tcp://10.0.0.7:50000", "role": "robot", "state": "established"} | {
-    "version": "1.1",
-    "counters": {"frames_in": 3},
-    "left_out": {"servertSLAMMapPart (56)": 7},
-}
-SCANNER = {"angle_min": 0.0, "angle_max": 1.0, "angle_increment": 0.5, "time_increment_s": 0.1} | {
-    "range_min": 0.2,
-    "range_max": 9.0,
-    "points": 3,
-}
+SESSION = {"name": "ground.2", "peer": "tcp://10.0.0.7:50000", "role": "robot", "state": "established"}
+SESSION |= {"version": "1.1", "counters": {"frames_in": 3}, "left_out": {"servertSLAMMapPart (56)": 7}}
+SCANNER = {"angle_min": 0.0, "angle_max": 1.0, "angle_increment": 0.5, "time_increment_s": 0.1}
+SCANNER |= {"range_min": 0.2, "range_max": 9.0, "points": 3}
 ACQUIRE = {"who": "hq 1", "priority": 3, "lease_s": 2.0, "deadman_s": 0.5, "alive": "operator.1"}
 GRANTED = {"ok": True, "lease": LEASE, "token": TOKEN, "expires_in_s": 3.0, "holder": "hq 1"}
 HELD = {"ok": False, "expires_in_s": 1.5, "holder": "hq 1", "reason": "held by hq 1", "code": "held"}
@@ -161,36 +155,26 @@ def test_cells_travel_row_by_row(cells: Any, sent: bytes) -> None:
     ("kind", "fields", "named"),
     [
         (m.Switch, {}, "on"),
-        (m.Switch, {"on": 1}, "on"),
         (m.Pose, {"x": 1.0, "y": 1.0}, "heading"),
-        (m.Pose, {"x": "1", "y": 1.0, "heading": 0.0}, "x"),
         (m.Drive, {"forward": 1.0001}, "forward"),
         (m.Drive, {"left": -1.0001}, "left"),
         (m.Drive, {"turn": math.nan}, "turn"),
         (m.Drive, {"turn": math.inf}, "turn"),
         (m.Motor, {"value": math.nan}, "value"),
         (m.Mode, {"mode": "sport"}, "mode"),
-        (m.Raw, {"id": 1, "body": [1]}, "body"),
         (m.Switch, {"on": True, "stamp_ns": "now"}, "stamp_ns"),
-        (m.Acquire, {}, "who"),
-        (m.Acquire, {"who": "hq", "priority": 1.5}, "priority"),
-        (m.Acquire, {"who": "hq", "lease_s": "long"}, "lease_s"),
         (m.Authorization, {"seq": 1, "proof": PROOF}, "lease"),
         (m.Authorization, {"lease": LEASE[1:], "seq": 1, "proof": PROOF}, "lease"),
         (m.Authorization, {"lease": LEASE, "seq": -1, "proof": PROOF}, "seq"),
         (m.Authorization, {"lease": LEASE, "proof": PROOF}, "seq"),
-        (m.Authorization, {"lease": LEASE, "seq": 1, "proof": "text"}, "proof"),
         (m.Refusals, {"refusals": 17 * [{"who": None, "command": "drive", "reason": "", "count": 1}]}, "refusals"),
         (m.Lease, {"ok": True, "lease": LEASE, "token": TOKEN[:16]}, "token"),
         (m.Scan, {name: value for name, value in SCAN.items() if name != "ranges"}, "`ranges`"),
         (m.Scan, {}, "required field `angle_min`"),
-        (m.Scan, {**SCAN, "angle_min": None}, "angle_min"),
         *((m.Scan, {**SCAN, "ranges": ranges}, "bin of float32") for ranges in (bytes(7), [1.0], None)),
         *((m.Map, {**MAP, "rows": rows, "columns": at}, "do not fill") for rows, at in ((3, 3), (-2, -3), (0, 3))),
         (m.Map, {**MAP, "rows": 0, "columns": 2**64 - 1, "cells": b""}, ""),
-        *((m.Map, {**MAP, "rows": rows}, "rows") for rows in (None, "2", 2.0)),
         *((m.Map, {**MAP, "cells": cells}, "") for cells in ("text", [0] * 6, None, bytes(5))),
-        (m.Map, {**MAP, "cell": "wide"}, "cell"),
         (m.Map, {**MAP, "origin": [0.0]}, "origin"),
     ],
 )

@@ -53,6 +53,8 @@ def test_the_last_value_is_kept_and_a_new_view_knows_nothing(topic: Topic) -> No
     assert (known(view), agreed(view), view.readings, view.missing) == ({}, (None, None, None), {}, NOBODY)
     view.note(topic, KEPT[topic])
     assert known(view) == {topic.path: KEPT[topic]}
+    view.note(topics.STATUS, ESTABLISHED)
+    assert known(view) == {topic.path: KEPT[topic], "status": ESTABLISHED}, "what came before it belongs to the robot"
 
 
 def test_what_is_no_state_of_the_robot_is_not_kept(view: RobotView) -> None:
@@ -90,9 +92,10 @@ def test_it_says_why_the_robot_cannot_be_used(status: Status, missing: str | Non
     assert view.missing == NOBODY
 
 
-def test_a_robot_that_is_away_for_a_moment_keeps_what_was_agreed(view: RobotView) -> None:
-    view.note(topics.STATUS, Status("offline", protocol="toy"))
-    assert agreed(view) == ("toy", "1.3", ("udp", "lidar"))
+@pytest.mark.parametrize("state", ["offline", "connecting", "handshaking", "closing"])
+def test_a_robot_that_is_away_for_a_moment_keeps_what_was_agreed_but_may_have_other_sensors(view, state) -> None:
+    view.note(topics.STATUS, Status(state, protocol="toy"))
+    assert (agreed(view), view.readings) == (("toy", "1.3", ("udp", "lidar")), {})
     view.note(topics.STATUS, Status("established", protocol="toy", version="1.1"))
     assert agreed(view) == ("toy", "1.1", ())
     assert view.pose is POSE
@@ -103,17 +106,3 @@ def test_a_robot_of_another_protocol_is_another_robot_but_its_lease_is_the_gatew
     view.note(topics.STATUS, other)
     assert known(view) == {"status": other, "control": KEPT[topics.CONTROL]}
     assert (agreed(view), view.readings, view.missing) == (("other", None, ()), {}, None)
-
-
-def test_what_came_before_the_first_status_belongs_to_the_robot() -> None:
-    """A late joiner is given the last values in any order."""
-    view = RobotView()
-    view.note(topics.POSE, POSE)
-    view.note(topics.STATUS, ESTABLISHED)
-    assert view.pose is POSE
-
-
-@pytest.mark.parametrize("state", ["offline", "connecting", "handshaking", "closing"])
-def test_readings_of_a_connection_that_is_gone_make_room_for_those_of_the_next(view: RobotView, state: str) -> None:
-    view.note(topics.STATUS, Status(state, protocol="toy"))  # type: ignore[arg-type]
-    assert view.readings == {}

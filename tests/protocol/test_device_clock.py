@@ -66,50 +66,37 @@ def stamps(clock: DeviceClock, packets: Iterable[Packet]) -> list[int]:
     return taken
 
 
-def errors_ns(clock: DeviceClock, packets: list[Packet]) -> list[int]:
-    return [abs(stamp - one.truth_ns) for stamp, one in zip(stamps(clock, packets), packets, strict=True)]
-
-
-def settled(packet: Packet) -> bool:
-    return packet.device_ms - 5000 >= SETTLED_S * 1000
-
-
-def spread_ms(late_ns: list[int], count: int = 100) -> float:
-    """Tell the ``E`` of the stated error: of any ten seconds the best packet, of these the worst."""
-    return max(min(late_ns[i : i + count]) for i in range(len(late_ns) - count + 1)) / MS
-
-
-def mobile(rng: random.Random, second: float) -> float:
-    return 0.04 + rng.expovariate(1 / 0.1)
+def errors_ns(clock: DeviceClock, packets: list[Packet], from_s: float = 0.0) -> list[int]:
+    """Tell how wrong the stamps are, from so many seconds of the counter after the first packet on."""
+    pairs = zip(stamps(clock, packets), packets, strict=True)
+    first_ms = min(one.device_ms for one in packets)
+    return [abs(stamp - one.truth_ns) for stamp, one in pairs if one.device_ms - first_ms >= from_s * 1000]
 
 
 def exponential(rng: random.Random, second: float) -> float:
     return 0.005 + rng.expovariate(1 / 0.02)
 
 
+def mobile(rng: random.Random, second: float) -> float:
+    return 0.04 + rng.expovariate(1 / 0.1)
+
+
+def often_late(rng: random.Random, second: float) -> float:
+    return exponential(rng, second) + (3.0 if second % 23 > 17 else 0.0)
+
+
+def often_held(rng: random.Random, second: float) -> float:
+    return exponential(rng, second) + (30 - second % 30 if second % 30 > 22 else 0.0)
+
+
+def once_a_second(rng: random.Random, second: float) -> float:
+    return 0.005 + 0.9 - (second + 1e-9) % 1.0 + rng.expovariate(1 / 0.002)
+
+
 def steady(ppm: float) -> Drift:
     return lambda second: ppm * 1e-6 * second
 
 
-DELAYS: dict[str, tuple[Delay, float, bool]] = {
-    "constant": (lambda rng, second: 0.005, 1.6, True),
-    "exponential": (exponential, 2.5, True),
-    "mobile": (mobile, 10, True),
-    "mobile, packets overtake each other": (mobile, 10, False),
-    "six seconds of every 23 are three seconds late": (
-        lambda rng, second: exponential(rng, second) + (3.0 if second % 23 > 17 else 0.0),
-        *(3, True),
-    ),
-    "held for eight seconds of every thirty, then all at once": (
-        lambda rng, second: exponential(rng, second) + (30 - second % 30 if second % 30 > 22 else 0.0),
-        *(4, True),
-    ),
-    "written once a second": (
-        lambda rng, second: 0.005 + 0.9 - (second + 1e-9) % 1.0 + rng.expovariate(1 / 0.002),
-        *(5, True),
-    ),
-}
-"""The delay, the greatest error of it in milliseconds, and whether packets come in order."""
 DRIFTS: dict[str, tuple[Drift, float]] = {
     "none": (steady(0), 0.0),
     "fast": (steady(200), 0.0),
@@ -121,17 +108,28 @@ DRIFTS: dict[str, tuple[Drift, float]] = {
 """How far the counter is ahead, and the greatest change of the drift, ppm per second."""
 
 
-@pytest.mark.parametrize("drift", DRIFTS)
-@pytest.mark.parametrize("delay", DELAYS)
-def test_the_error_stays_within_what_is_stated_and_that_is_so_many_milliseconds(delay: str, drift: str) -> None:
-    (delays, most_ms, in_order), (ahead, bend) = DELAYS[delay], DRIFTS[drift]
+@pytest.mark.parametrize(("ahead", "bend"), DRIFTS.values(), ids=DRIFTS)
+@pytest.mark.parametrize(
+    ("delay", "in_order", "most_ms"),
+    [
+        (lambda rng, second: 0.005, True, 1.6),
+        (exponential, True, 2.5),
+        (mobile, True, 10),
+        (mobile, False, 10),
+        (often_late, True, 3),
+        (often_held, True, 4),
+        (once_a_second, True, 5),
+    ],
+)
+def test_the_error_stays_within_what_is_stated_and_that_is_so_many_milliseconds(delay, in_order, most_ms, ahead, bend):
     for seed in (7, 0, 1):
-        packets = journey(delays, ahead, seed=seed, in_order=in_order)
+        packets = journey(delay, ahead, seed=seed, in_order=in_order)
         least_ns = min(one.arrived_ns - one.truth_ns for one in packets)
         late_ns = [one.arrived_ns - one.truth_ns - least_ns for one in sorted(packets)]
-        pairs = zip(stamps(DeviceClock(), packets), packets, strict=True)
-        worst_ms = max(abs(stamp - one.truth_ns - least_ns) for stamp, one in pairs if settled(one)) / MS
-        assert worst_ms <= 2.5 * spread_ms(late_ns) + 1.5 * bend + 0.01
+        spread_ms = max(min(late_ns[i : i + 100]) for i in range(len(late_ns) - 99)) / MS
+        measured = [one._replace(truth_ns=one.truth_ns + least_ns) for one in packets]
+        worst_ms = max(errors_ns(DeviceClock(), measured, SETTLED_S)) / MS
+        assert worst_ms <= 2.5 * spread_ms + 1.5 * bend + 0.01
         assert worst_ms <= most_ms
 
 
@@ -153,9 +151,7 @@ def test_the_stated_error_holds_for_any_delays(spread_us, drift_ppm, good, gap, 
         packets.append(Packet(second * 1000, truth_ns + round(delay_s * S), truth_ns))
     end_ns = max(one.truth_ns for one in packets[::gap])
     packets = sorted((one for one in packets if one.arrived_ns <= end_ns), key=lambda one: one.arrived_ns)
-    pairs = zip(stamps(DeviceClock(), packets), packets, strict=True)
-    errors_ns = [abs(stamp - one.truth_ns) for stamp, one in pairs if one.device_ms >= SETTLED_S * 1000]
-    assert max(errors_ns) <= 2.5 * spread_us * 1000 + 10
+    assert max(errors_ns(DeviceClock(), packets, SETTLED_S)) <= 2.5 * spread_us * 1000 + 10
 
 
 @settings(max_examples=2 * settings().max_examples)
@@ -182,15 +178,20 @@ def test_early_stamps_are_as_good_as_the_best_packet_so_far(drift_ppm, delays_s,
     steps_ms=st.lists(st.integers(0, 3000), min_size=100, max_size=100),
     drift_ppm=st.floats(-400, 400),
 )
-def test_stamps_never_go_back_and_equal_counters_have_equal_stamps(delays_s, steps_ms, drift_ppm) -> None:
+def test_stamps_go_on_at_half_the_pace_at_least_and_equal_counters_have_equal_stamps(delays_s, steps_ms, drift_ppm):
     clock = DeviceClock()
-    device_ms, free_at, last, before = 0, 0.0, 0, -1
+    device_ms, free_at, last_ns = 0, 0.0, 0
     for delay_s, step_ms in zip(delays_s, steps_ms, strict=False):
         device_ms += step_ms
         free_at = max(free_at, device_ms / 1000 * (1 + drift_ppm * 1e-6) + delay_s)
-        stamp_ns = clock.stamp_ns(device_ms, EPOCH_NS + round(free_at * S))
-        assert stamp_ns == last if device_ms == before else stamp_ns >= last
-        last, before = stamp_ns, device_ms
+        arrived_ns = EPOCH_NS + round(free_at * S)
+        stamp_ns = clock.stamp_ns(device_ms, arrived_ns)
+        if step_ms == 0 and last_ns:
+            assert stamp_ns == last_ns
+        else:
+            assert stamp_ns >= min(last_ns + step_ms * MS // 2, arrived_ns)
+        assert len(clock._points) <= BUCKETS
+        last_ns = stamp_ns
 
 
 # Jumps, and lesser steps
@@ -302,14 +303,6 @@ def test_a_measurement_has_the_stamp_of_its_counter_or_of_its_arrival(calls: lis
     assert clock.beginnings == 1
 
 
-def test_stamps_go_on_at_half_the_pace_at_least_although_the_line_falls() -> None:
-    packets = journey(mobile, DRIFTS["swinging"][0], minutes=5)
-    taken = stamps(DeviceClock(), packets)
-    for i in range(1, len(packets)):
-        least_ns = (packets[i].device_ms - packets[i - 1].device_ms) * MS // 2
-        assert taken[i] - taken[i - 1] >= least_ns or taken[i] == packets[i].arrived_ns
-
-
 @pytest.mark.parametrize("start_ms", [U32 - 5000, U32 - 1, U32 - 100_000])
 def test_a_wrap_is_no_restart(start_ms: int) -> None:
     packets = journey(exponential, steady(200), minutes=5)
@@ -319,12 +312,6 @@ def test_a_wrap_is_no_restart(start_ms: int) -> None:
     assert wrapped.beginnings == 1
 
 
-def test_without_a_wrap_the_counter_is_any_integer() -> None:
-    clock = DeviceClock()
-    arrivals_ns = [EPOCH_NS + i * 100 * MS for i in range(100)]
-    assert [clock.stamp_ns(10**30 + i * 100, arrived_ns) for i, arrived_ns in enumerate(arrivals_ns)] == arrivals_ns
-
-
 def test_the_drift_outlives_a_restart() -> None:
     clock = DeviceClock()
     stamps(clock, [packet(i / 10, 0.0, ahead_s=i / 10 * 2e-4) for i in range(900)])
@@ -332,13 +319,6 @@ def test_the_drift_outlives_a_restart() -> None:
     stamps(clock, series(5, from_s=100.0, start_ms=-100_000))
     assert clock.beginnings == 2
     assert clock.drift_ppm == pytest.approx(-200, abs=20)
-
-
-def test_a_counter_that_stands_still_is_no_clock_after_ten_seconds() -> None:
-    clock = DeviceClock(U32)
-    taken = [clock.stamp_ns(0, EPOCH_NS + i * 100 * MS) for i in range(500)]
-    assert taken == [EPOCH_NS] * 101 + [EPOCH_NS + i * 100 * MS for i in range(101, 500)]
-    assert clock.beginnings == 1
 
 
 @pytest.mark.parametrize("wrap_ms", [None, 1000, 1, 0])
@@ -365,9 +345,3 @@ def test_no_value_raises_or_is_stamped_after_its_arrival(wrap_ms: int | None, ca
         stamp_ns = clock.stamp_ns(device_ms, arrived_ns)
         assert type(stamp_ns) is int
         assert stamp_ns <= arrived_ns
-
-
-def test_memory_is_bounded() -> None:
-    clock = DeviceClock()
-    stamps(clock, journey(exponential, steady(200), minutes=11))
-    assert len(clock._points) == BUCKETS

@@ -188,43 +188,38 @@ def test_last_words_are_written_without_waiting_for_answers(asker: Asker) -> Non
     assert asker.state is State.CLOSED
 
 
-Step = st.one_of(
+STEPS = st.one_of(
     st.tuples(st.sampled_from(["send", "drive", "stop", "poll", "answer", "wrong"]), st.integers(0, 9)),
     st.tuples(st.just("wait"), st.integers(0, 300)),
 )
 
 
-@given(st.lists(Step, max_size=40))
+@given(st.lists(STEPS, max_size=40))
 def test_at_no_time_are_two_requests_on_the_wire_and_a_stop_is_next(steps: list[tuple[str, int]]) -> None:
-    session = Asker()
+    session, now, on_wire, stops = Asker(), 0.0, b"", False
     session.lost_after = 10**6
     session.open(0.0)
-    now, on_wire, stops = 0.0, None, 0
     for what, value in steps:
         if what == "send":
             session.send(Line(f"L,{value}"))
         elif what == "drive":
             session.outbox.set("drive", (b"D,%d\n" % (value + 1),), now)
         elif what == "stop":
-            stops = 1
             session.outbox.set("drive", (b"D,0,0\n",), now, until=now, urgent=True)
         elif what == "poll":
             session.poll(f"poll {value % 3}", Line("H"), now, 0.05)
-        elif what == "answer" and on_wire is not None:
-            session.receive(on_wire[:1].lower() + b",1\n", now)
-            on_wire = None
-        elif what == "wrong":
-            session.receive(b"z\n", now)
+        elif what in ("answer", "wrong"):
+            session.receive(on_wire[:1].lower() + b",1\n" if what == "answer" else b"z\n", now)
         else:
             now += value / 1000
-        if session.exchange.answer_at <= now:
-            on_wire = None
+        stops = stops or what == "stop"
+        if session.exchange.answer_at <= now or what == "answer":
+            on_wire = b""
         session.expire(now)
         if session.over:
             return
         frame = session.outgoing(now)
         if frame is not None:
-            assert on_wire is None
-            on_wire = frame
+            assert on_wire == b""
             assert not stops or frame == b"D,0,0\n"
-            stops = 0
+            on_wire, stops = frame, False

@@ -1,8 +1,6 @@
 """The package as the author of a protocol sees it."""
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -17,18 +15,6 @@ GATEWAYS = sorted(
 )
 AUTHORS = {"zbridge.protocol", "zbridge.wire", "zbridge.fleet"}
 SIMULATORS = {"zbridge.simulation", "zbridge.transport"}
-FRESH = """
-import sys
-import msgpack, msgspec, numpy
-theirs = set(sys.modules)
-import zbridge.protocol, zbridge.fleet, zbridge.wire, zbridge.fleet.view, zbridge.fleet.messages, zbridge.fleet.topics
-sys.exit(" ".join({"asyncio", "socket", "threading", "zenoh", "uvloop"} & (set(sys.modules) - theirs)))
-"""
-
-
-def test_importing_it_loads_no_event_loop_no_socket_no_thread_and_no_bus() -> None:
-    ran = subprocess.run([sys.executable, "-c", FRESH], capture_output=True, text=True)
-    assert ran.stderr.strip() == ""
 
 
 def test_its_docstring_is_the_table_of_its_contents_and_it_exports_them() -> None:

@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
-import sys
 from collections.abc import Callable, Iterable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
-from zbridge.errors import ConfigError, ProtocolError
+from tests.e2e.other_package import toyrobot as toy
+from zbridge.errors import ConfigError
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Switch
 from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
 from zbridge.simulation.check_commands import check_commands, check_stop
-from zbridge.simulation.check_messages import check_messages, example
+from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
 from zbridge.simulation.check_plugin import check_plugin
 from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
 from zbridge.simulation.check_stage import Recording, record
 
-PACKAGE = Path(__file__).parents[1] / "e2e" / "other_package" / "toyrobot.py"
-SPEC = importlib.util.spec_from_file_location("toyrobot_checked", PACKAGE)
-assert SPEC is not None
-assert SPEC.loader is not None
-toy = sys.modules[SPEC.name] = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(toy)
 TOY: Protocol = toy.PROTOCOL
 
 
@@ -91,19 +83,6 @@ def breaks_on_noise(frame: bytes) -> Any:
     return {b"at": toy.read}[frame.split(b" ")[0]](frame)
 
 
-def breaks_when_cut(frame: bytes) -> Any:
-    assert frame.endswith(b"\n")
-    return toy.read(frame)
-
-
-def ends_early(data: bytes, start: int) -> int:
-    return len(data)
-
-
-def reads_two_lines(data: bytes, start: int) -> int:
-    return len(data) if data.endswith(b"\n") else len(data) + 1
-
-
 ROUND_TRIP, CUTS, NOISE = "lines: 1 messages round-trip", "lines: whole, byte by byte", "lines: random bytes"
 TRUNCATED, NAME = "lines: what is cut off", "the protocol has the name of its entry point"
 TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session can be shown"
@@ -126,21 +105,23 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
         (with_codec(frame_end=lambda data, start: start + 1000), {CUTS: "is cut to []"}),
         (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:"}),
         (
-            with_codec(frame_end=ends_early, read=breaks_when_cut),
-            {CUTS: "byte by byte is cut to", TRUNCATED: "AssertionError", NOISE: "AssertionError"},
+            with_codec(
+                frame_end=lambda data, start: len(data),
+                read=lambda frame: toy.read(frame) if frame.endswith(b"\n") else 1 / 0,
+            ),
+            {CUTS: "byte by byte is cut to", TRUNCATED: "ZeroDivisionError", NOISE: "ZeroDivisionError"},
         ),
         (
-            with_codec(frame_end=reads_two_lines, messages=(toy.At(1, 2, 3), toy.At(4, 5, 6))),
+            with_codec(
+                frame_end=lambda data, start: len(data) + (not data.endswith(b"\n")),
+                messages=(toy.At(1, 2, 3), toy.At(4, 5, 6)),
+            ),
             {"lines: whole, byte by byte": "all messages joined"},
         ),
     ],
 )
 def test_a_broken_protocol_object_and_broken_messages_are_found(protocol: Protocol, expected: dict[str, str]) -> None:
     assert_found([*check_plugin(protocol, "toy"), *check_messages(protocol)], expected)
-
-
-def test_the_example_of_a_class_has_a_value_for_each_field() -> None:
-    assert example(toy.At) == toy.At(0.5, 0.5, 0.5)
 
 
 # Sessions
@@ -162,20 +143,6 @@ def test_a_session_that_is_not_established_is_found_with_its_reason(opened: Any,
     assert_found(check_sessions(protocol, asyncio.run(record(protocol, 0.3))), {ESTABLISHED: problem})
 
 
-def open_for_ever(self: Session[Any], now: float) -> None:
-    Session.open(self, now)
-    self._limit_at = float("inf")
-
-
-def establish_when_told(self: Session[Any], message: Any, now: float) -> bool:
-    self.establish("7.0", ())
-    return True
-
-
-def fails(message: Any) -> Any:
-    raise KeyError(message.x)
-
-
 GARBAGE, SILENCE, END = "garbage at", "silence at", "the end of the connection at"
 TRANSLATED = "messages of the robot are translated"
 
@@ -186,12 +153,15 @@ TRANSLATED = "messages of the robot are translated"
         (TOY, {}),
         (with_session(decode=lambda self, frame: breaks_on_noise(frame)), {GARBAGE: "KeyError"}),
         (
-            with_session(open=open_for_ever, opened=lambda self, now: None, accept=establish_when_told),
+            with_session(
+                opened=lambda self, now: self.lift_limit(),
+                accept=lambda self, message, now: self.establish("7.0", ()),
+            ),
             {SILENCE: "still handshaking after 6 s"},
         ),
         (with_session(lost=lambda self, reason: None), {END: "still does something"}),
         (with_session(timers=lambda self: 0.0), {"what the robot said establishes a session": "writes and timers"}),
-        (with_robot(_at=lambda self, message, stamp_ns: fails(message)), {"": "KeyError"}),
+        (with_robot(_at=lambda self, message, stamp_ns: {}[message.x]), {"": "KeyError"}),
         (with_robot(_at=lambda *_: ((topics.POSE, Switch(on=True)),)), {"": "PayloadError"}),
         (
             with_robot(_at=lambda self, message, stamp_ns: toy.ToyRobot._at(self, message, 0)),
@@ -217,40 +187,34 @@ STOP_EARLY = "a stop before the first connection is refused or ignored"
 STILL = b"go 0.000000 0.000000\n"
 
 
-def stop_without_asking(self: Any, now: float, until: float) -> None:
-    assert self._session is not None
-    toy.ToyRobot.stop(self, now, until)
-
-
-def stopping(slot: str | None = "motion", **more: Any) -> Protocol:
-    """The toy with a stop of its own."""
-
-    def stop(self: Any, now: float, until: float) -> None:
-        if self._session is None:
-            return
-        if slot is None:
-            self._session.outbox.put(STILL)
-        else:
-            ends = {"until": until} if "period_s" in more else {}
-            self._session.outbox.set(slot, (STILL,), now, **ends, **more)
-
-    return with_robot(stop=stop)
-
-
 @pytest.mark.parametrize(
-    ("protocol", "expected"),
+    ("stop", "expected"),
     [
-        (TOY, {}),
-        (stopping(None), {STOP_FIRST: "is written before the stop", REPEATED: ""}),
-        (with_robot(stop=lambda self, now, until: None), {STOP_FIRST: "a stop writes nothing"}),
-        (stopping("stop", period_s=0.1, urgent=True), {STOP_FIRST: "moves the robot after its stop"}),
-        (stopping(period_s=0.1), {STOP_FIRST: "b'what waits' is written before the stop"}),
-        (stopping(urgent=True), {REPEATED: "it is not written again"}),
-        (with_robot(stop=stop_without_asking), {STOP_EARLY: "AssertionError"}),
+        (toy.ToyRobot.stop, {}),
+        (lambda self, now, until: None, {STOP_FIRST: "a stop writes nothing"}),
+        (
+            lambda self, now, until: self._session.outbox.put(STILL),
+            {STOP_FIRST: "is written before the stop", REPEATED: "", STOP_EARLY: "AttributeError"},
+        ),
+        (
+            lambda self, now, until: toy.ToyRobot._go(self, 0.0, 0.0, now, until=until),
+            {STOP_FIRST: "b'what waits' is written before the stop"},
+        ),
+        (
+            lambda self, now, until: toy.ToyRobot._go(self, 0.0, 0.0, now, until=now, urgent=True),
+            {REPEATED: "it is not written again"},
+        ),
+        (
+            lambda self, now, until: self._session.outbox.set(
+                "beside", (STILL,), now, period_s=0.1, until=until, urgent=True
+            ),
+            {STOP_FIRST: "moves the robot after its stop", STOP_EARLY: "AttributeError"},
+        ),
     ],
+    ids=["sound", "nothing", "last", "after what waits", "once", "beside the motion"],
 )
-def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, protocol: Protocol, expected) -> None:
-    assert_found(check_stop(protocol, heard), expected)
+def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, stop, expected: dict[str, str]) -> None:
+    assert_found(check_stop(with_robot(stop=stop), heard), expected)
 
 
 OTHERS = [f"@cmd/{name}" for name in ("mode", "light", "lidar", "camera", "text", "scan", "motor", "sensor", "raw")]
@@ -261,24 +225,17 @@ def only_drives(self: Any, topic: Any, command: Any, now: float) -> Outcome:
     return toy.ToyRobot.command(self, topic, command, now) if isinstance(command, Drive) else Outcome()
 
 
-def refuses_by_protocol_errors(self: Any, topic: Any, command: Any, now: float) -> Outcome:
-    raise ProtocolError("no")
-
-
-def fails_at_full_scale(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
-    assert forward + turn < 2, 1 / 0
-    toy.ToyRobot._go(self, forward, turn, now, **more)
-
-
 @pytest.mark.parametrize(
     ("methods", "expected"),
     [
         ({}, {}),
         ({"command": only_drives}, dict.fromkeys(OTHERS, "accepted, but nothing is")),
         ({"command": lambda self, topic, command, now: {Drive: Outcome()}[type(command)]}, {"@cmd/": "KeyError"}),
-        ({"command": refuses_by_protocol_errors}, {"@cmd/text": "ProtocolError: no", "@cmd/": "", "drives at": ""}),
         ({"ask": lambda self, topic: None}, dict.fromkeys(QUESTIONS, "nothing is written for it")),
-        ({"_go": fails_at_full_scale}, {"drives at full scale": "ZeroDivisionError: division by zero (test_check.py:"}),
+        (
+            {"_go": lambda self, forward, turn, now: self._session.outbox.put({False: b"go"}[forward + turn == 2])},
+            {"drives at full scale": "KeyError: True (test_check.py:"},
+        ),
     ],
 )
 def test_a_command_that_is_neither_carried_out_nor_refused_is_found(heard: Recording, methods, expected) -> None:
@@ -288,30 +245,13 @@ def test_a_command_that_is_neither_carried_out_nor_refused_is_found(heard: Recor
 # Motion
 
 
-def moving_as_it_likes(step_m: float) -> Protocol:
-    """The toy whose simulated robot hears nothing."""
+def with_wheels(forwards: float, leftwards: float) -> Protocol:
+    """The toy whose wheels do something else than they are told."""
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        x = 0.0
-        try:
-            while not writer.is_closing():
-                x += step_m
-                writer.write(b"at %f 0 0\n" % x)
-                await asyncio.sleep(0.1)
-        finally:
-            writer.close()
+    def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
+        toy.ToyRobot._go(self, forward * forwards, turn * leftwards, now, **more)
 
-    async def simulate(simulation: Simulation) -> None:
-        (address,) = simulation.addresses
-        async with await asyncio.start_server(serve, address.host, address.port) as server:
-            simulation.ready((type(address)(*server.sockets[0].getsockname()[:2]),))
-            await server.serve_forever()
-
-    return broken(simulate=simulate)
-
-
-def go_the_other_way(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
-    toy.ToyRobot._go(self, -forward, -turn, now, **more)
+    return with_robot(_go=go)
 
 
 class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -328,9 +268,9 @@ STANDS = "the simulated robot stands after its stop"
 @pytest.mark.parametrize(
     ("protocol", "expected"),
     [
-        (moving_as_it_likes(0.0), {DRIVES: "it moved 0.000 m", TURNS: ""}),
-        (moving_as_it_likes(0.1), {STANDS: "it moves on", TURNS: ""}),
-        (with_robot(_go=go_the_other_way), {DRIVES: "it moved -0.", TURNS: "its heading changed by -0."}),
+        (with_wheels(0, 0), {DRIVES: "it moved 0.000 m", TURNS: "its heading changed by 0."}),
+        (with_robot(stop=lambda self, now, until: None), {STANDS: "it moves on"}),
+        (with_wheels(-1, -1), {DRIVES: "it moved -0.", TURNS: "its heading changed by -0."}),
         (broken(options=Sized), {}),
         (
             broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0}),

@@ -4,13 +4,15 @@ A frame is a length byte and so many bytes; ``welcome`` ends the handshake, ``by
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import ProtocolError
-from zbridge.protocol.session import LINGER_S, Limits, Role, Session, State
+from zbridge.protocol.session import Limits, Role, Session, State
 
 LIMITS = Limits(frame_bytes=100, handshake_s=5.0, gap_s=0.01)
 
@@ -43,7 +45,7 @@ class Toy(Session[bytes]):
         elif message == b"bye":
             self.send(b"bye too")
             self.close("the peer said bye", now)
-        elif message == b"not yet":
+        elif message == b"early":
             raise ProtocolError("too early")
         else:
             return True
@@ -53,73 +55,95 @@ class Toy(Session[bytes]):
 WELCOME = b"\x07welcome"
 
 
-@pytest.fixture
-def session() -> Toy:
-    return Toy(LIMITS, name="robot", peer="tcp://toy.test:1")
+BROKEN = {"!": b"\xff", "#": b"\x64"}
+"""What cannot begin a frame, and a header of a frame that is too long."""
 
 
-@pytest.fixture
-def established(session: Toy) -> Toy:
-    session.open(0.0)
-    assert session.outgoing(0.0) == b"\x05hello"
-    assert session.receive(WELCOME, 0.1) == []
-    return session
+def play(session: Any, script: str, **verbs: Callable[[str, float], Any]) -> None:
+    """Play the steps of a script, with semicolons between them; a word is a message:
+
+    ``at 1.5``: the time from now on; ``open``, ``lift``, ``expire``, ``send a``, ``urgent a``, ``close why``, ``lost
+    why``; ``hear a b = a``: messages come, and what is handed on; ``out = a`` or ``= nothing``; ``due 1.5`` or ``due
+    never``: the next deadline, ``limit 1.5``: that of a link that takes nothing; ``is closed (why)``.
+    ``verbs``: others, called with what follows them and the time; what they give has to be what is written, if anything.
+    """
+    now = 0.0
+
+    def framed(word: str) -> bytes:
+        return BROKEN.get(word) or session.encode(word.encode())
+
+    acts: dict[str, Callable[[str, float], Any]] = {
+        "open": lambda _, now: session.open(now),
+        "lift": lambda _, now: session.lift_limit(),
+        "expire": lambda _, now: session.expire(now),
+        "send": lambda word, now: session.send(word.encode()),
+        "urgent": lambda word, now: session.outbox.set("motion", (framed(word),), now, until=now, urgent=True),
+        "close": lambda why, now: session.close(why, now),
+        "lost": lambda why, now: session.lost(why),
+        "hear": lambda words, now: b" ".join(session.receive(b"".join(map(framed, words.split())), now)).decode(),
+        "out": lambda _, now: (session.outgoing(now) or framed("nothing")).decode(),
+        "due": lambda _, now: f"{session.deadline():g}" if session.deadline() is not None else "never",
+        "limit": lambda _, now: f"{session.deadline(writing=False):g}",
+        "is": lambda _, now: session.state.value + (f" ({session.reason})" if session.reason else ""),
+    }
+    for step in filter(str.strip, script.split(";")):
+        said, equals, wanted = step.strip().partition(" =")
+        verb, _, rest = said.partition(" ")
+        wanted = wanted.strip() if equals else rest
+        if verb == "at":
+            now = float(rest)
+            continue
+        result = (acts | verbs)[verb](rest, now)
+        assert result in (None, framed(wanted).decode() if verb == "out" else wanted), step
 
 
-@pytest.mark.parametrize("lifted", [False, True])
-def test_the_handshake_begins_when_the_link_is_up_and_fails_at_its_limit_unless_that_is_lifted(session, lifted) -> None:
-    assert (session.deadline(), session.outgoing(0.0)) == (None, None)
-    session.open(10.0)
-    assert (session.state, session.outgoing(10.0)) == (State.HANDSHAKING, b"\x05hello")
-    session.send(b"more")
-    assert (session.deadline(), session.deadline(writing=False)) == (10.01, 15.0)
-    session.expire(math.nextafter(15.0, 0))
-    assert session.state is State.HANDSHAKING
-    if lifted:
-        session.lift_limit()
-    session.expire(15.0)
-    ended = (State.HANDSHAKING, None) if lifted else (State.CLOSED, "no handshake within 5 s")
-    assert (session.state, session.reason) == ended
-    assert session.deadline(writing=False) is None
+OPEN = "open; out = hello; hear welcome =; is established; at 1; "
+SCRIPTS = {
+    "the handshake begins when the link is up and fails at its limit and not before": (
+        "due never; out = nothing; is connecting; at 10; open; is handshaking; out = hello; send more; due 10.01;"
+        "limit 15; at 14.999; expire; is handshaking; at 15; expire; is closed (no handshake within 5 s); due never"
+    ),
+    "a handshake whose limit is lifted takes as long as its own timers": (
+        "open; out = hello; lift; at 1e9; expire; is handshaking; due never"
+    ),
+    "a session is opened once, and has no limit when it is established": (
+        OPEN + "due never; at 1e6; open; expire; out = nothing; is established"
+    ),
+    "a session that was ended before its link was up takes no first step": (
+        "close gateway stopped; open; is closing (gateway stopped); out = nothing; is closed (gateway stopped)"
+    ),
+    "messages may follow the handshake at once, and what is malformed or comes too early is skipped": (
+        "open; hear welcome a ? b = a b; hear early c = c; is established"
+    ),
+    "what is no frame ends it after the messages before": (
+        OPEN + "hear a ! b = a; is closed (broken stream: length 255)"
+    ),
+    "a frame that is too long does so too": (
+        OPEN + "hear a # = a; is closed (broken stream: frame of 101 bytes exceeds 100)"
+    ),
+    "a closing session writes what waits, ignores what comes, and then is closed": (
+        OPEN
+        + "hear a bye b = a; is closing (the peer said bye); hear c =; out = bye too; is closing (the peer said bye);"
+        "at 1.02; out = nothing; is closed (the peer said bye)"
+    ),
+    "a closing session waits for the gap before its last frames": (
+        OPEN + "send one; out = one; send two; urgent stop; at 1.001; close enough; out = nothing; due 1.01;"
+        "at 1.01; out = stop; at 1.02; out = two; at 1.03; out = nothing; is closed (enough)"
+    ),
+    "a closing session does not wait for a peer that takes nothing": (
+        OPEN
+        + "send one; close enough; limit 1.5; at 1.49; expire; is closing (enough); at 1.5; expire; is closed (enough)"
+    ),
+    "the first reason stands, and a closed session neither writes nor takes anything": (
+        OPEN + "send one; close enough; close again; lost closed by peer; is closed (enough); due never; out = nothing;"
+        "hear a =; open; close late; is closed (enough)"
+    ),
+}
 
 
-def test_the_handshake_ends_with_version_and_features_and_then_there_is_no_limit(established: Toy) -> None:
-    assert (established.version, established.features) == ("2.0", ("wings",))
-    assert established.deadline() is None
-    established.open(1.0)
-    established.expire(1e6)
-    assert (established.state, established.outgoing(1e6)) == (State.ESTABLISHED, None), "it is opened once"
-
-
-def test_a_session_that_was_ended_before_its_link_was_up_stays_ended(session: Toy) -> None:
-    session.close("gateway stopped", 0.0)
-    session.open(0.1)
-    assert session.over
-    assert session.outgoing(0.1) is None, "not even the first step of the handshake"
-    session.establish("9.9", ("wings",))
-    assert (session.state, session.reason, session.version) == (State.CLOSED, "gateway stopped", None)
-
-
-# What is received
-
-
-def test_messages_may_follow_the_handshake_at_once_and_one_that_is_not_accepted_is_counted_and_skipped(session) -> None:
-    session.open(0.0)
-    assert session.receive(WELCOME + b"\x01a\x01?\x01b", 1.0) == [b"a", b"b"]
-    assert (session.state, session.last_malformed) == (State.ESTABLISHED, "what is ?")
-    assert session.receive(b"\x07not yet\x01c", 1.0) == [b"c"]
-    assert session.last_malformed == "too early"
-    traffic = session.traffic
-    assert (traffic.malformed, traffic.frames_in, traffic.bytes_in) == (2, 6, len(WELCOME) + 16)
-
-
-@pytest.mark.parametrize(
-    ("broken", "reason"),
-    [(b"\xff\x01b", "broken stream: length 255"), (b"\x64", "broken stream: frame of 101 bytes exceeds 100")],
-)
-def test_a_broken_stream_ends_the_session_after_the_messages_before_it(established: Toy, broken, reason) -> None:
-    assert established.receive(b"\x01a" + broken, 1.0) == [b"a"]
-    assert (established.state, established.reason, established.traffic.malformed) == (State.CLOSED, reason, 1)
+@pytest.mark.parametrize("script", SCRIPTS.values(), ids=SCRIPTS)
+def test_a_conversation_begins_goes_on_and_ends_as_it_should(script: str) -> None:
+    play(Toy(LIMITS), script)
 
 
 @given(st.lists(st.binary(max_size=60), max_size=8))
@@ -133,84 +157,40 @@ def test_random_bytes_never_raise_and_the_state_only_moves_down(reads: list[byte
     assert states == sorted(states, key=list(State).index)
 
 
-# The end
+@pytest.fixture
+def session() -> Toy:
+    session = Toy(LIMITS, name="robot", peer="tcp://toy.test:1")
+    play(session, OPEN)
+    return session
 
 
-def test_a_closing_session_writes_what_waits_ignores_what_comes_and_then_is_closed(established: Toy) -> None:
-    assert established.receive(b"\x01a\x03bye\x01b", 1.0) == [b"a"]
-    assert established.over
-    received = established.traffic.bytes_in
-    assert established.receive(b"\x01a", 1.0) == []
-    assert established.traffic.bytes_in == received
-    assert established.outgoing(1.0) == b"\x07bye too"
-    assert established.outgoing(1.02) is None
-    assert (established.state, established.reason) == (State.CLOSED, "the peer said bye")
-
-
-def test_a_closing_session_waits_for_the_gap_before_its_last_frames(established: Toy) -> None:
-    established.send(b"one")
-    assert established.outgoing(1.0) == b"\x03one"
-    established.send(b"two")
-    established.outbox.set("motion", (b"\x04stop",), 1.001, urgent=True)
-    established.close("enough", 1.001)
-    assert established.outgoing(1.001) is None
-    assert (established.state, established.deadline()) == (State.CLOSING, pytest.approx(1.01))
-    assert [established.outgoing(now) for now in (1.01, 1.02, 1.03)] == [b"\x04stop", b"\x03two", None]
-    assert established.state is State.CLOSED
-
-
-def test_a_closing_session_does_not_wait_for_a_peer_that_takes_nothing(established: Toy) -> None:
-    established.send(b"one")
-    established.close("enough", 1.0)
-    assert established.deadline(writing=False) == 1.0 + LINGER_S
-    for now, state in ((1.0 + LINGER_S - 0.01, State.CLOSING), (1.0 + LINGER_S, State.CLOSED)):
-        established.expire(now)
-        assert established.state is state
-
-
-def test_the_first_reason_for_an_end_stands_and_a_closed_session_writes_nothing(established: Toy) -> None:
-    established.send(b"one")
-    established.close("enough", 1.0)
-    established.close("again", 1.1)
-    established.lost("closed by peer")
-    established.fail("whatever")
-    assert (established.state, established.reason) == (State.CLOSED, "enough")
-    assert (established.deadline(), established.outgoing(2.0)) == (None, None)
-
-
-# What is shown
-
-
-def test_a_tap_is_shown_every_frame_of_both_directions_malformed_ones_too(established: Toy) -> None:
-    shown: list[tuple[str, bytes]] = []
-    established.tap = lambda direction, frame: shown.append((direction, frame))
-    established.receive(b"\x01a\x01?\x01", 1.0)
-    established.send(b"b")
-    established.outgoing(1.0)
-    established.tap = None
-    established.receive(b"c", 1.0)
-    assert shown == [("in", b"\x01a"), ("in", b"\x01?"), ("out", b"\x01b")]
-
-
-def test_the_snapshot_does_not_change_with_the_session(established: Toy) -> None:
-    established.send(b"abc")
-    established.outgoing(1.0)
-    established.left_out["wings (7)"] += 2
-    shown = established.snapshot()
-    established.receive(b"\x01a", 1.0)
-    established.left_out["wings (7)"] += 1
-    established.lost("closed by peer")
+def test_the_snapshot_tells_what_was_agreed_and_counted_and_does_not_change_with_the_session(session: Toy) -> None:
+    play(session, "send abc; at 1; out = abc; hear ? a early = a")
+    assert session.last_malformed == "too early"
+    session.left_out["wings (7)"] += 2
+    shown = session.snapshot()
+    play(session, "hear a = a; lost closed by peer")
+    session.left_out["wings (7)"] += 1
     assert (shown.name, shown.peer, shown.role, shown.transport) == ("robot", "tcp://toy.test:1", "hq", "tcp")
     assert (shown.state, shown.version, shown.features, shown.reason) == ("established", "2.0", ("wings",), None)
-    counted = {"frames_in": 1, "frames_out": 2, "bytes_in": 8, "bytes_out": 10}
-    not_counted = ("malformed", "foreign", "dropped", "refused", "unanswered")
-    assert shown.counters == counted | dict.fromkeys(not_counted, 0)
+    counted = {"frames_in": 4, "frames_out": 2, "bytes_in": 18, "bytes_out": 10, "malformed": 2}
+    assert shown.counters == counted | dict.fromkeys(("foreign", "dropped", "refused", "unanswered"), 0)
     assert shown.left_out == {"wings (7)": 2}
+
+
+def test_a_tap_is_shown_every_frame_of_both_directions_malformed_ones_too(session: Toy) -> None:
+    shown: list[tuple[str, bytes]] = []
+    session.tap = lambda direction, frame: shown.append((direction, frame))
+    session.receive(b"\x01a\x01?\x01", 1.0)
+    session.send(b"b")
+    session.outgoing(1.0)
+    session.tap = None
+    session.receive(b"c", 1.0)
+    assert shown == [("in", b"\x01a"), ("in", b"\x01?"), ("out", b"\x01b")]
 
 
 @pytest.mark.parametrize("end", [lambda toy: toy.close("enough", 1.0), lambda toy: toy.lost("enough")])
 def test_a_session_says_why_its_peer_must_not_be_moved_two_doubts_and_not_one_and_why_it_ended(session, end) -> None:
-    session.open(0.0)
     session.establish("", ())
     session.busy = "handshaking"
     assert (session.snapshot().reason, session.snapshot().version) == ("handshaking", None)

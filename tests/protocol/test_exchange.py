@@ -8,18 +8,14 @@ from tests.protocol.test_session import play
 from zbridge.errors import ProtocolError
 from zbridge.protocol.exchange import ExchangeSession
 from zbridge.protocol.session import Limits, Role
-
-
-def line_end(data: bytes, start: int) -> int:
-    end = data.find(b"\n", start)
-    return len(data) + 1 if end < 0 else end + 1
+from zbridge.wire.lines import Lines
 
 
 class Asker(ExchangeSession[bytes]):
     """Lines; an answer begins with the request's letter in lower case. ``!`` comes unasked, ``X`` has no answer."""
 
     role = Role.HQ
-    frame_end = staticmethod(line_end)
+    frame_end = staticmethod(Lines.end)
     lost_after = 4
 
     def __init__(self, gap_s: float = 0.0) -> None:

@@ -3,6 +3,7 @@
 A frame is a length byte and so many bytes; ``welcome`` ends the handshake, ``bye`` the conversation.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -52,9 +53,6 @@ class Toy(Session[bytes]):
         return False
 
 
-WELCOME = b"\x07welcome"
-
-
 BROKEN = {"!": b"\xff", "#": b"\x64"}
 """What cannot begin a frame, and a header of a frame that is too long."""
 
@@ -65,7 +63,7 @@ def play(session: Any, script: str, **verbs: Callable[[str, float], Any]) -> Non
     ``at 1.5``: the time from now on; ``open``, ``lift``, ``expire``, ``send a``, ``urgent a``, ``close why``, ``lost
     why``; ``hear a b = a``: messages come, and what is handed on; ``out = a`` or ``= nothing``; ``due 1.5`` or ``due
     never``: the next deadline, ``limit 1.5``: that of a link that takes nothing; ``is closed (why)``.
-    ``verbs``: others, called with what follows them and the time; what they give has to be what is written, if anything.
+    ``verbs``: others, called with what follows them and the time; what they give has to be what is written.
     """
     now = 0.0
 
@@ -204,43 +202,36 @@ def test_a_session_says_why_its_peer_must_not_be_moved_two_doubts_and_not_one_an
 
 # The peer's rate
 
-
-def limited(rate_hz: float) -> Toy:
-    session = Toy(Limits(frame_bytes=100, handshake_s=5.0, rate_hz=rate_hz))
-    session.open(100.0)
-    session.receive(WELCOME, 100.0)
-    return session
-
-
-@pytest.mark.parametrize(
-    ("reads", "delivered"),
-    [
-        ([b"\x01a" * 9, b"\x01a" * 2], [9, 0]),  # the welcome was the tenth
-        ([b"\x01a" * 100], [9]),  # what came before is delivered
-        ([b"\x01", b"?"] * 9 + [b"\x01?"], [0] * 19),  # the malformed count, half frames do not
-    ],
-    ids=["in two reads", "in one", "malformed, byte by byte"],
-)
-def test_a_peer_may_send_a_seconds_worth_at_once_and_one_more_ends_the_session(reads, delivered) -> None:
-    session = limited(10.0)
-    for read, count in zip(reads, delivered, strict=True):
-        assert session.state is State.ESTABLISHED
-        assert len(session.receive(read, 100.0)) == count
-    assert (session.state, session.reason) == (State.CLOSED, "flood: more than 10 messages a second")
+FLOODED = "is closed (flood: more than 10 messages a second)"
+AT_10_HZ = {
+    "a second's worth at once, the welcome among them, and one more ends it": (
+        f"hear{9 * ' a'} ={9 * ' a'}; is established; hear a a =; {FLOODED}"
+    ),
+    "half frames do not count": f"{9 * 'bytewise a = a; '}is established; bytewise a =; {FLOODED}",
+    "what came before it in one read is handed on": f"hear{100 * ' a'} ={9 * ' a'}; {FLOODED}",
+    "the malformed count": f"{9 * 'hear ? =; '}is established; hear ? =; {FLOODED}",
+    "datagrams share the rate with the stream": (
+        f"hear{7 * ' a'} ={7 * ' a'}; datagram b = b; datagram ! =; is established; datagram b =; {FLOODED}"
+    ),
+    "at its rate it is served for ever": "; ".join(f"at {1 + step / 10}; hear a = a" for step in range(1000)),
+}
 
 
-def test_a_peer_at_its_rate_is_served_for_ever_and_one_without_a_rate_may_send_all_at_once() -> None:
-    session = limited(10.0)
-    assert all(session.receive(b"\x01a", 100.0 + step / 10) == [b"a"] for step in range(1, 1001))
-    session = limited(math.inf)
-    assert [len(session.receive(b"\x01a" * count, 100.0)) for count in (10_000, 1)] == [10_000, 1]
+@pytest.mark.parametrize("script", AT_10_HZ.values(), ids=AT_10_HZ)
+def test_a_peer_may_send_as_often_as_its_rate_says(script: str) -> None:
+    session = Toy(Limits(frame_bytes=100, handshake_s=5.0, rate_hz=10.0))
+
+    def datagram(word: str, now: float) -> str:
+        return b" ".join(session.receive_datagram(BROKEN.get(word) or session.encode(word.encode()), now)).decode()
+
+    def bytewise(word: str, now: float) -> str:
+        read = (session.receive(bytes([byte]), now) for byte in session.encode(word.encode()))
+        return b"".join(itertools.chain.from_iterable(read)).decode()
+
+    play(session, "open; hear welcome =; " + script, datagram=datagram, bytewise=bytewise)
 
 
-def test_datagrams_share_the_rate_with_the_stream() -> None:
-    session = limited(5.0)
-    assert session.receive(b"\x01a" * 2, 100.0) == [b"a", b"a"]
-    assert session.receive_datagram(b"\x01b", 100.0) == [b"b"]
-    assert session.receive_datagram(b"no frame", 100.0) == []
-    assert session.state is State.ESTABLISHED
-    assert session.receive_datagram(b"\x01b", 100.0) == []
-    assert (session.state, session.reason) == (State.CLOSED, "flood: more than 5 messages a second")
+def test_a_peer_without_a_rate_may_send_all_at_once() -> None:
+    session = Toy(Limits(frame_bytes=100, handshake_s=5.0, rate_hz=math.inf))
+    session.open(0.0)
+    assert [len(session.receive(b"\x01a" * count, 0.0)) for count in (10_000, 1)] == [10_000, 1]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.protocol.test_session import LIMITS, WELCOME, Toy
+from tests.protocol.test_session import LIMITS, Toy, play
 from zbridge.protocol.session import State
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 
@@ -19,19 +19,20 @@ EVENTS: dict[SessionEvent, Callable[[Toy], object]] = {
 }
 
 
+TO = {
+    State.CONNECTING: "",
+    State.HANDSHAKING: "open; out = hello",
+    State.ESTABLISHED: "open; out = hello; hear welcome =",
+    State.CLOSING: "open; out = hello; close over",
+    State.CLOSED: "lost over",
+}
+
+
 @pytest.mark.parametrize("event", SessionEvent)
 @pytest.mark.parametrize("state", State)
 def test_a_session_obeys_the_table_and_ignores_what_it_does_not_name(state: State, event: SessionEvent) -> None:
     session = Toy(LIMITS)
-    if state is not State.CONNECTING:
-        session.open(0.0)
-        session.outgoing(0.0)
-    if state is State.ESTABLISHED:
-        session.receive(WELCOME, 0.1)
-    if state in (State.CLOSING, State.CLOSED):
-        session.close("over", 0.2)
-    if state is State.CLOSED:
-        session.lost("over")
+    play(session, TO[state])
     assert session.state is state
     _, wanted = TRANSITIONS[state].get(event, (None, state))
     EVENTS[event](session)

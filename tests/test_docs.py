@@ -85,9 +85,8 @@ def test_every_module_that_is_named_exists(page: Path) -> None:
 
 def is_there(name: str) -> bool:
     """Tell whether a dotted name is a module, or something in one."""
-    path = ROOT.joinpath(*name.split("."))
     with contextlib.suppress(ImportError, AttributeError):
-        return path.is_dir() or path.with_suffix(".py").exists() or pkgutil.resolve_name(name) is not None
+        return pkgutil.resolve_name(name) is not None
     return False
 
 

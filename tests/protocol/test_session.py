@@ -197,7 +197,9 @@ def test_a_session_says_why_its_peer_must_not_be_moved_two_doubts_and_not_one_an
     session.doubts = ("client id 3", "malformed packets")
     assert session.doubtful == "connection in doubt: client id 3; malformed packets"
     end(session)
-    assert (session.doubts, session.doubtful, session.snapshot().reason) == ((), None, "enough")
+    session.establish("9.9", ("wings",))
+    assert (session.doubts, session.doubtful, session.version, session.features) == ((), None, "", ())
+    assert session.snapshot().reason == "enough"
 
 
 # The peer's rate

@@ -1,6 +1,8 @@
 """The package as the author of a protocol sees it."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,14 @@ GATEWAYS = sorted(
 )
 AUTHORS = {"zbridge.protocol", "zbridge.wire", "zbridge.fleet"}
 SIMULATORS = {"zbridge.simulation", "zbridge.transport"}
+
+
+def test_importing_it_loads_no_event_loop_no_socket_no_thread_and_no_bus() -> None:
+    ours = "import zbridge.protocol, zbridge.fleet, zbridge.wire, zbridge.fleet.view"
+    others = '{"asyncio", "socket", "threading", "zenoh", "uvloop"} & (set(sys.modules) - theirs)'
+    fresh = f"import sys, msgpack, msgspec, numpy; theirs = set(sys.modules); {ours}; print(*{others})"
+    ran = subprocess.run([sys.executable, "-c", fresh], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == ""
 
 
 def test_its_docstring_is_the_table_of_its_contents_and_it_exports_them() -> None:

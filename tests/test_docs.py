@@ -1,8 +1,7 @@
 """What the pages name exists: links, files, modules, commands with their options, keys; and no key is left out."""
 
-from __future__ import annotations
-
-import importlib
+import contextlib
+import pkgutil
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,19 +85,9 @@ def test_every_module_that_is_named_exists(page: Path) -> None:
 
 def is_there(name: str) -> bool:
     """Tell whether a dotted name is a module, or something in one."""
-    chunks = name.split(".")
-    for length in range(len(chunks), 0, -1):
-        path = ROOT.joinpath(*chunks[:length])
-        if path.with_suffix(".py").exists() or (path / "__init__.py").exists():
-            break
-    else:
-        return False
-    if length == len(chunks):
-        return True
-    found: object = importlib.import_module(".".join(chunks[:length]))
-    for chunk in chunks[length:]:
-        found = getattr(found, chunk, None)
-    return found is not None
+    with contextlib.suppress(ImportError, AttributeError):
+        return pkgutil.resolve_name(name) is not None
+    return False
 
 
 @on_every_page(PRESENT)

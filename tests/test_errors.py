@@ -17,14 +17,10 @@ def test_every_code_has_one_class_and_comes_back_with_it(code: Code) -> None:
     assert [family for family in Refused.__subclasses__() if code in family.codes] == [type(raised)]
 
 
-def test_a_code_of_tomorrow_is_unsupported() -> None:
+def test_a_code_of_tomorrow_is_unsupported_and_a_class_alone_has_the_usual_code_of_its_family() -> None:
     raised = refusal("too_late", "because", holder="ann")
     assert (type(raised), raised.code, raised.holder) == (Unsupported, Code.UNSUPPORTED, "ann")
-
-
-def test_a_class_alone_has_the_usual_code_of_its_family() -> None:
     assert [family("x").code for family in (Held, LeaseLost)] == ["held", "lease_ended"]
-    assert (Held("x", holder="ann").holder, LeaseLost("x", who="ann").who) == ("ann", "ann")
 
 
 def test_the_page_names_every_code_with_its_class() -> None:

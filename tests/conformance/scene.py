@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable
 from typing import Any, ClassVar
 
 import pytest
@@ -147,7 +147,6 @@ class Scene:
         await until(lambda: any(words in event for event in events), lambda: f"{words!r} is not among {events}")
 
     async def told(self, events: str) -> None:
-        """So many events, and no more."""
         assert len(self.judge.events) == int(events), self.judge.events
 
     async def ok(self, _: str) -> None:
@@ -202,9 +201,13 @@ class Scene:
     async def close(self, _: str) -> None:
         self.peer.close()
 
-    def close_all(self) -> None:
+    async def aclose(self) -> None:
+        """End the judge and all connections."""
         for peer in (*self._former, self.peer):
             peer.close()
+        self.task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self.task
 
     async def reset(self, _: str) -> None:
         self.peer.reset()
@@ -230,24 +233,13 @@ async def serving(judge: Any, peer: Callable[[int], Any], scene: Callable[..., A
     """Run a judge that listens; its peer is not connected yet."""
     port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
     task = asyncio.create_task(judge.serve("127.0.0.1", 0, port.set_result))
-    async with _ending(scene(judge, peer(await port), task)) as made:
+    async with contextlib.aclosing(scene(judge, peer(await port), task)) as made:
         yield made
 
 
 @contextlib.asynccontextmanager
 async def calling(judge: Any, peer: Any, scene: Callable[..., Any]) -> AsyncIterator[Any]:
     """Run a judge that connects."""
-    run: Coroutine[Any, Any, None] = judge.run("127.0.0.1", peer.port)
-    async with _ending(scene(judge, peer, asyncio.create_task(run))) as made:
+    task = asyncio.create_task(judge.run("127.0.0.1", peer.port))
+    async with contextlib.aclosing(scene(judge, peer, task)) as made:
         yield made
-
-
-@contextlib.asynccontextmanager
-async def _ending(scene: Any) -> AsyncIterator[Any]:
-    try:
-        yield scene
-    finally:
-        scene.close_all()
-        scene.task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await scene.task

@@ -1,7 +1,5 @@
 """Drives and wheels."""
 
-import math
-
 import msgspec
 import pytest
 
@@ -13,37 +11,34 @@ CAR = Differential(track_m=0.4, speed_full_m_s=2.0, turn_full_rad_s=5.0)
 
 
 @pytest.mark.parametrize(
-    ("drive", "sides_m_s"),
+    ("drive", "left_m_s", "right_m_s"),
     [
-        (Drive(), (0.0, 0.0)),
-        (Drive(forward=1.0), (2.0, 2.0)),
-        (Drive(forward=-0.5), (-1.0, -1.0)),
-        (Drive(turn=1.0), (-1.0, 1.0)),
-        (Drive(forward=0.5, turn=-1.0), (2.0, 0.0)),
-        (Drive(forward=0.5, left=1.0), (1.0, 1.0)),
+        (Drive(), 0.0, 0.0),
+        (Drive(forward=1.0), 2.0, 2.0),
+        (Drive(forward=-0.5), -1.0, -1.0),
+        (Drive(turn=1.0), -1.0, 1.0),
+        (Drive(forward=0.5, turn=-1.0), 2.0, 0.0),
     ],
 )
-def test_a_drive_moves_both_sides(drive: Drive, sides_m_s: tuple[float, float]) -> None:
-    assert CAR.sides_m_s(drive) == pytest.approx(sides_m_s)
+def test_a_drive_moves_both_sides_and_their_speeds_give_the_drive(drive: Drive, left_m_s, right_m_s) -> None:
+    assert CAR.sides_m_s(drive) == pytest.approx((left_m_s, right_m_s))
+    back = CAR.drive(left_m_s, right_m_s)
+    assert (back.forward, back.left, back.turn) == pytest.approx((drive.forward, 0.0, drive.turn))
 
 
 def test_two_sides_of_wheels_do_not_move_sideways() -> None:
+    assert CAR.sides_m_s(Drive(forward=0.5, left=1.0)) == pytest.approx((1.0, 1.0))
     with pytest.raises(Unsupported, match="does not move sideways"):
         CAR.sides_m_s(Drive(left=0.5))
 
 
-@pytest.mark.parametrize("drive", [Drive(), Drive(forward=1.0), Drive(turn=-1.0), Drive(forward=-0.25, turn=0.75)])
-def test_the_speeds_of_a_drive_give_the_drive(drive: Drive) -> None:
-    back = CAR.drive(*CAR.sides_m_s(drive))
-    assert (back.forward, back.left, back.turn) == pytest.approx((drive.forward, 0.0, drive.turn))
-
-
-@pytest.mark.parametrize(("left", "right"), [(20.0, 20.0), (-20.0, 20.0), (3.0, -9.0), (0.0, 100.0)])
-def test_speeds_beyond_full_scale_keep_their_proportion(left: float, right: float) -> None:
-    drive = CAR.drive(left, right)
-    assert max(abs(drive.forward), abs(drive.turn)) == pytest.approx(1.0)
-    scaled_left, scaled_right = CAR.sides_m_s(drive)
-    assert math.isclose(scaled_left * right, scaled_right * left, abs_tol=1e-9)
+@pytest.mark.parametrize(
+    ("sides_m_s", "forward", "turn"),
+    [((20.0, 20.0), 1.0, 0.0), ((-20.0, 20.0), 0.0, 1.0), ((3.0, -9.0), -0.25, -1.0), ((0.0, 100.0), 0.5, 1.0)],
+)
+def test_speeds_beyond_full_scale_keep_their_proportion(sides_m_s: tuple[float, float], forward, turn) -> None:
+    drive = CAR.drive(*sides_m_s)
+    assert (drive.forward, drive.turn) == pytest.approx((forward, turn))
 
 
 def test_factors_add_up() -> None:
@@ -52,9 +47,7 @@ def test_factors_add_up() -> None:
     assert Factors().value(Drive(forward=1.0, left=1.0, turn=1.0)) == 0.0
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"track_m": 0.0}, {"track_m": 1.0, "speed_full_m_s": -1.0}, {"track_m": 1.0, "x": 1}]
-)
+@pytest.mark.parametrize("options", [{}, {"track_m": 0.0}, {"track_m": 1.0, "speed_full_m_s": -1.0}])
 def test_absurd_settings_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(options, Differential)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.protocol.test_session import LIMITS, WELCOME, Toy
+from tests.protocol.test_session import LIMITS, Toy, play
 from zbridge.protocol.session import State
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 
@@ -19,53 +19,31 @@ EVENTS: dict[SessionEvent, Callable[[Toy], object]] = {
 }
 
 
-def session_in(state: State) -> Toy:
-    session = Toy(LIMITS)
-    if state is not State.CONNECTING:
-        session.open(0.0)
-        session.outgoing(0.0)
-    if state is State.ESTABLISHED:
-        session.receive(WELCOME, 0.1)
-    if state in (State.CLOSING, State.CLOSED):
-        session.close("over", 0.2)
-    if state is State.CLOSED:
-        session.lost("over")
-    assert session.state is state
-    return session
+TO = {
+    State.CONNECTING: "",
+    State.HANDSHAKING: "open; out = hello",
+    State.ESTABLISHED: "open; out = hello; hear welcome =",
+    State.CLOSING: "open; out = hello; close over",
+    State.CLOSED: "lost over",
+}
 
 
 @pytest.mark.parametrize("event", SessionEvent)
 @pytest.mark.parametrize("state", State)
 def test_a_session_obeys_the_table_and_ignores_what_it_does_not_name(state: State, event: SessionEvent) -> None:
-    session = session_in(state)
+    session = Toy(LIMITS)
+    play(session, TO[state])
+    assert session.state is state
     _, wanted = TRANSITIONS[state].get(event, (None, state))
     EVENTS[event](session)
     assert session.state is wanted
 
 
-def test_every_state_has_a_row_and_every_event_and_action_a_place() -> None:
-    steps = [(event, action) for row in TRANSITIONS.values() for event, (action, _) in row.items()]
+def test_every_state_has_a_row_and_every_event_and_action_a_place_and_a_session_only_moves_down() -> None:
+    steps = [(state, event, *step) for state, row in TRANSITIONS.items() for event, step in row.items()]
     assert list(TRANSITIONS) == ORDER
-    assert {event for event, _ in steps} == set(SessionEvent)
-    assert {action for _, action in steps} == set(SessionAction)
-
-
-def test_a_session_only_moves_down_the_list() -> None:
-    for state, row in TRANSITIONS.items():
-        for event, (_, wanted) in row.items():
-            again = state is State.ESTABLISHED and event is SessionEvent.AGREED
-            assert ORDER.index(wanted) >= ORDER.index(state) + (not again)
-
-
-def test_an_ended_session_is_not_established_any_more() -> None:
-    for state in (State.CLOSING, State.CLOSED):
-        session = session_in(state)
-        session.establish("9.9", ("wings",))
-        assert (session.state, session.version, session.features) == (state, None, ())
-
-
-def test_a_handshake_whose_limit_is_lifted_takes_as_long_as_its_own_timers() -> None:
-    session = session_in(State.HANDSHAKING)
-    session.lift_limit()
-    session.expire(1e9)
-    assert (session.state, session.deadline()) == (State.HANDSHAKING, None)
+    assert {event for _, event, _, _ in steps} == set(SessionEvent)
+    assert {action for _, _, action, _ in steps} == set(SessionAction)
+    for state, event, _, wanted in steps:
+        again = (state, event) == (State.ESTABLISHED, SessionEvent.AGREED)
+        assert ORDER.index(wanted) >= ORDER.index(state) + (not again)

@@ -3,46 +3,29 @@
 from __future__ import annotations
 
 import asyncio
-import importlib.util
-import sys
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from types import ModuleType
+from functools import partial
 from typing import Any
 
 import msgspec
 import pytest
 
-from zbridge.errors import ConfigError, ProtocolError
+from tests.e2e.other_package import toyrobot as toy
+from zbridge.errors import ConfigError
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Switch
-from zbridge.fleet.topics import Topic
-from zbridge.protocol.plugin import Outcome, Protocol, Robot, Simulation, Telemetry
+from zbridge.fleet.messages import Drive, Switch
+from zbridge.protocol.plugin import Outcome, Protocol, Simulation
 from zbridge.protocol.session import Session
 from zbridge.simulation import check as kit
 from zbridge.simulation.check_commands import check_commands, check_stop
-from zbridge.simulation.check_messages import check_messages, example
+from zbridge.simulation.check_messages import check_messages
 from zbridge.simulation.check_motion import check_motion
 from zbridge.simulation.check_plugin import check_plugin
 from zbridge.simulation.check_report import Finding
 from zbridge.simulation.check_sessions import check_sessions
 from zbridge.simulation.check_stage import Recording, record
 
-PACKAGE = Path(__file__).parents[1] / "e2e" / "other_package" / "toyrobot.py"
-
-
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("toyrobot_checked", PACKAGE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-toy = load()
 TOY: Protocol = toy.PROTOCOL
-LINES = TOY.codecs[0]
 
 
 @pytest.fixture(autouse=True)
@@ -63,18 +46,32 @@ def failed(findings: Iterable[Finding]) -> dict[str, str]:
     return {finding.claim: finding.problem for finding in findings if finding.problem is not None}
 
 
-def broken(**parts: Any) -> Protocol:
-    """The toy with other parts."""
-    return msgspec.structs.replace(TOY, **parts)
+def assert_found(findings: Iterable[Finding], expected: dict[str, str]) -> None:
+    """Each claim with these words failed for a problem that says so, and no other claim failed."""
+    found = failed(findings)
+    for claim, problem in expected.items():
+        assert any(claim in one and problem in found[one] for one in found), found
+    assert [one for one in found if not any(claim in one for claim in expected)] == []
+
+
+def claims(value: object) -> str:
+    """Name a row of a table by the claims that fail."""
+    return "; ".join(value) or "sound" if isinstance(value, dict) else ""
+
+
+broken = partial(msgspec.structs.replace, TOY)
+"""The toy with other parts."""
+
+
+def with_codec(**parts: Any) -> Protocol:
+    return broken(codecs=(msgspec.structs.replace(TOY.codecs[0], **parts),))
 
 
 def with_robot(**methods: Callable[..., Any]) -> Protocol:
-    """The toy with other methods of its robot."""
     return broken(robot=type("BrokenRobot", (toy.ToyRobot,), methods))
 
 
 def with_session(**methods: Any) -> Protocol:
-    """The toy with other methods of its session."""
     session_class = type("BrokenSession", (toy.ToySession,), methods)
 
     def session(self: Any, link: str, peer: str) -> Session[Any]:
@@ -84,266 +81,221 @@ def with_session(**methods: Any) -> Protocol:
     return with_robot(session=session)
 
 
-# Messages
-
-
-def test_sound_messages_pass() -> None:
-    assert failed(check_messages(TOY)) == {}
-
-
-def with_codec(**parts: Any) -> Protocol:
-    return broken(codecs=(msgspec.structs.replace(LINES, **parts),))
-
-
-def reads_half(frame: bytes) -> Any:
-    message = toy.read(frame)
-    return toy.At(message.x, 0.0, 0.0)
+# The protocol object, and its messages
 
 
 def breaks_on_noise(frame: bytes) -> Any:
     return {b"at": toy.read}[frame.split(b" ")[0]](frame)
 
 
-def breaks_when_cut(frame: bytes) -> Any:
-    assert frame.endswith(b"\n")
-    return toy.read(frame)
-
-
-def ends_early(data: bytes, start: int) -> int:
-    return len(data)
-
-
-def reads_two_lines(data: bytes, start: int) -> int:
-    return len(data) if data.endswith(b"\n") else len(data) + 1
+ROUND_TRIP, CUTS, NOISE = "lines: 1 messages round-trip", "lines: whole, byte by byte", "lines: random bytes"
+TRUNCATED, NAME = "lines: what is cut off", "the protocol has the name of its entry point"
+TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session can be shown"
 
 
 @pytest.mark.parametrize(
-    ("parts", "claim"),
+    ("protocol", "expected"),
     [
-        ({"read": reads_half}, "messages round-trip"),
-        ({"write": lambda message: 1 / 0}, "messages round-trip"),
-        ({"messages": (object,)}, "messages round-trip"),
-        ({"frame_end": ends_early}, "byte by byte"),
-        ({"frame_end": lambda data, start: start + 1000}, "byte by byte"),
-        ({"read": breaks_on_noise}, "random bytes"),
-        ({"frame_end": ends_early, "read": breaks_when_cut}, "what is cut off"),
+        (TOY, {}),
+        (broken(name="toys"), {NAME: "the entry point is 'toy', Protocol.name is 'toys'", TEMPLATE: "not 'toys'"}),
+        (broken(template=""), {TEMPLATE: "it has no table [device]"}),
+        (broken(template='[device]\nprotocol = "toy"\n'), {TEMPLATE: "it has no connect"}),
+        (broken(template=toy.TEMPLATE + "[device.options]\nx = 1\n"), {TEMPLATE: "unknown field `x`"}),
+        (with_session(role=None), {SHOWN: "role is None, not Role.HQ"}),
+        (with_session(version=property(lambda self: 1 / 0)), {SHOWN: "Error"}),
+        (broken(codecs=()), {"messages are declared": "codecs is empty"}),
+        (with_codec(read=lambda frame: toy.At(toy.read(frame).x, 0.0, 0.0)), {ROUND_TRIP: "was read as"}),
+        (with_codec(write=lambda message: 1 / 0), {ROUND_TRIP: "ZeroDivisionError"}),
+        (with_codec(messages=(object,)), {ROUND_TRIP: ""}),
+        (with_codec(frame_end=lambda data, start: start + 1000), {CUTS: "is cut to []"}),
+        (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:"}),
+        (
+            with_codec(
+                frame_end=lambda data, start: len(data),
+                read=lambda frame: toy.read(frame) if frame.endswith(b"\n") else 1 / 0,
+            ),
+            {CUTS: "byte by byte is cut to", TRUNCATED: "ZeroDivisionError", NOISE: "ZeroDivisionError"},
+        ),
+        (
+            with_codec(
+                frame_end=lambda data, start: len(data) + (not data.endswith(b"\n")),
+                messages=(toy.At(1, 2, 3), toy.At(4, 5, 6)),
+            ),
+            {"lines: whole, byte by byte": "all messages joined"},
+        ),
     ],
+    ids=claims,
 )
-def test_broken_messages_are_found(parts: dict[str, Any], claim: str) -> None:
-    assert any(claim in found for found in failed(check_messages(with_codec(**parts))))
-
-
-def test_joined_messages_that_are_one_frame_are_found() -> None:
-    protocol = with_codec(frame_end=reads_two_lines, messages=(toy.At(1, 2, 3), toy.At(4, 5, 6)))
-    (problem,) = failed(check_messages(protocol)).values()
-    assert "all messages joined" in problem
-
-
-def test_a_protocol_that_declares_no_messages_is_told_so() -> None:
-    assert "codecs is empty" in failed(check_messages(broken(codecs=())))["messages are declared"]
-
-
-def test_the_example_of_a_class_has_a_value_for_each_field() -> None:
-    assert example(toy.At) == toy.At(0.5, 0.5, 0.5)
+def test_a_broken_protocol_object_and_broken_messages_are_found(protocol: Protocol, expected: dict[str, str]) -> None:
+    assert_found([*check_plugin(protocol, "toy"), *check_messages(protocol)], expected)
 
 
 # Sessions
 
-
-def test_a_sound_session_passes(heard: Recording) -> None:
-    assert failed(check_sessions(TOY, heard)) == {}
-    assert failed(check_stop(TOY, heard)) == {}
-    assert failed(check_commands(TOY, heard)) == {}
-
-
-def test_a_session_that_is_never_established_is_found() -> None:
-    protocol = with_session(opened=lambda self, now: None)
-    recording = asyncio.run(record(protocol, 0.3))
-    assert "handshaking after 0.3 s" in failed(check_sessions(protocol, recording))[ESTABLISHED]
-
-
 ESTABLISHED = "the session with the simulated robot is established"
 
 
-def test_a_session_that_ends_at_once_is_found_with_its_reason() -> None:
-    protocol = with_session(opened=lambda self, now: self.fail("I do not like it"))
-    recording = asyncio.run(record(protocol, 5.0))
-    assert "I do not like it" in failed(check_sessions(protocol, recording))[ESTABLISHED]
+@pytest.mark.parametrize(
+    ("opened", "problem"),
+    [
+        (lambda self, now: None, "handshaking after 0.3 s"),
+        (lambda self, now: self.fail("I do not like it"), "I do not like it"),
+        (lambda self, now: {}[1], "KeyError: 1 (test_check.py:"),
+    ],
+    ids=["never established", "ends at once", "raises"],
+)
+def test_a_session_that_is_not_established_is_found_with_its_reason(opened: Any, problem: str) -> None:
+    protocol = with_session(opened=opened)
+    assert_found(check_sessions(protocol, asyncio.run(record(protocol, 0.3))), {ESTABLISHED: problem})
 
 
-def test_a_session_that_breaks_on_garbage_is_found(heard: Recording) -> None:
-    (claim,) = failed(check_sessions(with_session(decode=lambda self, frame: breaks_on_noise(frame)), heard))
-    assert claim.startswith("garbage at")
+GARBAGE, SILENCE, END = "garbage at", "silence at", "the end of the connection at"
+TRANSLATED = "messages of the robot are translated"
 
 
-def test_a_session_that_waits_for_ever_is_found(heard: Recording) -> None:
-    def open_for_ever(self: Session[Any], now: float) -> None:
-        Session.open(self, now)
-        self._limit_at = float("inf")
-
-    def accept(self: Session[Any], message: Any, now: float) -> bool:
-        self.establish("7.0", ())
-        return True
-
-    protocol = with_session(open=open_for_ever, opened=lambda self, now: None, accept=accept)
-    (claim, problem), *others = failed(check_sessions(protocol, heard)).items()
-    assert claim.startswith("silence at")
-    assert "still handshaking after 6 s" in problem
-    assert not others
-
-
-def test_a_timer_that_never_ends_is_found(heard: Recording) -> None:
-    protocol = with_session(timers=lambda self: 0.0)
-    assert any("writes and timers" in problem for problem in failed(check_sessions(protocol, heard)).values())
-
-
-def test_a_session_that_lives_on_without_a_connection_is_found(heard: Recording) -> None:
-    (claim,) = failed(check_sessions(with_session(lost=lambda self, reason: None), heard))
-    assert claim.startswith("the end of the connection at")
-
-
-def test_a_translation_that_raises_is_found(heard: Recording) -> None:
-    def at(self: Robot, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
-        raise KeyError(message.x)
-
-    assert "messages of the robot are translated" in str(failed(check_sessions(with_robot(_at=at), heard)))
+@pytest.mark.parametrize(
+    ("protocol", "expected"),
+    [
+        (TOY, {}),
+        (with_session(decode=lambda self, frame: breaks_on_noise(frame)), {GARBAGE: "KeyError"}),
+        (
+            with_session(
+                opened=lambda self, now: self.lift_limit(),
+                accept=lambda self, message, now: self.establish("7.0", ()),
+            ),
+            {SILENCE: "still handshaking after 6 s"},
+        ),
+        (with_session(lost=lambda self, reason: None), {END: "still does something"}),
+        (with_session(timers=lambda self: 0.0), {"what the robot said establishes a session": "writes and timers"}),
+        (with_robot(_at=lambda self, message, stamp_ns: {}[message.x]), {TRANSLATED: "KeyError", GARBAGE: "KeyError"}),
+        (with_robot(_at=lambda *_: ((topics.POSE, Switch(on=True)),)), {TRANSLATED: "PayloadError"}),
+        (
+            with_robot(_at=lambda self, message, stamp_ns: toy.ToyRobot._at(self, message, 0)),
+            {TRANSLATED: "pose has the stamp 0, given was"},
+        ),
+    ],
+    ids=claims,
+)
+def test_a_session_that_breaks_is_found(heard: Recording, protocol: Protocol, expected: dict[str, str]) -> None:
+    assert_found(check_sessions(protocol, heard), expected)
 
 
-def test_telemetry_that_is_not_what_its_topic_promises_is_found(heard: Recording) -> None:
-    def at(self: Robot, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
-        return ((topics.POSE, Switch(on=True)),)
-
-    assert "messages of the robot are translated" in str(failed(check_sessions(with_robot(_at=at), heard)))
-
-
-def test_a_silent_robot_is_found(heard: Recording) -> None:
-    silent = msgspec.structs.replace(heard, messages=[])
-    assert "the simulated robot sent none" in failed(check_sessions(TOY, silent)).values()
+def test_a_silent_robot_and_requests_without_an_answer_are_found(heard: Recording) -> None:
+    lacking = msgspec.structs.replace(heard, messages=[], unanswered=3)
+    expected = {"0 messages": "the simulated robot sent none", "the simulated robot answers": "3 had no answer"}
+    assert_found(check_sessions(TOY, lacking), expected)
 
 
 # Commands
 
-
-def stop_last(self: Any, now: float, until: float) -> None:
-    self._session.outbox.put(b"go 0.000000 0.000000\n")
-
-
-def stop_nothing(self: Any, now: float, until: float) -> None:
-    return
-
-
-def stop_beside(self: Any, now: float, until: float) -> None:
-    self._session.outbox.set("stop", (b"go 0.000000 0.000000\n",), now, period_s=0.1, until=until, urgent=True)
+STOP_FIRST = "the stop goes before all that waits, and no motion after it"
+REPEATED = "a stop is repeated until its time is over"
+STOP_EARLY = "a stop before the first connection is refused or ignored"
+STILL = b"go 0.000000 0.000000\n"
 
 
 @pytest.mark.parametrize(
-    ("stop", "problem"),
+    ("stop", "expected"),
     [
-        (stop_last, "is written before the stop"),
-        (stop_nothing, "a stop writes nothing"),
-        (stop_beside, "moves the robot after its stop"),
+        (toy.ToyRobot.stop, {}),
+        (lambda self, now, until: None, {STOP_FIRST: "a stop writes nothing"}),
+        (
+            lambda self, now, until: self._session.outbox.put(STILL),
+            {STOP_FIRST: "is written before the stop", REPEATED: "", STOP_EARLY: "AttributeError"},
+        ),
+        (
+            lambda self, now, until: toy.ToyRobot._go(self, 0.0, 0.0, now, until=until),
+            {STOP_FIRST: "b'what waits' is written before the stop"},
+        ),
+        (
+            lambda self, now, until: toy.ToyRobot._go(self, 0.0, 0.0, now, until=now, urgent=True),
+            {REPEATED: "it is not written again"},
+        ),
+        (
+            lambda self, now, until: self._session.outbox.set(
+                "beside", (STILL,), now, period_s=0.1, until=until, urgent=True
+            ),
+            {STOP_FIRST: "moves the robot after its stop", STOP_EARLY: "AttributeError"},
+        ),
     ],
+    ids=["sound", "nothing", "last", "after what waits", "once", "beside the motion"],
 )
-def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, stop, problem) -> None:
-    claims = failed(check_stop(with_robot(stop=stop), heard))
-    assert next(iter(claims)) == "the stop goes before all that waits, and no motion after it"
-    assert problem in claims["the stop goes before all that waits, and no motion after it"]
+def test_a_stop_that_is_not_first_or_does_not_last_is_found(heard: Recording, stop, expected: dict[str, str]) -> None:
+    assert_found(check_stop(with_robot(stop=stop), heard), expected)
 
 
-def test_a_stop_that_breaks_before_the_first_connection_is_found(heard: Recording) -> None:
-    def stop(self: Any, now: float, until: float) -> None:
-        assert self._session is not None
-        toy.ToyRobot.stop(self, now, until)
-
-    assert list(failed(check_stop(with_robot(stop=stop), heard))) == [
-        "a stop before the first connection is refused or ignored"
-    ]
+OTHERS = [f"@cmd/{name}" for name in ("mode", "light", "lidar", "camera", "text", "scan", "motor", "sensor", "raw")]
+QUESTIONS = ("a question for map is answered", "a question for pose is answered")
 
 
-def test_a_command_that_is_ignored_is_found(heard: Recording) -> None:
-    def command(self: Any, topic: Topic, command: FleetMessage, now: float) -> Outcome:
-        return toy.ToyRobot.command(self, topic, command, now) if isinstance(command, Drive) else Outcome()
-
-    claims = failed(check_commands(with_robot(command=command), heard))
-    assert "@cmd/light is carried out or refused with a code" in claims
-    assert "@cmd/drive is carried out or refused with a code" not in claims
+def only_drives(self: Any, topic: Any, command: Any, now: float) -> Outcome:
+    return toy.ToyRobot.command(self, topic, command, now) if isinstance(command, Drive) else Outcome()
 
 
-def test_a_command_that_raises_anything_but_a_refusal_is_found(heard: Recording) -> None:
-    def command(self: Any, topic: Topic, command: FleetMessage, now: float) -> Outcome:
-        return {Drive: Outcome()}[type(command)]
-
-    claims = failed(check_commands(with_robot(command=command), heard))
-    assert "KeyError" in claims["@cmd/mode is carried out or refused with a code"]
-
-
-def test_a_command_that_raises_a_protocol_error_is_found(heard: Recording) -> None:
-    def command(self: Any, topic: Topic, command: FleetMessage, now: float) -> Outcome:
-        raise ProtocolError("no")
-
-    assert (
-        "ProtocolError: no"
-        in failed(check_commands(with_robot(command=command), heard))["@cmd/text is carried out or refused with a code"]
-    )
-
-
-def test_a_question_that_is_ignored_is_found(heard: Recording) -> None:
-    claims = failed(check_commands(with_robot(ask=lambda self, topic: None), heard))
-    assert claims["a question for pose is answered, asked or refused"] == "nothing is written for it"
+@pytest.mark.parametrize(
+    ("methods", "expected"),
+    [
+        ({}, {}),
+        ({"command": only_drives}, dict.fromkeys(OTHERS, "accepted, but nothing is")),
+        ({"command": lambda self, topic, command, now: {Drive: Outcome()}[type(command)]}, {"@cmd/": "KeyError"}),
+        ({"ask": lambda self, topic: None}, dict.fromkeys(QUESTIONS, "nothing is written for it")),
+        (
+            {"_go": lambda self, forward, turn, now: self._session.outbox.put({False: b"go"}[forward + turn == 2])},
+            {"drives at full scale": "KeyError: True (test_check.py:"},
+        ),
+    ],
+    ids=claims,
+)
+def test_a_command_that_is_neither_carried_out_nor_refused_is_found(heard: Recording, methods, expected) -> None:
+    assert_found(check_commands(with_robot(**methods), heard), expected)
 
 
 # Motion
 
 
-def test_a_simulated_robot_that_does_not_move_is_found() -> None:
-    async def simulate(simulation: Simulation) -> None:
-        await deaf(simulation, 0.0)
+def with_wheels(forwards: float, leftwards: float) -> Protocol:
+    """The toy whose wheels do something else than they are told."""
 
-    drives, turns = failed(check_motion(broken(simulate=simulate), 5.0))
-    assert (drives, turns) == ("the simulated robot drives", "a turn of the simulated robot is counter-clockwise")
-
-
-def test_a_robot_that_drives_backwards_and_turns_clockwise_is_found() -> None:
     def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
-        toy.ToyRobot._go(self, -forward, -turn, now, **more)
+        toy.ToyRobot._go(self, forward * forwards, turn * leftwards, now, **more)
 
-    drives, turns = failed(check_motion(with_robot(_go=go), 5.0)).values()
-    assert drives.startswith("it moved -0.")
-    assert turns.startswith("its heading changed by -0.")
+    return with_robot(_go=go)
 
 
-def test_a_simulated_robot_that_does_not_stand_is_found() -> None:
-    async def simulate(simulation: Simulation) -> None:
-        await deaf(simulation, 0.1)
+class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a robot that knows its full scale."""
 
-    assert "the simulated robot stands after its stop" in failed(check_motion(broken(simulate=simulate), 5.0))
+    speed_full_m_s: float = 1.0
+    turn_full_rad_s: float = 1.0
 
 
-async def deaf(simulation: Simulation, step_m: float) -> None:
-    """Be a robot that moves as it likes."""
+DRIVES, TURNS = "the simulated robot drives", "a turn of the simulated robot is counter-clockwise"
+STANDS = "the simulated robot stands after its stop"
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        x = 0.0
-        try:
-            while not writer.is_closing():
-                x += step_m
-                writer.write(b"at %f 0 0\n" % x)
-                await asyncio.sleep(0.1)
-        finally:
-            writer.close()
 
-    (address,) = simulation.addresses
-    async with await asyncio.start_server(serve, address.host, address.port) as server:
-        simulation.ready((type(address)(*server.sockets[0].getsockname()[:2]),))
-        await server.serve_forever()
+@pytest.mark.parametrize(
+    ("protocol", "expected"),
+    [
+        (with_wheels(0, 0), {DRIVES: "it moved 0.000 m", TURNS: "its heading changed by 0."}),
+        (with_robot(stop=lambda self, now, until: None), {STANDS: "it moves on"}),
+        (with_wheels(-1, -1), {DRIVES: "it moved -0.", TURNS: "its heading changed by -0."}),
+        (broken(options=Sized), {}),
+        (
+            broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0}),
+            {DRIVES: "m, but the options say", TURNS: "rad, but the options say"},
+        ),
+    ],
+    ids=["does not move", "does not stand", "goes the other way", "as the options say", "not as the options say"],
+)
+def test_a_simulated_robot_that_does_not_move_as_it_should_is_found(protocol: Protocol, expected) -> None:
+    assert_found(check_motion(protocol, 5.0), expected)
 
 
 def test_a_simulation_that_cannot_start_is_found() -> None:
     async def simulate(simulation: Simulation) -> None:
         raise ConfigError("no")
 
-    (*_, last) = kit.check(broken(simulate=simulate), "toy")
-    assert (last.claim, last.problem is not None and "ConfigError: no" in last.problem) == (ESTABLISHED, True)
+    assert_found(kit.check(broken(simulate=simulate), "toy"), {ESTABLISHED: "ConfigError: no"})
 
 
 # The command
@@ -368,91 +320,10 @@ def test_what_does_not_hold_is_printed_and_is_the_exit_status(monkeypatch, capsy
     ]
 
 
-def test_a_protocol_that_is_not_installed_is_a_clear_error(capsys: pytest.CaptureFixture[str]) -> None:
-    assert kit.main(["nobody"]) == 2
-    assert "expected one of" in capsys.readouterr().err
-    assert kit.main([]) == 2
-    assert "usage" in capsys.readouterr().err
-    assert kit.main(["--help"]) == 0
-    assert "NAME" in capsys.readouterr().out
-
-
-# The protocol object
-
-
-class Sized(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a robot that knows its full scale."""
-
-    speed_full_m_s: float = 1.0
-    turn_full_rad_s: float = 1.0
-
-
-def test_a_sound_protocol_object_passes() -> None:
-    assert failed(check_plugin(TOY, "toy")) == {}
-
-
 @pytest.mark.parametrize(
-    ("protocol", "name", "problem"),
-    [
-        (TOY, "toys", "the entry point is 'toys', Protocol.name is 'toy'"),
-        (broken(template=""), "toy", "it has no table [device]"),
-        (broken(template=toy.TEMPLATE.replace("toy", "tom")), "toy", "its protocol is 'tom', not 'toy'"),
-        (broken(template='[device]\nprotocol = "toy"\n'), "toy", "it has no connect"),
-        (broken(template=toy.TEMPLATE + "[device.options]\nx = 1\n"), "toy", "unknown field `x`"),
-        (with_session(role=None), "toy", "role is None, not Role.HQ"),
-        (with_session(version=property(lambda self: 1 / 0)), "toy", "Error"),
-    ],
+    ("arguments", "status", "said"), [(["nobody"], 2, "expected one of"), ([], 2, "usage"), (["--help"], 0, "NAME")]
 )
-def test_a_broken_protocol_object_is_found(protocol: Protocol, name: str, problem: str) -> None:
-    (found,) = failed(check_plugin(protocol, name)).values()
-    assert problem in found
-
-
-def test_requests_without_an_answer_are_found(heard: Recording) -> None:
-    claims = failed(check_sessions(TOY, msgspec.structs.replace(heard, unanswered=3)))
-    assert "3 had no answer" in claims["the simulated robot answers every request"]
-
-
-def test_a_stamp_that_was_not_given_is_found(heard: Recording) -> None:
-    def at(self: Robot, message: Any, stamp_ns: int) -> Iterable[Telemetry]:
-        return toy.ToyRobot._at(self, message, 0)
-
-    assert "pose has the stamp 0, given was" in str(failed(check_sessions(with_robot(_at=at), heard)))
-
-
-def test_a_stop_that_is_not_repeated_is_found(heard: Recording) -> None:
-    def stop(self: Any, now: float, until: float) -> None:
-        self._session.outbox.set("motion", (b"go 0.000000 0.000000\n",), now, urgent=True)
-
-    assert "a stop is repeated until its time is over" in failed(check_stop(with_robot(stop=stop), heard))
-
-
-def test_a_stop_that_waits_for_what_was_queued_is_found(heard: Recording) -> None:
-    def stop(self: Any, now: float, until: float) -> None:
-        self._session.outbox.set("motion", (b"go 0.000000 0.000000\n",), now, period_s=0.1, until=until)
-
-    problem, *_ = failed(check_stop(with_robot(stop=stop), heard)).values()
-    assert "b'what waits' is written before the stop" in problem
-
-
-def test_a_drive_at_full_scale_that_raises_is_found(heard: Recording) -> None:
-    def go(self: Any, forward: float, turn: float, now: float, **more: Any) -> None:
-        assert forward + turn < 2, 1 / 0
-        toy.ToyRobot._go(self, forward, turn, now, **more)
-
-    (problem,) = failed(check_commands(with_robot(_go=go), heard)).values()
-    assert "ZeroDivisionError" in problem
-    assert "test_check.py:" in problem
-
-
-def test_ways_and_turns_that_are_not_what_the_options_say_are_found() -> None:
-    assert failed(check_motion(broken(options=Sized), 5.0)) == {}
-    protocol = broken(options=Sized, simulated={"speed_full_m_s": 10.0, "turn_full_rad_s": 10.0})
-    drives, turns = failed(check_motion(protocol, 5.0)).values()
-    assert "m, but the options say" in drives
-    assert "rad, but the options say" in turns
-
-
-def test_a_session_that_raises_when_it_opens_is_found_with_the_place() -> None:
-    recording = asyncio.run(record(with_session(opened=lambda self, now: {}[1]), 5.0))
-    assert "KeyError: 1 (test_check.py:" in (recording.reason or "")
+def test_a_wrong_command_line_is_a_clear_error(capsys, arguments: list[str], status: int, said: str) -> None:
+    assert kit.main(arguments) == status
+    printed = capsys.readouterr()
+    assert said in (printed.err if status else printed.out)

@@ -13,23 +13,16 @@ from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Limits, Role, Session
 from zbridge.simulation.simulator import Simulator
 from zbridge.transport.conversation import Conversation
+from zbridge.wire.lines import Lines
 
 SOON_S = 5.0
-Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
-def line_end(data: bytes, start: int) -> int:
-    end = data.find(b"\n", start)
-    if end < 0:
-        return len(data) + 1
-    return end + 1
-
-
-class Lines(Session[str]):
+class Talk(Session[str]):
     """A line is a message."""
 
     role = Role.ROBOT
-    frame_end = staticmethod(line_end)
+    frame_end = staticmethod(Lines.end)
 
     def __init__(self) -> None:
         super().__init__(Limits(frame_bytes=100, handshake_s=5.0))
@@ -54,9 +47,9 @@ class Toy(Simulator[str]):
         super().__init__(logging.getLogger("test"), links=("drive", "laser"))
         self.places = 2
 
-    def session(self, peer: str, link: str) -> Lines | None:
+    def session(self, peer: str, link: str) -> Talk | None:
         self.places -= 1
-        return Lines() if self.places >= 0 else None
+        return Talk() if self.places >= 0 else None
 
     def greet(self, client: Conversation, link: str) -> None:
         self.send(client, f"hello {link}")
@@ -75,10 +68,10 @@ class Toy(Simulator[str]):
 
 
 @contextlib.asynccontextmanager
-async def living(toy: Toy, links: int = 2) -> AsyncIterator[tuple[Address, ...]]:
+async def living() -> AsyncIterator[tuple[Address, ...]]:
     ready: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
-    simulation = Simulation(tuple(Address("127.0.0.1", 0) for _ in range(links)), ready=ready.set_result)
-    task = asyncio.create_task(toy.run(simulation))
+    simulation = Simulation(tuple(Address("127.0.0.1", 0) for _ in range(2)), ready=ready.set_result)
+    task = asyncio.create_task(Toy().run(simulation))
     try:
         async with asyncio.timeout(SOON_S):
             yield await ready
@@ -88,41 +81,28 @@ async def living(toy: Toy, links: int = 2) -> AsyncIterator[tuple[Address, ...]]
             await task
 
 
-async def connect(address: Address) -> Streams:
+async def connect(address: Address) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
     return await asyncio.open_connection(address.host, address.port)
 
 
-async def test_each_link_greets_first_and_is_told_its_own() -> None:
-    async with living(Toy()) as (first, second):
+async def test_each_link_greets_first_is_told_its_own_and_answers_up_to_what_may_not_be_sent() -> None:
+    async with living() as (first, second):
         for address, lines in ((first, [b"hello drive\n", b"first\n"]), (second, [b"hello laser\n", b"second\n"])):
             reader, writer = await connect(address)
             assert [await reader.readline() for _ in lines] == lines
+            writer.write(b"one\n")
+            assert {await reader.readline() for _ in range(3)} == {lines[1], b"echo one\n"}
             writer.close()
 
 
-async def test_a_client_is_answered_up_to_what_it_may_not_be_sent() -> None:
-    async with living(Toy()) as (first, _):
-        reader, writer = await connect(first)
-        writer.write(b"one\n")
-        answers = {await reader.readline() for _ in range(4)}
-        assert answers == {b"hello drive\n", b"echo one\n", b"first\n"}
-        writer.close()
-
-
-async def test_who_finds_no_place_is_closed() -> None:
-    async with living(Toy()) as (first, _):
+async def test_who_finds_no_place_is_closed_and_the_end_closes_every_conversation() -> None:
+    async with living() as (first, _):
         served = [await connect(first), await connect(first)]
         for reader, _ in served:
             assert await reader.readline() == b"hello drive\n"
         reader, writer = await connect(first)
         assert await reader.read() == b""
-        for _, one in [*served, (reader, writer)]:
-            one.close()
-
-
-async def test_its_end_closes_every_conversation() -> None:
-    async with living(Toy()) as (first, _):
-        reader, writer = await connect(first)
-        assert await reader.readline() == b"hello drive\n"
-    assert (await reader.read()).strip(b"first\n") == b""
-    writer.close()
+        writer.close()
+    for reader, writer in served:
+        assert (await reader.read()).strip(b"first\n") == b""
+        writer.close()

@@ -1,7 +1,5 @@
 """Lines of text: a word and numbers, both ways; what is no line of the protocol."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import pytest
@@ -32,44 +30,34 @@ class Warm(Line, frozen=True):
 
 
 LINES: Lines[Line] = Lines((Drive, Ask, Warm))
+SPACED: Lines[Line] = Lines((Drive,), b" ")
+WRONG = rb"|X|d,1,2|D|D,1|D,1,2,3|D,1,|D,1,2x3|D,1,128|D,1,+2|D,1, 2|D,1,0.5|D,1,1_0|ask,|ask,1"
 
 
 @pytest.mark.parametrize(
-    ("message", "line"), [(Drive(100, -100), b"D,100,-100\n"), (Ask(), b"ask\n"), (Warm(21.5), b"w,21.500000\n")]
-)
-def test_lines_both_ways(message: Line, line: bytes) -> None:
-    assert LINES.write(message) == line
-    assert LINES.read(line) == message
-    assert LINES.read(line[:-1] + b"\r\n") == message
-
-
-def test_the_separator_is_the_protocols() -> None:
-    lines: Lines[Line] = Lines((Drive,), b" ")
-    assert lines.write(Drive(1, 2)) == b"D 1 2\n"
-    assert lines.read(b"D 1 2\n") == Drive(1, 2)
-
-
-@pytest.mark.parametrize(
-    "line",
+    ("lines", "message", "line"),
     [
-        b"\n", b"X\n", b"d,1,2\n", b"D\n", b"D,1\n", b"D,1,2,3\n", b"D,1,\n", b"D,1,2x3\n", b"D,1,128\n",
-        b"D,1,+2\n", b"ask,\n",
-    ]
-    + [b"D,1, 2\n", b"D,1,0.5\n", b"D,1,1_0\n", b"ask,1\n", b"\xff\n"],
-)  # fmt: skip
+        (LINES, Drive(100, -100), b"D,100,-100\n"),
+        (LINES, Ask(), b"ask\n"),
+        (LINES, Warm(21.5), b"w,21.500000\n"),
+        (SPACED, Drive(1, 2), b"D 1 2\n"),
+    ],
+)
+def test_lines_both_ways_with_the_separator_of_the_protocol(lines: Lines[Line], message: Line, line: bytes) -> None:
+    assert lines.write(message) == line
+    assert lines.read(line) == lines.read(line[:-1] + b"\r\n") == message
+
+
+@pytest.mark.parametrize("line", [*WRONG.split(b"|"), b"\xff"])
 def test_what_is_no_line_of_the_protocol(line: bytes) -> None:
     with pytest.raises(ProtocolError):
-        LINES.read(line)
+        LINES.read(line + b"\n")
 
 
-def test_a_number_out_of_range_is_not_written() -> None:
+def test_a_number_out_of_range_is_not_written_and_a_line_ends_at_its_line_feed() -> None:
     with pytest.raises(EncodeError):
         LINES.write(Drive(128, 0))
-
-
-def test_a_line_ends_at_its_line_feed() -> None:
-    assert Lines.end(b"ask\nD,1,2\n", 0) == 4
-    assert Lines.end(b"ask\nD,1,2\n", 4) == 10
+    assert [Lines.end(b"ask\nD,1,2\n", start) for start in (0, 4)] == [4, 10]
     assert Lines.end(b"ask\nD,1", 4) > 7
 
 

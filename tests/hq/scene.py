@@ -214,7 +214,7 @@ class Scene:
         self.loop = asyncio.get_running_loop()
         self.skipped_s = 0.0
         self.bus = FakeBus("hq")
-        self.gateway = Gateway(self.bus.join("gw"), self)  # type: ignore[arg-type]
+        self.gateway = Gateway(self.bus.join("gw"), self)
         self.status = self.gateway.bus.publisher(KEYS.key("status"), topics.STATUS)
         self.token = None
         if robot:
@@ -223,22 +223,10 @@ class Scene:
         self.manager = SessionTable()
         self.robot = RobotSubscription(self.bus, KEYS, self.metrics)
         self.robot.open()
-        protocol = Protocol(
-            name="toy",
-            summary="",
-            options=HqSettings,
-            links=1,
-            robot=None,  # type: ignore[arg-type]
-            simulate=None,  # type: ignore[arg-type]
-            hq=self._side,
-        )
-        plan = ListenerPlan(
-            protocol,
-            None,
-            Address("127.0.0.1", 0),
-            HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings),
-            tuple(map(ipaddress.ip_network, allow)),
-        )
+        limits = HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings)
+        networks = tuple(map(ipaddress.ip_network, allow))
+        protocol = Protocol("toy", "", HqSettings, 1, robot=None, simulate=None, hq=self._side)  # type: ignore[arg-type]
+        plan = ListenerPlan(protocol, None, Address("127.0.0.1", 0), limits, networks)
         self.accept: Callable[[], Receiver]
         self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now)
         self.hosts = 0

@@ -7,11 +7,9 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-import msgspec
-
-from tests.proofs import Holder, numbered
-from zbridge.bus import Sample
+from tests.proofs import numbered
 from zbridge.bus.fake import FakeBus
+from zbridge.client import Fleet
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
@@ -20,10 +18,10 @@ from zbridge.control.enforcer import Enforcer
 from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.standstill import Standstill
-from zbridge.errors import NotReady, Unsupported
+from zbridge.errors import NotReady, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Authorization, Control, FleetMessage, Status
+from zbridge.fleet.messages import Control, FleetMessage, Pose, Status
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Outcome, Robot
@@ -73,18 +71,16 @@ class Machine(Robot):
 class Gateway:
     """The gateway of one robot: lease, commands, stop, ``control`` and ``status``; quiet until :meth:`serve`."""
 
-    def __init__(self, bus: FakeBus, name: str = "r1", *, lease_s: float = LEASE_S) -> None:
+    def __init__(self, bus: FakeBus, name: str = "r1") -> None:
         self.name = name
         self.keys = KeySpace("fleet", name)
         self.machine = Machine()
-        self.attachments: list[Authorization] = []
-        """What came with the commands that need the lease, in order."""
         self.asked: list[tuple[float, str]] = []
         """When which question about the lease came."""
         self._bus = bus.join(f"gateway of {name}")
         self._loop = asyncio.get_running_loop()
         metrics = Metrics()
-        self.authority = Authority(lease_s, DEADMAN_S, numbered())
+        self.authority = Authority(LEASE_S, DEADMAN_S, numbered())
         context = RobotContext(
             self.machine,
             self.keys,
@@ -110,7 +106,7 @@ class Gateway:
         for name in ("acquire/*", "takeover/*", "renew", "release"):
             self._bus.answer(self.keys.key(f"@rpc/control/{name}"), self._note)
         self.leases.serve()
-        self._bus.subscribe(self.keys.key("@cmd/**"), self._take)
+        self._bus.subscribe(self.keys.key("@cmd/**"), self.commands.take)
 
     async def vanish(self) -> None:
         """Be gone, without a word."""
@@ -124,23 +120,9 @@ class Gateway:
         """Publish this payload, whatever it is; a state keeps its last value for as long as the gateway is there."""
         self._bus.publisher(self.keys.key(topic.path), topic).put(payload)
 
-    def give(self, who: str, *, takeover: bool = False, **wishes: Any) -> Holder:
-        """Give another program the lease."""
-        decide = self.authority.takeover if takeover else self.authority.acquire
-        lease = decide(Acquire(who=who, **wishes), self._loop.time())
-        self.enforcer.settle()
-        assert lease.lease is not None, lease.reason
-        assert lease.token is not None
-        return Holder(lease.lease, lease.token, self.name)
-
-    def answer_first(self, question: Any) -> None:
-        """Answer what somebody else asks before anything else."""
-        handlers = [answer for key, answer, _ in self._bus._shared.queryables if key == question.key]
-        handlers[-1](question)
-
-    def refuse(self, command: str, reason: str, who: str | None) -> None:
-        """Show a refusal on ``control``."""
-        self.authority.refuse(command, NotReady(reason), who)
+    def refuse(self, command: str, refusal: Refused, who: str | None, by: str | None = None) -> None:
+        """Show a refusal on ``control``. by: the listener that tells of it."""
+        self.authority.refuse(command, refusal, who, by=by)
         self.enforcer.settle()
 
     @property
@@ -159,10 +141,31 @@ class Gateway:
     def _note(self, question: Any) -> None:
         self.asked.append((self._loop.time(), self.keys.path(question.key)))
 
-    def _take(self, sample: Sample) -> None:
-        if sample.attachment is not None:
-            self.attachments.append(msgspec.msgpack.decode(sample.attachment, type=Authorization))
-        self.commands.take(sample)
+
+class World:
+    """Robots, each with its gateway, and programs; the first robot is ``robot``, with ``gateway`` and ``machine``."""
+
+    def __init__(self, *names: str, served: bool = True) -> None:
+        self.loop = asyncio.get_running_loop()
+        self.bus = FakeBus()
+        self.gateways = {name: Gateway(self.bus, name) for name in names or ("r1",)}
+        self.gateway = next(iter(self.gateways.values()))
+        self.machine = self.gateway.machine
+        self.fleet = Fleet(self.bus.join("mine"))
+        self.robot = self.fleet[self.gateway.name]
+        self.others = Fleet(self.bus.join("others"))[self.gateway.name]
+        for gateway in self.gateways.values():
+            if served:
+                gateway.serve()
+
+    def pose(self, *xs: float) -> None:
+        """Have the robot publish poses."""
+        for x in xs:
+            self.gateway.publish(topics.POSE, at(x))
+
+
+def at(x: float) -> Pose:
+    return Pose(x=float(x), y=0.0, heading=0.0)
 
 
 async def settle() -> None:

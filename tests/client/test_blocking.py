@@ -12,13 +12,15 @@ import time
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
+import tests.client
 import zbridge
 import zbridge.client
-from tests.client import Gateway, subscriptions, tokens
+from tests.client import at, subscriptions, tokens
 from zbridge.bus import BusSettings
 from zbridge.bus.fake import FakeBus
 from zbridge.client import blocking
@@ -27,22 +29,7 @@ from zbridge.client.feed import WAITING
 from zbridge.errors import BusError, Held, LeaseLost, NotReady, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import (
-    Drive,
-    FleetMessage,
-    Map,
-    Mode,
-    Motor,
-    Pose,
-    Raw,
-    Reading,
-    Scan,
-    SensorSetting,
-    Status,
-    Switch,
-    Text,
-)
-from zbridge.fleet.topics import Topic
+from zbridge.fleet.messages import Drive, Map, Pose
 
 ME = "ann@here"
 POSE = Pose(x=1.0, y=2.0, heading=0.5)
@@ -51,17 +38,14 @@ SOON_S = 5.0
 """Longest time a test waits for what is to happen at once."""
 
 
-class World:
+class World(tests.client.World):
     """The bus on the client's thread, with a robot on it; ``on_bus`` does things there."""
 
     def __init__(self) -> None:
-        self.bus = FakeBus()
-        self.gateway = Gateway(self.bus)
-        self.gateway.serve()
+        super().__init__()
         self.bus.answer("fleet/r1/@rpc/pose", lambda question: question.answer(payloads.encode(POSE)))
         self.bus.answer("fleet/r1/@rpc/map", lambda question: question.refuse(NotReady("offline")))
         self.closed = False
-        self._loop = asyncio.get_running_loop()
 
     def on_bus(self, work: Callable[[], Any]) -> Any:
         """Do something on the client's thread, and wait for it."""
@@ -69,24 +53,18 @@ class World:
         async def do() -> Any:
             return work()
 
-        return asyncio.run_coroutine_threadsafe(do(), self._loop).result(SOON_S)
+        return asyncio.run_coroutine_threadsafe(do(), self.loop).result(SOON_S)
 
-    def publish(self, *poses: float) -> None:
+    def publish(self, *xs: float) -> None:
         """Have the robot publish poses."""
-        for x in poses:
-            self.on_bus(lambda x=x: self.gateway.publish(topics.POSE, Pose(x=x, y=0.0, heading=0.0)))
+        self.on_bus(lambda: self.pose(*xs))
 
-    def soon(self, topic: Topic, *messages: FleetMessage, key: str = "") -> None:
-        """Have the robot publish messages when somebody iterates them."""
-
-        def wait() -> None:
-            if not subscriptions(self.bus, f"fleet/r1/{key or topic.path}"):
-                self._loop.call_later(0.001, wait)
-                return
-            for message in messages:
-                self.gateway.publish(topic, message)
-
-        self._loop.call_soon_threadsafe(wait)
+    def soon(self, *xs: float) -> None:
+        """Have the robot publish poses when somebody iterates them."""
+        if subscriptions(self.bus, "fleet/r1/pose"):
+            self.pose(*xs)
+        else:
+            self.loop.call_soon_threadsafe(self.loop.call_later, 0.001, self.soon, *xs)
 
     @property
     def listeners(self) -> int:
@@ -131,44 +109,39 @@ def world(opened: list[tuple[World, BusSettings]], fleet: blocking.Fleet) -> Wor
     return opened[-1][0]
 
 
-def fails(error: type[BaseException]) -> Any:
-    raise error
-
-
 def until(condition: Callable[[], object], what: str) -> None:
     deadline = time.monotonic() + SOON_S
     while not condition():
         assert time.monotonic() < deadline, what
-        time.sleep(0.001)
+        time.sleep(0.005)
 
 
-def lease(robot: blocking.Robot, **wishes: Any) -> None:
-    """Get the lease, and give it back."""
-    with robot.control(**wishes):
+def lease(robot: blocking.Robot, who: str = ME, **wishes: Any) -> None:
+    """Hold the lease for nothing."""
+    with robot.control(who, **wishes):
         pass
 
 
-# Being on the bus
+# The bus and its thread
 
 
-def test_the_bus_is_left_with_the_context(opened: list[tuple[World, BusSettings]]) -> None:
+def test_the_bus_and_its_thread_live_as_long_as_the_context(opened: list[tuple[World, BusSettings]]) -> None:
     before = set(threading.enumerate())
     with zbridge.blocking.connect(["tcp/h:1"], realm="fleet") as fleet:
         ((world, settings),) = opened
         assert settings.connect == ("tcp/h:1",)
-        assert repr(fleet) == "<Fleet fleet>"
         assert not world.closed
         (thread,) = set(threading.enumerate()) - before
         assert thread.daemon, "a program that dies does not wait for it"
+        with zbridge.blocking.connect() as other:
+            assert fleet["r1"].ask_pose() == other["r1"].ask_pose() == POSE
     assert world.closed
-    assert not thread.is_alive()
-
-
-def test_the_bus_is_left_when_the_program_raises(opened: list[tuple[World, BusSettings]]) -> None:
-    before = set(threading.enumerate())
-    with pytest.raises(KeyError), zbridge.blocking.connect():
-        fails(KeyError)
-    assert opened[0][0].closed
+    with pytest.raises(BusError, match=r"^this client was closed$"):
+        fleet["r1"].ask_pose()
+    gc.collect()  # a coroutine that was never awaited would be an error
+    with contextlib.suppress(KeyError), zbridge.blocking.connect():
+        raise KeyError
+    assert [world.closed for world, _ in opened] == [True] * 3
     assert set(threading.enumerate()) <= before
 
 
@@ -183,94 +156,38 @@ def test_a_bus_that_cannot_be_opened_is_an_error_and_leaves_no_thread(monkeypatc
     assert set(threading.enumerate()) <= before
 
 
-def test_clients_can_follow_each_other_and_live_beside_each_other(opened: list[tuple[World, BusSettings]]) -> None:
-    with zbridge.blocking.connect() as one, zbridge.blocking.connect() as two:
-        assert one["r1"].ask_pose() == two["r1"].ask_pose() == POSE
-    with zbridge.blocking.connect() as three:
-        assert three["r1"].ask_pose() == POSE
-    assert [world.closed for world, _ in opened] == [True] * 3
-
-
-def test_a_client_that_was_closed_says_so(opened: list[tuple[World, BusSettings]]) -> None:
-    with zbridge.blocking.connect() as fleet:
-        robot = fleet["r1"]
-    with pytest.raises(BusError, match=r"^this client was closed$"):
-        robot.ask_pose()
-    gc.collect()  # a coroutine that was never awaited would be an error
-
-
 # Looking
 
 
-def test_robots_status_and_questions(fleet: blocking.Fleet) -> None:
-    assert fleet.robots() == {"r1": Status(state="established")}
-    robot = fleet["r1"]
-    assert (robot.name, repr(robot)) == ("r1", "<Robot fleet/r1>")
-    assert robot.status.last() == Status(state="established")
-    assert robot.map.last() is None
-    assert robot.ask_pose() == POSE
-    with pytest.raises(Refused, match=r"^r1: offline$"):
-        robot.ask_map()
-    with pytest.raises(BusError, match=r"^r2: no gateway answered"):
-        fleet["r2"].ask_pose()
-
-
-def test_iterating_gives_message_after_message(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-    world.soon(topics.POSE, *(Pose(x=x, y=0.0, heading=0.0) for x in (1.0, 2.0, 3.0)))
-    seen = []
+def test_iterating_gives_message_after_message_and_what_comes_between_two_steps_waits(fleet, world: World) -> None:
+    robot, seen = fleet["r1"], list[float]()
+    world.soon(1.0, 2.0)
     for pose in robot.pose:
         seen.append(pose.x)
-        if len(seen) == 3:
+        if len(seen) == 2:
+            world.publish(5.0, 6.0)
+        elif len(seen) == 4:
             break
-    assert seen == [1.0, 2.0, 3.0]
+    assert seen == [1.0, 2.0, 5.0, 6.0]
     until(lambda: world.listeners == 0, "the subscription ends with the loop")
-    assert repr(robot.pose) == "<Feed fleet/r1/pose>"
-
-
-def test_what_comes_between_two_steps_waits(fleet: blocking.Fleet, world: World) -> None:
-    poses = iter(fleet["r1"].pose)
-    world.soon(topics.POSE, POSE)
-    assert next(poses) == POSE
-    world.publish(5.0, 6.0)
-    assert [next(poses).x, next(poses).x] == [5.0, 6.0]
-    poses.close()  # type: ignore[attr-defined]
-    assert world.listeners == 0
 
 
 def test_a_feed_counts_what_was_lost_and_malformed(fleet: blocking.Fleet, world: World) -> None:
     feed = fleet["r1"].pose
     assert (feed.lost, feed.malformed) == (0, 0)
     poses = iter(feed)
-    world.soon(topics.POSE, POSE)
+    world.soon(1.0)
     next(poses)
+    world.publish(*map(float, range(WAITING + 1)))
     world.on_bus(lambda: world.gateway.put(topics.POSE, b"\xc1"))
-    world.publish(*map(float, range(WAITING)))
-    assert next(poses).x == 0.0
-    assert (feed.lost, feed.malformed) == (1, 0), "the malformed one was the oldest"
+    assert next(poses).x == 2.0
+    world.publish(500.0)
+    while next(poses).x != 500.0:
+        pass
+    assert (feed.lost, feed.malformed) == (2, 1)
 
 
-def test_states_give_their_last_value_first_and_arrays_are_numpys(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-    world.on_bus(lambda: world.gateway.publish(topics.MAP, MAP))
-    for seen in robot.map:
-        np.testing.assert_array_equal(seen.cells, MAP.cells)
-        break
-    last = robot.map.last()
-    assert last is not None
-    assert (last.cells.dtype, last.cells.shape) == (np.uint8, (2, 1))
-
-
-def test_sensors_and_raw_messages(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-    reading = Reading(value=1.0)
-    left = topics.SENSOR("front left")
-    world.soon(left, reading)
-    assert next(iter(robot.sensor("front left"))) == reading
-    world.soon(left, reading, key="sensor/*")
-    assert next(iter(robot.sensors)) == ("front left", reading)
-    world.soon(topics.RAW("tcpudp"), Raw(id=1))
-    assert next(iter(robot.raw("tcpudp"))) == Raw(id=1)
+# Ctrl-C
 
 
 class Interrupted(BaseException):
@@ -279,52 +196,40 @@ class Interrupted(BaseException):
 
 @contextlib.contextmanager
 def interrupted_after(seconds: float) -> Iterator[None]:
-    """Have a signal come to whatever the main thread waits for."""
+    """Have a signal come to whatever the main thread waits for, and expect that it ends soon."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise Interrupted
 
-    before = signal.signal(signal.SIGALRM, interrupt)
+    before, began = signal.signal(signal.SIGALRM, interrupt), time.monotonic()
     signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
-        yield
+        with pytest.raises(Interrupted):
+            yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-
-
-def test_an_interrupted_iteration_ends_its_subscription(fleet: blocking.Fleet, world: World) -> None:
-    began = time.monotonic()
-    with interrupted_after(0.1), pytest.raises(Interrupted):
-        list(fleet["r1"].pose)
     assert time.monotonic() - began < SOON_S
-    until(lambda: world.listeners == 0, "the subscription ends")
-    assert fleet["r1"].ask_pose() == POSE, "and the client is as good as before"
 
 
 def test_an_interrupted_drive_gives_the_lease_back(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-
-    def program() -> None:
-        with robot.control(ME) as drive:
-            drive.during(60.0, forward=0.5)
-
-    began = time.monotonic()
-    with interrupted_after(0.2), pytest.raises(Interrupted):
-        program()
-    assert time.monotonic() - began < SOON_S
-    assert world.gateway.control.state == "free"
-    assert world.gateway.machine.stops == 1
+    with interrupted_after(0.2), fleet["r1"].control(ME) as drive:
+        drive.during(60.0, forward=0.5)
+    assert (world.gateway.control.state, world.machine.stops) == ("free", 1)
     assert tokens(world.bus) == []
     driven = len(world.gateway.driven)
     time.sleep(0.15)
     assert len(world.gateway.driven) == driven, "nobody drives on"
 
 
-def test_an_interrupted_wait_for_the_gateway_leaves_nothing_behind(fleet: blocking.Fleet, world: World) -> None:
-    with interrupted_after(0.1), pytest.raises(Interrupted):
+def test_an_interrupted_iteration_or_wait_for_the_gateway_leaves_nothing_behind(fleet, world: World) -> None:
+    with interrupted_after(0.1):
+        list(fleet["r1"].pose)
+    until(lambda: world.listeners == 0, "the subscription ends")
+    with interrupted_after(0.1):
         lease(fleet["nobody"])
     until(lambda: world.on_bus(lambda: tokens(world.bus, "nobody")) == [], "the token is withdrawn")
+    assert fleet["r1"].ask_pose() == POSE, "and the client is as good as before"
 
 
 # Driving
@@ -333,181 +238,97 @@ def test_an_interrupted_wait_for_the_gateway_leaves_nothing_behind(fleet: blocki
 def test_the_lease_is_held_while_the_context_lasts(fleet: blocking.Fleet, world: World) -> None:
     robot = fleet["r1"]
     with robot.control(ME, priority=2, deadman_s=0.4) as drive:
-        assert robot.control.last().holder == ME  # type: ignore[union-attr]
-        assert drive.loss is None
-        assert repr(drive) == "<Driver of r1 holding>"
-        drive(forward=0.5, left=-0.25, turn=1.0, light=True)
-        drive.motor("arm", 1.0)
-        drive.mode("manual")
-        drive.raw("tcpudp", 7, b"abc")
+        shown = robot.control.last()
+        assert shown is not None
+        assert (shown.holder, shown.priority, drive.loss) == (ME, 2, None)
         drive.during(0.12, forward=0.25, left=0.5, turn=-0.5)
-    assert robot.control.last().state == "free"  # type: ignore[union-attr]
-    first, motor, mode, raw, *driven, last = world.gateway.machine.commands
-    assert [first, motor, mode, raw] == [
-        ("drive", Drive(forward=0.5, left=-0.25, turn=1.0, light=True)),
-        ("motor/arm", Motor(1.0)),
-        ("mode", Mode("manual")),
-        ("raw/tcpudp", Raw(id=7, body=b"abc")),
-    ]
-    assert set(driven) == {("drive", Drive(forward=0.25, left=0.5, turn=-0.5))}
-    assert last == ("drive", Drive())
-    assert [shown.seq for shown in world.gateway.attachments] == list(range(1, len(world.gateway.attachments) + 1))
+    assert world.gateway.control.state == "free"
+    *driven, last = world.gateway.driven
+    assert set(driven) == {Drive(forward=0.25, left=0.5, turn=-0.5)}
+    assert last == Drive()
 
 
-def test_held_bad_wishes_and_no_gateway_come_through(fleet: blocking.Fleet) -> None:
+def test_states_errors_refusals_and_losses_come_through(fleet: blocking.Fleet, world: World) -> None:
     robot = fleet["r1"]
-    with robot.control(ME):
+    with robot.control(ME) as drive:
         with pytest.raises(Held, match=r"^r1 is held by ann@here \(priority 0\)") as held:
             lease(robot, who="bob@there")
         assert held.value.holder == ME
-    with pytest.raises(Refused, match="lease_s"):
-        lease(robot, lease_s=0.0)
+        with pytest.raises(ValueError, match=r"^forward = 2\.0: expected -1 to 1$"):
+            drive(forward=2.0)
+        world.machine.refusal = "no legs"
+        with pytest.raises(Refused, match=r"^r1: drive: no legs$"):
+            drive.during(SOON_S, forward=0.5)
+        world.machine.refusal = None
+        robot.stop()
+        with pytest.raises(LeaseLost, match=r"^r1: the lease has ended \(stop\)$"):
+            drive.during(SOON_S, forward=0.5)
+        assert str(drive.loss) == "r1: the lease has ended (stop)"
+    world.on_bus(lambda: world.gateway.publish(topics.MAP, MAP))
+    np.testing.assert_array_equal(next(iter(robot.map)).cells, MAP.cells)
+    with pytest.raises(Refused, match=r"^r1: offline$"):
+        robot.ask_map()
     with pytest.raises(BusError, match=r"^nobody: no gateway answered within 0\.1 s$"):
         lease(fleet["nobody"], wait_s=0.1)
     with pytest.raises(TypeError, match="speed"):
         lease(robot, speed=1.0)
 
 
-def test_refusals_range_errors_and_losses_come_through(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-    with robot.control(ME) as drive:
-        with pytest.raises(ValueError, match=r"^forward = 2\.0: expected -1 to 1$"):
-            drive(forward=2.0)
-        with pytest.raises(ValueError, match=r"^mode = 'fast'"):
-            drive.mode("fast")
-        world.gateway.machine.refusal = "no legs"
-        with pytest.raises(Refused, match=r"^r1: drive: no legs$"):
-            drive.during(SOON_S, forward=0.5)
-        world.gateway.machine.refusal = None
-        robot.stop()
-        with pytest.raises(LeaseLost, match=r"^r1: the lease has ended \(stop\)$"):
-            drive.during(SOON_S, forward=0.5)
-        assert str(drive.loss) == "r1: the lease has ended (stop)"
-
-
-def test_stops_come_through(fleet: blocking.Fleet, world: World) -> None:
-    fleet["r1"].stop()
-    assert fleet.stop(["r1"]) == fleet.stop() == {"r1": None}
-    assert world.gateway.machine.stops >= 3
-    world.gateway.machine.unstoppable = "no"
-    with pytest.raises(Refused, match=r"^r1: cannot be stopped: no$"):
-        fleet["r1"].stop()
-    assert str(fleet.stop()["r1"]) == "r1: cannot be stopped: no"
-
-
-def test_commands_that_need_no_lease(fleet: blocking.Fleet, world: World) -> None:
-    robot = fleet["r1"]
-    scan = Scan(angle_min=0.0, angle_increment=0.1, range_min=0.1, range_max=4.0, ranges=np.ones(3, np.float32))
-    setting = SensorSetting(enable=True)
-    robot.set_light(True)
-    robot.set_lidar(False)
-    robot.set_camera(True)
-    robot.say("hello")
-    robot.feed_scan(scan)
-    robot.set_sensor("front left", setting)
-    taken = dict(world.gateway.machine.commands)
-    assert isinstance(taken.pop("scan"), Scan)
-    assert taken == {
-        "light": Switch(on=True),
-        "lidar": Switch(on=False),
-        "camera": Switch(on=True),
-        "text": Text(text="hello"),
-        "sensor/front%20left": setting,
-    }
-
-
 # Threads, notebooks, and being the same as the client with async
 
 
-def test_one_thread_drives_while_another_looks(fleet: blocking.Fleet, world: World) -> None:
-    robot, seen = fleet["r1"], list[float]()
-
-    def look() -> None:
-        for pose in robot.pose:
-            seen.append(pose.x)
-            if len(seen) == 3:
-                break
-
-    looking = threading.Thread(target=look)
-    looking.start()
-    with robot.control(ME) as drive:
-        until(lambda: world.listeners == 1, "the other thread looks")
-        for x in (1.0, 2.0, 3.0):
-            drive(forward=0.5)
-            world.publish(x)
-    looking.join(SOON_S)
-    assert not looking.is_alive()
-    assert seen == [1.0, 2.0, 3.0]
-    assert len(world.gateway.driven) == 3
-
-
-async def test_it_works_inside_a_running_loop(opened: list[tuple[World, BusSettings]]) -> None:
-    """As in a notebook, whose cells run in one."""
-    assert asyncio.get_running_loop().is_running()
-    with zbridge.blocking.connect() as fleet:
-        world = opened[-1][0]
-        robot = fleet["r1"]
-        assert robot.ask_pose() == POSE
-        with robot.control(ME) as drive:
-            drive.during(0.1, forward=0.5)
-        world.soon(topics.POSE, POSE)
-        for pose in robot.pose:
-            assert pose == POSE
-            break
-        with pytest.raises(Refused):
-            robot.ask_map()
-    assert world.gateway.control.state == "free"
-    await asyncio.sleep(0)
-
-
-def test_an_iterator_that_is_dropped_ends_its_subscription(fleet: blocking.Fleet, world: World) -> None:
-    poses = iter(fleet["r1"].pose)
-    world.soon(topics.POSE, POSE)
-    next(poses)
-    assert world.listeners == 1
-    del poses
-    gc.collect()
-    until(lambda: world.listeners == 0, "the subscription ends")
-
-
-def test_an_iterator_may_outlive_its_client(opened: list[tuple[World, BusSettings]]) -> None:
-    with zbridge.blocking.connect() as fleet:
-        poses = iter(fleet["r1"].pose)
-        opened[-1][0].soon(topics.POSE, POSE)
-        assert next(poses) == POSE
-    del poses
-    gc.collect()
-
-
-def test_an_iterator_collected_on_the_clients_thread_does_not_hang_it(fleet: blocking.Fleet, world: World) -> None:
-    poses = iter(fleet["r1"].pose)
-    world.soon(topics.POSE, POSE)
-    next(poses)
-    cycle: list[Any] = [poses]
-    cycle.append(cycle)
-    del poses, cycle
-    world.on_bus(gc.collect)
-    until(lambda: world.listeners == 0, "the subscription ends")
-
-
-def test_a_thread_that_iterates_ends_with_the_client(opened: list[tuple[World, BusSettings]]) -> None:
+def test_one_thread_drives_while_another_looks_and_that_one_ends_with_the_client(opened) -> None:
+    seen: list[float] = []
     ended: list[str] = []
 
     def look() -> None:
         try:
-            for _ in robot.pose:
-                pass
+            seen.extend(pose.x for pose in robot.pose)
         except BusError as error:
             ended.append(str(error))
 
     looking = threading.Thread(target=look, daemon=True)
     with zbridge.blocking.connect() as fleet:
-        robot = fleet["r1"]
+        world, robot = opened[-1][0], fleet["r1"]
         looking.start()
-        until(lambda: opened[-1][0].listeners == 1, "the other thread looks")
+        with robot.control(ME) as drive:
+            until(lambda: world.listeners == 1, "the other thread looks")
+            for x in (1.0, 2.0, 3.0):
+                drive(forward=0.5)
+                world.publish(x)
+            until(lambda: len(seen) == 3, "the other thread sees")
     looking.join(SOON_S)
     assert not looking.is_alive()
-    assert ended == ["this client was closed"]
+    assert (seen, ended, len(world.gateway.driven)) == ([1.0, 2.0, 3.0], ["this client was closed"], 3)
+
+
+async def test_it_works_inside_a_running_loop(opened: list[tuple[World, BusSettings]]) -> None:
+    """As in a notebook, whose cells run in one."""
+    with zbridge.blocking.connect() as fleet:
+        with fleet["r1"].control(ME) as drive:
+            drive.during(0.1, forward=0.5)
+        opened[-1][0].soon(1.0)
+        assert next(iter(fleet["r1"].pose)) == at(1.0)
+    assert opened[-1][0].gateway.control.state == "free"
+    await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("where", ["dropped", "on the client's thread", "after the client"])
+def test_an_iterator_that_is_collected_ends_its_subscription_and_hangs_nothing(opened, where: str) -> None:
+    with zbridge.blocking.connect() as fleet:
+        world = opened[-1][0]
+        poses = iter(fleet["r1"].pose)
+        world.soon(1.0)
+        assert next(poses) == at(1.0)
+        assert world.listeners == 1
+        cycle: list[Any] = [poses]
+        cycle.append(cycle)
+        if where != "after the client":
+            del poses, cycle
+            world.on_bus(gc.collect) if where == "on the client's thread" else gc.collect()
+            until(lambda: world.listeners == 0, "the subscription ends")
+    poses = cycle = None  # type: ignore[assignment]
+    gc.collect()
 
 
 PAIRS: list[tuple[type, type]] = [
@@ -521,19 +342,29 @@ INSIDE = {"acquire", "look", "release"}
 
 
 @pytest.mark.parametrize(("awaited", "blocks"), PAIRS, ids=[pair[0].__name__ for pair in PAIRS])
-def test_every_method_has_its_like_with_the_same_arguments(awaited: type, blocks: type) -> None:
+def test_every_method_has_its_like_with_the_same_arguments_and_calls_it_with_them(awaited: type, blocks: type) -> None:
     for name, method in vars(awaited).items():
         if (name.startswith("_") and name != "__call__") or name in INSIDE or not inspect.isfunction(method):
             continue
-        like = getattr(blocks, name)
-        assert str(inspect.signature(like)) == str(inspect.signature(method)), name
+        signature = inspect.signature(getattr(blocks, name))
+        assert str(signature) == str(inspect.signature(method)), name
+        if inspect.iscoroutinefunction(method):
+            its, more = mock.AsyncMock(), {"light": True} if "light" in signature.parameters else {}
+            given = [object() for parameter in list(signature.parameters)[1:] if parameter not in more]
+            with contextlib.closing(blocking._Loop()) as loop:
+                result = getattr(blocks(loop, its), name)(*given, **more)
+            called = its if name == "__call__" else getattr(its, name)
+            called.assert_awaited_once_with(*given, **more)
+            assert result is (called.return_value if signature.return_annotation != "None" else None)
 
 
 def test_every_feed_has_its_like(fleet: blocking.Fleet) -> None:
-    robot = zbridge.client.Fleet(FakeBus())["r1"]
-    feeds = {name for name, value in vars(robot).items() if isinstance(value, zbridge.client.Feed)}
-    like = {name for name, value in vars(fleet["r1"]).items() if isinstance(value, blocking.Feed)}
-    assert feeds == like
-    for name in feeds:
-        assert hasattr(getattr(robot, name), "last") == hasattr(getattr(fleet["r1"], name), "last"), name
-        assert repr(getattr(robot, name)) == repr(getattr(fleet["r1"], name))
+    robot, like = zbridge.client.Fleet(FakeBus())["r1"], fleet["r1"]
+    feeds = {name: feed for name, feed in vars(robot).items() if isinstance(feed, zbridge.client.Feed)}
+    assert {name for name, feed in vars(like).items() if isinstance(feed, blocking.Feed)} == set(feeds)
+    for name, feed in feeds.items():
+        assert hasattr(feed, "last") == hasattr(getattr(like, name), "last"), name
+        assert repr(feed) == repr(getattr(like, name)), "it has the same key"
+    assert repr(like.sensor("front left")) == repr(robot.sensor("front left"))
+    assert repr(like.sensors) == repr(robot.sensors)
+    assert repr(like.raw("tcpudp")) == repr(robot.raw("tcpudp"))

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.client import Gateway, settle, subscriptions, tokens
+import tests.client
+from tests.client import subscriptions, tokens
 from zbridge.bus import Answer, IncomingQuery, Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet, Robot
 from zbridge.client.fleet import CONFIRM_S
-from zbridge.errors import BusError, Held, NotReady, PayloadError, Refused
+from zbridge.errors import BusError, NotReady, PayloadError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -38,74 +39,34 @@ pytestmark = pytest.mark.jumping
 POSE = Pose(x=1.0, y=2.0, heading=0.5)
 MAP = Map(rows=1, columns=2, cell=0.1, origin=(0.0, 0.0), cells=np.array([[1, 2]], np.uint8))
 SCAN = Scan(angle_min=0.0, angle_increment=0.1, range_min=0.1, range_max=4.0, ranges=np.ones(3, np.float32))
+SETTING = SensorSetting(enable=True, values=(1.0, 2.0))
+ESTABLISHED = Status(state="established")
 
 
-class World:
-    """Some robots, each with its gateway, and a program."""
-
-    def __init__(self, *names: str) -> None:
-        self.loop = asyncio.get_running_loop()
-        self.bus = FakeBus()
-        self.fleet = Fleet(self.bus.join("program"))
-        self.robot: Robot = self.fleet["r1"]
-        self.gateways = {name: Gateway(self.bus, name) for name in names}
-        for gateway in self.gateways.values():
-            gateway.serve()
-
+class World(tests.client.World):
     @property
-    def gateway(self) -> Gateway:
-        return self.gateways["r1"]
+    def stopped(self) -> list[str]:
+        """The robots that were stopped."""
+        return [name for name, gateway in self.gateways.items() if gateway.machine.stops > 0]
 
     def taken(self, path: str) -> list[Sample]:
         """Give the samples that came on a key of r1."""
         return [sample for sample in self.bus._shared.history if sample.key == f"fleet/r1/{path}"]
 
 
-# Which robots there are
-
-
-async def test_robots_lists_what_has_a_gateway_or_a_status() -> None:
-    world = World("r2", "r1")
+async def test_robots_lists_what_has_a_gateway_or_a_status_in_its_own_realm() -> None:
+    world = World("r2", "r1", "r3")
+    world.gateways["r3"].put(topics.STATUS, b"\xc1")
     world.bus.announce("fleet/starting/@alive/gateway")
     world.bus.announce("fleet/r9/@alive/operator.7")
     status = Status(state="offline", reason="gone")
     world.bus.publisher("fleet/old/status", topics.STATUS).put(payloads.encode(status))
-    Gateway(FakeBus(), "elsewhere").serve()
-    established = Status(state="established")
-    assert await world.fleet.robots() == {"old": status, "r1": established, "r2": established, "starting": None}
-    assert list(await world.fleet.robots()) == ["old", "r1", "r2", "starting"], "in order of their names"
-
-
-async def test_a_status_nobody_can_read_counts_as_none() -> None:
-    world = World("r1", "r2")
-    world.gateway.put(topics.STATUS, b"\xc1")
-    assert await world.fleet.robots() == {"r1": None, "r2": Status(state="established")}
-
-
-async def test_without_robots_the_list_is_empty() -> None:
-    assert await World().fleet.robots() == {}
-    assert await World().fleet.stop() == {}
-
-
-async def test_a_realm_sees_its_own_robots_only() -> None:
-    world = World("r1")
+    robots = await world.fleet.robots()
+    assert robots == {"old": status, "r1": ESTABLISHED, "r2": ESTABLISHED, "r3": None, "starting": None}
+    assert list(robots) == sorted(robots)
     other = Fleet(world.bus.join("other"), "lab")
-    assert await other.robots() == {}
-    assert await other.stop() == {}
-    assert await other["r1"].status.last() is None
-    assert world.gateway.machine.stops == 0
-
-
-async def test_fleet_and_robots_print_what_they_are() -> None:
-    world = World()
-    assert repr(world.fleet) == "<Fleet fleet>"
-    assert repr(world.robot) == "<Robot fleet/r1>"
-    assert repr(Fleet(world.bus, "lab")["r2"]) == "<Robot lab/r2>"
-    assert world.robot.name == "r1"
-    assert repr(world.robot.control) == "<ControlFeed fleet/r1/control>"
-
-
-# Questions
+    assert await other.robots() == await other.stop() == {}
+    assert world.stopped == []
 
 
 @pytest.mark.parametrize(
@@ -114,7 +75,7 @@ async def test_fleet_and_robots_print_what_they_are() -> None:
     ids=["pose", "map"],
 )
 async def test_questions_are_answered_refused_or_not_answered(topic, message, ask) -> None:
-    world = World()
+    world = World(served=False)
     with pytest.raises(BusError, match=r"^r1: no gateway answered"):
         await ask(world.robot)
     asked: list[IncomingQuery] = []
@@ -130,19 +91,11 @@ async def test_questions_are_answered_refused_or_not_answered(topic, message, as
     got = await ask(world.robot)
     assert type(got) is type(message)
     assert payloads.encode(got) == payloads.encode(message)
+    if isinstance(got, Map):
+        assert (got.cells.dtype, got.cells.shape) == (np.uint8, (1, 2))
     assert payloads.decode(Query, asked[0].payload) == Query()
     with pytest.raises(NotReady, match=r"^r1: offline$"):
         await ask(world.robot)
-
-
-async def test_an_asked_maps_cells_are_an_array_of_rows_and_columns() -> None:
-    world = World()
-    world.bus.answer("fleet/r1/@rpc/map", lambda question: question.answer(payloads.encode(MAP)))
-    cells = (await world.robot.ask_map()).cells
-    assert (cells.dtype, cells.shape) == (np.uint8, (1, 2))
-
-
-# Commands that everybody may give
 
 
 @pytest.mark.parametrize(
@@ -153,11 +106,7 @@ async def test_an_asked_maps_cells_are_an_array_of_rows_and_columns() -> None:
         ("camera", Switch(on=True), lambda robot: robot.set_camera(True)),
         ("text", Text(text="hello"), lambda robot: robot.say("hello")),
         ("scan", SCAN, lambda robot: robot.feed_scan(SCAN)),
-        (
-            "sensor/front%20left",
-            SensorSetting(enable=True, values=(1.0, 2.0)),
-            lambda robot: robot.set_sensor("front left", SensorSetting(enable=True, values=(1.0, 2.0))),
-        ),
+        ("sensor/front%20left", SETTING, lambda robot: robot.set_sensor("front left", SETTING)),
     ],
 )
 async def test_commands_that_need_no_lease(path: str, message: FleetMessage, work: Callable[[Robot], Any]) -> None:
@@ -166,9 +115,8 @@ async def test_commands_that_need_no_lease(path: str, message: FleetMessage, wor
     (sample,) = world.taken(f"@cmd/{path}")
     assert payloads.encode(payloads.decode(type(message), sample.payload)) == payloads.encode(message)
     assert sample.attachment is None
-    ((taken, command),) = world.gateway.machine.commands
-    assert taken == path
-    assert type(command) is type(message)
+    ((taken, command),) = world.machine.commands
+    assert (taken, type(command)) == (path, type(message))
 
 
 # The stop
@@ -181,60 +129,28 @@ async def test_a_stop_returns_when_the_gateway_has_confirmed_it() -> None:
         asked_at = world.loop.time()
         await Fleet(world.bus.join("passer-by"))["r1"].stop()
         assert world.loop.time() - asked_at < 0.1
-        assert world.gateway.machine.stops >= 1
-        assert world.gateway.control.state == "stopped"
-        assert world.gateway.control.holder is None
+        stops = world.machine.stops
+        assert stops >= 1
+        assert (world.gateway.control.state, world.gateway.control.holder) == ("stopped", None)
     sent = world.taken("@cmd/stop")
     assert {payloads.decode(Stop, sample.payload) for sample in sent} == {Stop()}
     await asyncio.sleep(1.0)
     assert world.taken("@cmd/stop") == sent, "not sent any more"
     assert subscriptions(world.bus, "fleet/r1/control") == 0
-
-
-async def test_a_robot_that_is_free_or_stopped_is_stopped_too() -> None:
-    world = World("r1")
     await world.robot.stop()
-    stops = world.gateway.machine.stops
-    assert stops >= 1
-    await world.robot.stop()
-    assert world.gateway.machine.stops > stops
+    assert world.machine.stops > stops, "a robot that is stopped is stopped too"
+    async with world.robot.control("ann@here") as drive:
+        await drive(forward=0.5)
+    assert len(world.gateway.driven) == 2, "and can be taken again"
 
 
-async def test_a_stop_that_is_lost_is_sent_again() -> None:
-    world = World()
-    heard: list[Sample] = []
-
-    def confirm(sample: Sample) -> None:
-        heard.append(sample)
-        if len(heard) == 5:
-            control = payloads.encode(Control(state="stopped"))
-            world.loop.call_later(0.01, world.bus.publisher("fleet/r1/control", topics.CONTROL).put, control)
-
-    world.bus.subscribe("fleet/r1/@cmd/stop", confirm)
-    asked_at = world.loop.time()
-    await world.robot.stop()
-    assert world.loop.time() - asked_at < 0.3
-    assert 5 <= len(heard) <= 6
-
-
-async def test_what_was_stopped_before_is_no_confirmation() -> None:
-    world = World()
+@pytest.mark.parametrize("shown", [b"\xc1", payloads.encode(Control(state="held", holder="ann@here")), None])
+async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so(shown: bytes | None) -> None:
+    world = World(served=False)
     world.bus.publisher("fleet/r1/control", topics.CONTROL).put(payloads.encode(Control(state="stopped")))
-    with pytest.raises(BusError, match="no gateway confirmed"):
-        await world.robot.stop()
-
-
-@pytest.mark.parametrize("payload", [b"\xc1", payloads.encode(Control(state="held", holder="ann@here"))])
-async def test_anything_else_on_control_is_no_confirmation(payload: bytes) -> None:
-    world = World()
-    publisher = world.bus.publisher("fleet/r1/control", topics.TEXT)
-    world.bus.subscribe("fleet/r1/@cmd/stop", lambda sample: publisher.put(payload) and None)
-    with pytest.raises(BusError, match="no gateway confirmed"):
-        await world.robot.stop()
-
-
-async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so() -> None:
-    world = World()
+    control = world.bus.publisher("fleet/r1/control", topics.TEXT)
+    if shown is not None:
+        world.bus.subscribe("fleet/r1/@cmd/stop", lambda sample: control.put(shown) and None)
     asked_at = world.loop.time()
     with pytest.raises(BusError, match=r"^r1: stop sent, but no gateway confirmed it within 2 s$"):
         await world.robot.stop()
@@ -243,55 +159,35 @@ async def test_a_stop_nobody_confirms_was_sent_many_times_and_says_so() -> None:
     assert subscriptions(world.bus, "fleet/r1/control") == 0
 
 
-async def test_who_tells_that_a_listener_refused_a_stop_makes_no_stop_fail() -> None:
+async def test_refusals_of_long_ago_or_of_a_listener_are_none_of_this_stop() -> None:
     world = World("r1")
-
-    def tell(_: Sample) -> None:
-        world.gateway.authority.refuse("stop", NotReady("somebody said so"), "hq.x.1", by="hq.x")
-
+    world.machine.unstoppable = "not now"
+    world.gateway.enforcer.stop("stop")
+    world.machine.unstoppable = None
+    forged = NotReady("somebody said so")
+    world.bus.subscribe(
+        "fleet/r1/@cmd/stop", lambda _: world.gateway.authority.refuse("stop", forged, "hq.x.1", by="hq.x")
+    )
     subscribers = world.bus._shared.subscribers
-    world.bus.subscribe("fleet/r1/@cmd/stop", tell)
     subscribers.insert(0, subscribers.pop())
     await world.robot.stop()
-    assert world.gateway.control.refusals[0].command == "stop"
+    assert world.stopped == ["r1"]
+    assert world.gateway.control.refusals[-1].by == "hq.x"
 
 
-async def test_a_robot_that_cannot_be_stopped_is_refused_with_the_reason_every_time() -> None:
+@pytest.mark.parametrize(
+    ("status", "why"),
+    [
+        (Status(state="connecting", reason="no route to host"), "connecting: no route to host"),
+        (Status(state="offline"), "offline: no reason known"),
+    ],
+)
+async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so(status: Status, why: str) -> None:
     world = World("r1")
-    world.gateway.machine.unstoppable = "this version knows no stop"
-    for _ in range(2):
-        with pytest.raises(Refused, match=r"^r1: cannot be stopped: this version knows no stop$"):
-            await world.robot.stop()
-    assert world.gateway.control.state == "stopped", "nobody drives it any more, whatever it does"
-
-
-async def test_a_refusal_of_long_ago_is_none_of_this_stop() -> None:
-    world = World("r1")
-    world.gateway.machine.unstoppable = "not now"
-    world.gateway.enforcer.stop("stop")
-    world.gateway.machine.unstoppable = None
-    await world.robot.stop()
-    assert world.gateway.machine.stops >= 1
-
-
-async def test_a_stop_taken_for_a_robot_that_cannot_be_reached_says_so() -> None:
-    world = World("r1")
-    world.gateway.publish(topics.STATUS, Status(state="connecting", reason="no route to host"))
-    with pytest.raises(Refused, match=r"^r1: stop taken, but the robot is connecting: no route to host$"):
+    world.gateway.publish(topics.STATUS, status)
+    with pytest.raises(Refused, match=rf"^r1: stop taken, but the robot is {why}$"):
         await world.robot.stop()
-    world.gateway.publish(topics.STATUS, Status(state="offline"))
-    with pytest.raises(Refused, match=r"^r1: stop taken, but the robot is offline: no reason known$"):
-        await world.robot.stop()
-    assert len(world.taken("@cmd/stop")) >= 2
-
-
-@pytest.mark.parametrize("topic", [topics.CONTROL, topics.STATUS], ids=["control", "status"])
-async def test_a_stop_is_sent_although_a_state_cannot_be_read(topic: Topic) -> None:
-    world = World("r1")
-    world.gateway.put(topic, b"\xc1")
-    with contextlib.suppress(Refused, PayloadError):
-        await world.robot.stop()
-    assert world.gateway.machine.stops >= 1
+    assert world.taken("@cmd/stop") != []
 
 
 class SlowToAsk(FakeBus):
@@ -302,76 +198,51 @@ class SlowToAsk(FakeBus):
         return await super().ask(key_expr, payload, timeout_s=timeout_s)
 
 
-async def test_a_stop_is_sent_before_anything_is_asked() -> None:
+@pytest.mark.parametrize("topic", [topics.CONTROL, topics.STATUS], ids=["control", "status"])
+async def test_a_stop_is_sent_before_anything_is_asked_and_although_a_state_cannot_be_read(topic: Topic) -> None:
     world = World("r1")
+    world.gateway.put(topic, b"\xc1")
     stopping = asyncio.create_task(Fleet(SlowToAsk("slow", world.bus._shared))["r1"].stop())
     await asyncio.sleep(0.05)
-    assert world.gateway.machine.stops >= 1
+    assert world.stopped == ["r1"]
     assert not stopping.done()
-    await stopping
+    with contextlib.suppress(Refused, PayloadError):
+        await stopping
 
 
 async def test_all_robots_are_stopped_at_once_and_each_has_its_outcome() -> None:
-    world = World("r1", "r2", "r3")
-    world.gateways["r2"].machine.unstoppable = "no"
-    world.bus.announce("fleet/dead1/@alive/gateway")
-    world.bus.announce("fleet/dead2/@alive/gateway")
-    world.bus.announce("fleet/program/@alive/operator.1")
+    world = World("r1", "r2", "r3", "r4")
+    world.gateways["r2"].machine.unstoppable = "this version knows no stop"
+    world.gateways["r4"].put(topics.STATUS, b"\xc1")
+    for token in ("dead1/@alive/gateway", "dead2/@alive/gateway", "program/@alive/operator.1"):
+        world.bus.announce(f"fleet/{token}")
     asked_at = world.loop.time()
     outcomes = await world.fleet.stop()
     assert world.loop.time() - asked_at < CONFIRM_S + 0.2, "not one after the other"
-    assert list(outcomes) == ["dead1", "dead2", "r1", "r2", "r3"]
+    assert list(outcomes) == ["dead1", "dead2", "r1", "r2", "r3", "r4"]
     assert outcomes["r1"] is outcomes["r3"] is None
-    assert str(outcomes["r2"]) == "r2: cannot be stopped: no"
-    assert isinstance(outcomes["r2"], Refused)
-    assert isinstance(outcomes["dead1"], BusError)
-    assert isinstance(outcomes["dead2"], BusError)
-    assert [gateway.machine.stops > 0 for gateway in world.gateways.values()] == [True, False, True]
+    assert str(outcomes["r2"]) == "r2: cannot be stopped: this version knows no stop"
+    assert [type(outcomes[name]) for name in ("dead1", "dead2", "r4")] == [BusError, BusError, NotReady]
+    assert world.stopped == ["r1", "r3", "r4"]
+    again = (await world.fleet.stop(["r2"]))["r2"]
+    assert str(again) == str(outcomes["r2"]), "every time"
+    assert world.gateways["r2"].control.state == "stopped", "nobody drives it any more, whatever it does"
 
 
-async def test_one_robots_unreadable_status_leaves_every_robot_its_stop_and_outcome() -> None:
-    world = World("r1", "r2")
-    world.gateway.put(topics.STATUS, b"\xc1")
-    outcomes = await world.fleet.stop()
-    assert list(outcomes) == ["r1", "r2"]
-    assert isinstance(outcomes["r1"], Refused)
-    assert outcomes["r2"] is None
-    assert all(gateway.machine.stops > 0 for gateway in world.gateways.values())
-
-
-async def test_only_the_named_robots_are_stopped() -> None:
+@pytest.mark.parametrize(("names", "stopped"), [(iter(["r3", "r1", "r3"]), ["r1", "r3"]), ("r1", ["r1"])])
+async def test_only_the_named_robots_are_stopped(names: Any, stopped: list[str]) -> None:
     world = World("r1", "r2", "r3")
-    outcomes = await world.fleet.stop(name for name in ("r3", "r1", "r3"))
-    assert set(outcomes) == {"r1", "r3"}
-    assert not any(outcomes.values())
-    assert [gateway.machine.stops > 0 for gateway in world.gateways.values()] == [True, False, True]
-
-
-async def test_a_single_name_is_one_robot_to_stop() -> None:
-    world = World("r1", "r2")
-    assert await world.fleet.stop("r1") == {"r1": None}
-    assert world.gateways["r2"].machine.stops == 0
-
-
-async def test_a_program_can_stop_what_it_drives_and_take_it_again() -> None:
-    world = World("r1")
-    async with world.robot.control("ann@here"):
-        await world.robot.stop()
-    async with world.robot.control("ann@here") as drive:
-        await drive(forward=0.5)
-    assert len(world.gateway.driven) == 1
+    assert await world.fleet.stop(names) == dict.fromkeys(stopped)
+    assert world.stopped == stopped
 
 
 async def test_several_robots_are_driven_at_once() -> None:
     world = World("r1", "r2")
     async with world.fleet["r1"].control("ann@here") as one, world.fleet["r2"].control("ann@here") as two:
-        assert tokens(world.bus, "r1") == tokens(world.bus, "r2") == ["operator.ann%40here.program"]
+        assert tokens(world.bus, "r1") == tokens(world.bus, "r2") == ["operator.ann%40here.mine"]
         await asyncio.gather(one.during(1.0, forward=0.5), two.during(1.0, turn=0.5))
-        with pytest.raises(Held):
-            await Fleet(world.bus.join("bob"))["r1"].control("bob@there").__aenter__()
         assert one.loss is None
         await world.fleet["r1"].stop()
         await asyncio.wait_for(one.lost.wait(), 0.1)
         assert two.loss is None
-    await settle()
     assert len(world.gateways["r1"].driven) == len(world.gateways["r2"].driven)

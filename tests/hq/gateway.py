@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any
 
 from tests.proofs import numbered
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import Handle, IncomingQuery, Sample
+from zbridge.bus.interface import IncomingQuery, Sample
 from zbridge.control.authority import Authority
 from zbridge.control.proof import read
 from zbridge.errors import Refused
@@ -19,17 +19,13 @@ from zbridge.hq.intent import LEASE_S
 KEYS = KeySpace("fleet", "r1")
 
 
-class Clock(Protocol):
-    """A scene that says what time it is."""
-
-    @property
-    def now(self) -> float: ...
-
-
 class Gateway:
-    """The robot's end of the bus: the lease as it is, and every command with what became of it."""
+    """The robot's end of the bus: the lease as it is, and every command with what became of it.
 
-    def __init__(self, bus: FakeBus, scene: Clock) -> None:
+    scene: ``scene.now`` is the time.
+    """
+
+    def __init__(self, bus: FakeBus, scene: Any) -> None:
         self.bus = bus
         self.scene = scene
         self.authority = Authority(LEASE_S, 2.0, numbered())
@@ -39,17 +35,9 @@ class Gateway:
         self.requests: list[Acquire] = []
         self.control = bus.publisher(KEYS.key("control"), topics.CONTROL)
         bus.subscribe(KEYS.key("@cmd/**"), self._take)
-        self.serving: list[Handle] = []
-        self.serve()
+        for name in ("acquire/*", "renew", "release"):
+            bus.answer(KEYS.key(f"@rpc/control/{name}"), self._decide)
         bus.watch_alive(KEYS.alive("*"), self._on_alive)
-
-    def serve(self) -> None:
-        rpc = ("acquire/*", "takeover/*", "renew", "release")
-        self.serving = [self.bus.answer(KEYS.key(f"@rpc/control/{name}"), self._decide) for name in rpc]
-
-    def vanish(self) -> None:
-        for handle in self.serving:
-            handle.close()
 
     def _decide(self, question: IncomingQuery) -> None:
         what, _, name = KEYS.path(question.key).removeprefix("@rpc/control/").partition("/")
@@ -79,8 +67,7 @@ class Gateway:
                     self.authority.applied(topic.path, self.scene.now, moving=moving)
             except Refused as refusal:
                 self.refused.append(str(refusal))
-                command = topic.path.removeprefix("@cmd/")
-                self.authority.refuse(command, refusal, refusal.who or who)
+                self.authority.refuse(topic.path.removeprefix("@cmd/"), refusal, refusal.who or who)
                 return
         else:
             assert sample.attachment is None

@@ -10,6 +10,7 @@ import contextlib
 import ipaddress
 from collections.abc import AsyncIterator, Callable
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -18,15 +19,16 @@ from zbridge.bus.fake import FakeBus
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
+from zbridge.fleet.messages import Acquire, Drive, FleetMessage, Map, Pose, Query, Scan, Status, Stop, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
+from zbridge.hq import listener as listeners
 from zbridge.hq.listener import Listener
 from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import HqSettings, ListenerPlan
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import ATTEND_S, HqSide, Protocol, RobotUser, Send, Telemetry
+from zbridge.protocol.plugin import HqSide, Protocol, Send, Telemetry
 from zbridge.protocol.session import Limits, Role, Session, State
 from zbridge.protocol.session_table import ClientIds, SessionTable
 from zbridge.transport.fake import FakeLink
@@ -50,7 +52,7 @@ class ToySession(Session[bytes]):
     role = Role.ROBOT
     frame_end = staticmethod(frame_end)
     scans = False
-    said_at = half_at = 0.0
+    said_at = 0.0
 
     def encode(self, message: bytes) -> bytes:
         return framed(message)
@@ -78,7 +80,6 @@ class ToySide(HqSide):
     deadman_s = 1.25
     follows = ("pose", "text", "lidar")
     quiet_s = 0.0
-    hold = False
 
     def __init__(self, options: Any, view: RobotView, metrics: Metrics) -> None:
         self.view = view
@@ -87,13 +88,6 @@ class ToySide(HqSide):
 
     def numbers(self, clients: int) -> ClientIds:
         return ClientIds(range(2, 256), self.quiet_s)
-
-    def attend(self, client: RobotUser) -> None:
-        if self.hold:
-            if client.silent_s > self.deadman_s - ATTEND_S:
-                client.let_go("the connection is silent")
-            else:
-                client.repeat()
 
     def session(self, number: int, bounds: Limits) -> ToySession:
         self.made = [session for session in self.made if not session.over]
@@ -185,17 +179,29 @@ class Program:
         written, self.link.written = self.link.written, []
         return [frame[1:] for frame in written]
 
+    async def said(self, *messages: bytes) -> list[bytes]:
+        """Say that, let it be done, and return what was heard since the last call."""
+        self.say(*messages)
+        await soon()
+        return self.heard()
+
     def leave(self) -> None:
         if not self.link.closed:
             self.link.closed = True
             self.receiver.lost("closed by peer")
 
-    def take_nothing(self) -> None:
+    def hears(self, text: str) -> None:
+        assert (b", ".join(self.heard()).decode() or NOTHING) == text
+
+    def stalls(self) -> None:
         self.link.ready = False
 
-    def take_all(self) -> None:
+    def takes(self) -> None:
         self.link.ready = True
         self.receiver.writable()
+
+    def is_(self, state: str) -> None:
+        assert self.link.closed is (state == "closed"), state
 
 
 class Scene:
@@ -208,7 +214,7 @@ class Scene:
         self.loop = asyncio.get_running_loop()
         self.skipped_s = 0.0
         self.bus = FakeBus("hq")
-        self.gateway = Gateway(self.bus.join("gw"), self)  # type: ignore[arg-type]
+        self.gateway = Gateway(self.bus.join("gw"), self)
         self.status = self.gateway.bus.publisher(KEYS.key("status"), topics.STATUS)
         self.token = None
         if robot:
@@ -217,25 +223,14 @@ class Scene:
         self.manager = SessionTable()
         self.robot = RobotSubscription(self.bus, KEYS, self.metrics)
         self.robot.open()
-        protocol = Protocol(
-            name="toy",
-            summary="",
-            options=HqSettings,
-            links=1,
-            robot=None,  # type: ignore[arg-type]
-            simulate=None,  # type: ignore[arg-type]
-            hq=self._side,
-        )
-        plan = ListenerPlan(
-            protocol,
-            None,
-            Address("127.0.0.1", 0),
-            HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings),
-            tuple(map(ipaddress.ip_network, allow)),
-        )
+        limits = HqSettings(protocol="toy", listen="tcp://127.0.0.1:0", **settings)
+        networks = tuple(map(ipaddress.ip_network, allow))
+        protocol = Protocol("toy", "", HqSettings, 1, robot=None, simulate=None, hq=self._side)  # type: ignore[arg-type]
+        plan = ListenerPlan(protocol, None, Address("127.0.0.1", 0), limits, networks)
         self.accept: Callable[[], Receiver]
         self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now)
         self.hosts = 0
+        self.programs: dict[str, Program] = {}
 
     def _side(self, options: Any, view: RobotView, metrics: Metrics) -> ToySide:
         self.side = self.side_class(options, view, metrics)
@@ -250,45 +245,136 @@ class Scene:
         self.status.put(payloads.encode(STATUS))
         self.token = self.gateway.bus.announce(KEYS.alive("gateway"))
 
-    def go(self) -> None:
-        """Let the robot's gateway be gone."""
-        assert self.token is not None
-        self.token.close()
-
     def say(self, topic: Topic, message: FleetMessage) -> None:
         self.gateway.bus.publisher(KEYS.key(topic.path), topic).put(payloads.encode(message))
 
-    def report(self) -> None:
-        self.gateway.control.put(payloads.encode(self.gateway.report()))
+    def pose(self, x: float) -> None:
+        """Let the robot be at ``x``."""
+        self.say(topics.POSE, Pose(x=x, y=0.0, heading=0.0))
 
     def connect(self, host: str = "10.0.0.1") -> Program:
         self.hosts += 1
         return Program(self.accept(), f"tcp://{host}:{5000 + self.hosts}")
 
-    async def driver(self) -> Program:
-        """Connect a program that drives."""
-        program = self.connect().greeted()
-        program.say(b"stand", b"go")
-        await soon()
-        return program
+    def greeted(self, count: int) -> list[Program]:
+        """Connect so many programs that have shaken hands."""
+        return [self.connect().greeted() for _ in range(count)]
+
+    def driven(self) -> list[float]:
+        """The speeds that were commanded since the last call."""
+        taken = (message for _, message in self.gateway.taken())
+        return [message.forward for message in taken if isinstance(message, Drive) and message.moving]
 
     def count(self, name: str) -> int:
         return self.metrics.total(name)
 
-    def reason(self, name: str) -> str | None:
-        """Why a session ended, or nothing while it lives."""
-        return next(shown.reason for shown in self.manager.snapshots() if shown.name == name)
+    def robot_is(self, what: str) -> None:
+        if what == "there":
+            self.come()
+        elif what == "gone":
+            assert self.token is not None
+            self.token.close()
+        else:
+            state, _, reason = what.partition(" ")
+            self.say(topics.STATUS, Status(state=state, reason=reason or None, protocol="toy"))  # type: ignore[arg-type]
+
+    def show(self) -> None:
+        """Let the gateway say how things stand."""
+        self.gateway.control.put(payloads.encode(self.gateway.report()))
+
+    def skip(self, seconds: float) -> None:
+        self.skipped_s += seconds
+
+    def ended(self, text: str) -> None:
+        name, _, reason = text.partition(" ")
+        assert next(shown.reason for shown in self.manager.snapshots() if shown.name == name) == reason
+
+    async def play(self, script: str) -> None:
+        """Play the steps of a script, one after the other, separated by semicolons; each takes a millisecond.
+
+        A program is a letter: ``a connects``, ``a greets`` (shakes hands too), ``a drives``, or see ``SAYS``. Other
+        steps are in ``STEPS``, and looks, ``holder hq.toy.2``, in ``LOOKS``.
+        """
+        for step in script.split("; "):
+            word, _, rest = step.partition(" ")
+            if len(word) == 1:
+                verb, _, rest = rest.partition(" ")
+                if verb in ("connects", "greets", "drives"):
+                    self.programs[word] = self.connect() if verb == "connects" else self.connect().greeted()
+                    self.programs[word].say(*[b"stand", b"go"] * (verb == "drives"))
+                else:
+                    SAYS[verb](self.programs[word], rest)
+            elif word in LOOKS:
+                assert LOOKS[word](self) == rest, step
+            elif word == "wait":
+                await asyncio.sleep(float(rest))
+            else:
+                STEPS[word](self, rest)
+            await soon()
 
 
-SCENES: list[list[Scene]] = []
+NOTHING = "nothing"
+SCAN = Scan(0.0, 0.1, 0.1, 10.0, np.ones(3, np.float32))
+OPERATOR = Acquire(who="operator")
+
+
+def spelled(*values: object) -> str:
+    return " ".join(map(str, values)) or NOTHING
+
+
+SAYS: dict[str, Callable[[Program, str], object]] = {
+    "says": lambda program, text: program.say(*text.encode().split(b", ")),
+    "garbles": lambda program, text: program.receiver.received(framed(text.encode()) + b"\xff rubbish"),
+    "hears": Program.hears,  # since the last look
+    "leaves": lambda program, _: program.leave(),
+    "stalls": lambda program, _: program.stalls(),
+    "takes": lambda program, _: program.takes(),
+    "owes": lambda program, seconds: setattr(program.link, "silent_s", float(seconds)),  # an acknowledgement
+    "is": Program.is_,  # open or closed
+}
+STEPS: dict[str, Callable[[Scene, str], object]] = {
+    "robot": Scene.robot_is,  # there, gone, or its state and the reason
+    "at": lambda scene, x: scene.pose(float(x)),
+    "text": lambda scene, text: scene.say(topics.TEXT, Text(text=text)),
+    "scan": lambda scene, _: scene.say(topics.SCAN, SCAN),
+    "frozen": lambda scene, seconds: scene.skip(float(seconds)),
+    "operator-drives": lambda scene, _: scene.gateway.authority.acquire(OPERATOR, scene.now),
+    "operator-takes-over": lambda scene, _: scene.gateway.authority.takeover(OPERATOR, scene.now),
+    "gateway-refuses": lambda scene, why: scene.gateway.authority.hold_back(why),  # motion, until neutral is said
+    "gateway-forgets": lambda scene, _: scene.gateway.authority.stop("a new gateway knows of no lease"),
+    "shown": lambda scene, _: scene.show(),
+    "forget": lambda scene, _: scene.driven(),
+    "ended": Scene.ended,  # a session, and why
+}
+COUNTS = ("accepted", "turned_away", "dropped", "left_out", "commands", "refused", "malformed")
+LOOKS: dict[str, Callable[[Scene], str]] = {
+    "clients": lambda scene: spelled(*sorted(scene.listener.clients)),
+    "holder": lambda scene: scene.gateway.report().holder or NOTHING,
+    "state": lambda scene: scene.gateway.report().state,
+    "driven": lambda scene: spelled(*scene.driven()),
+    "asked": lambda scene: spelled(*scene.gateway.asked),
+    "stops": lambda scene: spelled(len(scene.bus.values("fleet/r1/@cmd/stop"))),
+    "encoded": lambda scene: spelled(scene.side.encoded),
+    "tokens": lambda scene: spelled(*(key.removeprefix(KEYS.alive("")) for key in scene.bus._shared.tokens)),
+    "active": lambda scene: spelled(*(client.number for client in scene.listener._active)),
+    **{what: lambda scene, name=f"hq_{what}": spelled(scene.count(name)) for what in COUNTS},
+    "sessions": lambda scene: spelled(*(client.session.state.value for client in scene.listener.clients.values())),
+}
 
 
 @contextlib.asynccontextmanager
 async def serving(**settings: Any) -> AsyncIterator[Scene]:
+    """Run a listener whose links are accepted by hand."""
     scene = Scene(**settings)
-    SCENES[-1].append(scene)
-    task = scene.loop.create_task(scene.listener.run())
-    await asyncio.wait_for(scene.listener.ready.wait(), 1.0)
+
+    @contextlib.asynccontextmanager
+    async def listen(address: Address, receiver: Callable[[], Receiver], **kwargs: Any) -> AsyncIterator[Address]:
+        scene.accept = receiver
+        yield Address(address.host, 11002)
+
+    with mock.patch.object(listeners, "listen", listen):
+        task = scene.loop.create_task(scene.listener.run())
+        await asyncio.wait_for(scene.listener.ready.wait(), 1.0)
     try:
         yield scene
         assert not task.done(), task
@@ -296,6 +382,14 @@ async def serving(**settings: Any) -> AsyncIterator[Scene]:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+
+
+async def play(special: str, script: str) -> None:
+    """Play a script with a listener whose settings are special: ``rate_hz=50 side=HalfSide``."""
+    sides = {side.__name__: side for side in ToySide.__subclasses__()}
+    settings = dict(pair.split("=") for pair in special.split())
+    async with serving(**{name: sides.get(value) or float(value) for name, value in settings.items()}) as scene:
+        await scene.play(script)
 
 
 async def soon() -> None:

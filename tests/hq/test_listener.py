@@ -10,9 +10,8 @@ import weakref
 
 import pytest
 
-from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, serving, soon
-from zbridge.fleet import topics
-from zbridge.fleet.messages import Pose, Text
+from tests.hq.scene import KEYS, Program, Scene, ToySession, ToySide, play, serving, soon
+from tests.hq.scripts import scripts
 from zbridge.protocol.address import Address
 from zbridge.protocol.session import Limits
 
@@ -23,80 +22,68 @@ class RestingSide(ToySide):
     quiet_s = 2.0
 
 
+class SessionlessSide(ToySide):
+    def session(self, number: int, bounds: Limits) -> ToySession:
+        raise KeyError(self.view.protocol)
+
+
 # Coming and going
 
 
-async def test_a_client_shakes_hands_and_is_shown_the_robot(scene: Scene) -> None:
+COMING = """
+a client shakes hands and is shown the robot until it goes
+    a connects; a hears who are you; at 1; a hears nothing; a says hi; a hears welcome; at 2; a hears at 2
+    sessions established; a leaves; ended toy.2 closed by peer; clients nothing
+a listener may be told to serve fewer, and a number that rests takes no client's place [clients=1 side=RestingSide]
+    a greets; b connects; b is closed; a leaves; c connects; c is open; d connects; d is closed
+a number rests after its client left, unless it was never used [side=RestingSide]
+    a connects; a leaves; b greets; b leaves; c connects; clients 3; wait 2; d connects; clients 2 3
+a client for which there is no session is turned away and uses up no number [side=SessionlessSide clients=1]
+    a connects; a is closed; b connects; b is closed; accepted 0; turned_away 2; clients nothing
+"""
+
+
+@scripts(COMING)
+async def test_a_client(special: str, script: str) -> None:
+    await play(special, script)
+
+
+async def test_a_session_is_shown_in_the_table(scene: Scene) -> None:
     assert scene.listener.address == Address("127.0.0.1", 11002)
-    program = scene.connect()
-    assert program.heard() == [b"who are you"]
-    scene.say(topics.POSE, Pose(x=1.0, y=0.0, heading=0.0))
-    assert program.heard() == [], "nothing before the handshake"
-    program.say(b"hi")
-    assert program.heard() == [b"welcome"]
-    scene.say(topics.POSE, Pose(x=2.0, y=0.0, heading=0.0))
-    assert program.heard() == [b"at 2"]
-    (entry,) = scene.manager.snapshots()
-    assert (entry.name, entry.role, entry.state, entry.version) == ("toy.2", "robot", "established", "2.0")
-    assert entry.peer == program.link.peer
-
-
-async def test_clients_get_the_lowest_numbers_that_are_free(scene: Scene) -> None:
-    programs = [scene.connect() for _ in range(4)]
-    assert sorted(scene.listener.clients) == [2, 3, 4, 5]
-    programs[1].leave()
-    await soon()
-    scene.connect()
-    assert sorted(scene.listener.clients) == [2, 3, 4, 5]
-    assert scene.reason("toy.3") is None
-    assert scene.count("hq_accepted") == 5
+    (program,), (entry,) = scene.greeted(1), scene.manager.snapshots()
+    shown = (entry.name, entry.role, entry.state, entry.version, entry.peer)
+    assert shown == ("toy.2", "robot", "established", "2.0", program.link.peer)
 
 
 @pytest.mark.scene(accept_hz=1000)
-async def test_254_clients_are_served_and_the_255th_is_turned_away(scene: Scene) -> None:
-    programs = [scene.connect().greeted() for _ in range(254)]
+async def test_254_clients_are_served_and_the_255th_is_turned_away_until_one_leaves(scene: Scene) -> None:
+    programs = scene.greeted(254)
     assert sorted(scene.listener.clients) == list(range(2, 256))
     late = scene.connect()
-    assert late.link.closed
-    assert late.heard() == []
     late.say(b"hi", b"go")
-    assert late.heard() == []
+    assert (late.link.closed, late.heard()) == (True, [])
     assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (254, 1)
     await soon()
-    scene.say(topics.POSE, Pose(x=3.0, y=0.0, heading=0.0))
+    scene.pose(3.0)
     assert all(program.heard() == [b"at 3"] for program in programs)
     assert scene.side.encoded == 1
-    programs[76].leave()
+    programs[75].leave()
     await soon()
     assert scene.connect().heard() == [b"who are you"]
+    assert sorted(scene.listener.clients) == list(range(2, 256)), "it got the number that was free"
 
 
-@pytest.mark.scene(clients=2)
-async def test_a_listener_may_be_told_to_serve_fewer(scene: Scene) -> None:
-    programs = [scene.connect() for _ in range(3)]
-    assert [program.link.closed for program in programs] == [False, False, True]
+async def test_twenty_connections_a_second_of_one_address_are_let_in_unless_told_otherwise(scene: Scene) -> None:
+    programs = [scene.connect() for _ in range(25)]
+    assert [program.link.closed for program in programs] == [False] * 20 + [True] * 5
+    assert programs[24].heard() == []
+    assert not scene.connect("10.0.0.2").link.closed, "another address"
+    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (21, 5)
     programs[0].leave()
     await soon()
-    assert not scene.connect().link.closed
-
-
-@pytest.mark.scene(accept_hz=3.0)
-async def test_more_than_so_many_connections_a_second_of_one_address_are_closed_at_once(scene: Scene) -> None:
-    programs = [scene.connect() for _ in range(5)]
-    assert [program.link.closed for program in programs] == [False, False, False, True, True]
-    assert programs[4].heard() == []
-    assert not scene.connect("10.0.0.2").link.closed, "another address"
-    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (4, 2)
-    for program in programs[:3]:
-        program.leave()
-    await soon()
-    assert scene.connect().link.closed, "that they have left makes no room"
+    assert scene.connect().link.closed, "that one has left makes no room"
     await asyncio.sleep(1.0)
     assert not scene.connect().link.closed
-
-
-async def test_twenty_connections_a_second_are_let_in_unless_told_otherwise(scene: Scene) -> None:
-    assert [scene.connect().link.closed for _ in range(25)] == [False] * 20 + [True] * 5
 
 
 @pytest.mark.parametrize("accept_hz", [20.0, 1000.0])
@@ -105,8 +92,7 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
         async with serving(accept_hz=accept_hz, clients=10_000) as scene:
             caplog.clear()
             for _ in range(800):
-                program = scene.connect()
-                program.leave()
+                scene.connect().leave()
                 await asyncio.sleep(0.0025)
             scene.connect("10.0.0.9")
             await asyncio.sleep(2.0)
@@ -118,29 +104,6 @@ async def test_a_flood_of_connections_costs_a_few_lines_a_second(accept_hz, capl
     away = sum(int(count) for line in lines for count in re.findall(r"(\d+) more turned away", line))
     assert away + sum(" turned away (" in line for line in lines) == scene.count("hq_turned_away")
     assert any("tcp://10.0.0.9" in line and "connected as client" in line for line in lines), "others are told of"
-
-
-@pytest.mark.scene(side=RestingSide)
-async def test_a_number_rests_after_its_client_left(scene: Scene) -> None:
-    scene.connect().leave()
-    await soon()
-    scene.connect().greeted().leave()
-    await soon()
-    assert scene.count("hq_accepted") == 2, "the first was never used, and need not rest"
-    scene.connect()
-    assert sorted(scene.listener.clients) == [3]
-    await asyncio.sleep(2.0)
-    scene.connect()
-    assert sorted(scene.listener.clients) == [2, 3]
-
-
-@pytest.mark.scene(side=RestingSide, clients=1)
-async def test_numbers_that_rest_take_no_clients_place(scene: Scene) -> None:
-    """``clients`` is the most at a time: a program that is restarted at once finds its place free."""
-    scene.connect().leave()
-    await soon()
-    assert not scene.connect().link.closed
-    assert scene.connect().link.closed
 
 
 @pytest.mark.scene(accept_hz=1000)
@@ -177,12 +140,6 @@ async def test_many_clients_come_and_go_and_leave_nothing_behind(scene: Scene) -
     assert sum(session() is not None for session in sessions) <= 1, "the last one is a variable of a loop"
 
 
-async def test_the_table_says_why_a_client_went(scene: Scene) -> None:
-    scene.connect().leave()
-    await soon()
-    assert scene.reason("toy.2") == "closed by peer"
-
-
 # Who may come
 
 
@@ -195,37 +152,13 @@ async def test_the_table_says_why_a_client_went(scene: Scene) -> None:
     ],
 )  # fmt: skip
 @pytest.mark.scene(allow=("10.0.0.0/8", "192.168.1.7/32", "fd00::/8"))
-async def test_only_allowed_networks_are_let_in(scene: Scene, host: str, welcome: bool) -> None:
-    program = scene.connect(host)
-    assert program.link.closed is not welcome
+async def test_only_allowed_networks_are_let_in_and_who_is_turned_away_uses_up_no_number(scene, host, welcome) -> None:
+    assert scene.connect(host).link.closed is not welcome
     assert scene.count("hq_turned_away") == (not welcome)
-    assert len(scene.listener.clients) == welcome
-
-
-async def test_without_a_list_everybody_is_let_in(scene: Scene) -> None:
-    assert not any(scene.connect(host).link.closed for host in ("10.1.2.3", "127.0.0.1", "[fe80::1%eth0]"))
-
-
-@pytest.mark.scene(allow=("10.0.0.0/8",))
-async def test_a_client_that_is_turned_away_uses_up_no_number(scene: Scene) -> None:
-    for _ in range(300):
-        scene.connect("11.0.0.1")
+    assert list(scene.listener.clients) == [2] * welcome
     await soon()
-    scene.connect()
-    assert sorted(scene.listener.clients) == [2]
-
-
-class SessionlessSide(ToySide):
-    def session(self, number: int, bounds: Limits) -> ToySession:
-        raise KeyError(self.view.protocol)
-
-
-@pytest.mark.scene(side=SessionlessSide)
-async def test_a_client_for_which_there_is_no_session_is_turned_away(scene: Scene) -> None:
-    for _ in range(5):
-        assert scene.connect().link.closed
-    assert (scene.count("hq_accepted"), scene.count("hq_turned_away")) == (0, 5)
-    assert repr(scene.listener._numbers) == "<ClientIds 0 of 254 taken>"
+    scene.connect("10.9.9.9")
+    assert len(scene.listener.clients) == max(scene.listener.clients) - 1
 
 
 # The end
@@ -233,33 +166,15 @@ async def test_a_client_for_which_there_is_no_session_is_turned_away(scene: Scen
 
 async def test_an_ending_listener_takes_leave_of_all_and_gives_the_robot_back() -> None:
     async with serving() as scene:
-        driver, idle, early = scene.connect().greeted(), scene.connect().greeted(), scene.connect()
-        driver.say(b"stand", b"go")
-        await soon()
-        assert scene.gateway.report().holder == "hq.toy.2"
-        listener = scene.listener
-    assert all(program.link.closed for program in (driver, idle, early))
+        await scene.play("a drives; b greets; c connects; holder hq.toy.2; b stalls; text last words")
+        start = scene.loop.time()
+    assert scene.loop.time() - start <= 1.0, "it does not wait long for a client that takes nothing"
+    assert all(program.link.closed for program in scene.programs.values())
     assert {shown.reason for shown in scene.manager.snapshots()} == {"gateway stopped"}
     assert scene.gateway.report().state == "free"
     assert scene.bus._shared.tokens == [KEYS.alive("gateway")]
     await soon()
-    assert listener.clients == {}
+    assert scene.listener.clients == {}
     assert len(asyncio.all_tasks()) == 1
     late = Program(scene.accept(), "tcp://10.0.0.1:1")
     assert late.link.closed
-
-
-async def test_an_ending_listener_does_not_wait_long_for_a_client_that_takes_nothing() -> None:
-    async with serving() as scene:
-        program = scene.connect().greeted()
-        program.take_nothing()
-        scene.say(topics.TEXT, Text(text="last words"))
-        start = scene.loop.time()
-    assert scene.loop.time() - start <= 1.0
-    assert program.link.closed
-
-
-async def test_a_listener_and_its_clients_print_themselves(scene: Scene) -> None:
-    scene.connect()
-    assert repr(scene.listener) == "<Listener toy tcp://127.0.0.1:11002, 1 clients>"
-    assert repr(scene.listener.clients[2]) == "<Client 2 <ToySession toy.2 handshaking>>"

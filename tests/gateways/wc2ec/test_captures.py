@@ -1,14 +1,11 @@
-"""The recorded session of the field through the sessions of both roles, each segment at its time, and on to the fleet.
+"""The recorded session of the field, each segment at its time, on to the fleet; ``test_hq`` goes on to a controller.
 
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from gateways.wc2ec.messages import RegisterSensor, SensorData
-from gateways.wc2ec.session import ControllerRole, ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
-from tests.captures import payloads, stream
-from tests.gateways.wc2ec.golden import DEPLOYED, NODE_TYPES
+from tests.captures import payloads
 from zbridge.fleet.messages import Device, Devices, Reading
 from zbridge.metrics import Metrics
 from zbridge.protocol.session import State
@@ -22,23 +19,7 @@ RECORDED = (
     Device("slider_curb_lf2", 5, "linear"),
     *(Device(name, 6 + at, "distance") for at, name in enumerate(SENSORS)),
 )
-REGISTRATIONS = [RegisterSensor(NODE_TYPES[each.kind], each.number, each.name.encode()) for each in RECORDED]
 VALUES = {6: 1000.0, 7: 750.5, 8: 123.456, 9: 0.0, 10: -1.0, 11: 0.001}
-READINGS = [SensorData(37, number, value) for number, value in VALUES.items()] * 20 + [SensorData(37, 6, 1000.0)]
-
-
-def test_what_is_read_as_external_controller_is_written_as_controller_to_the_same_bytes() -> None:
-    reader, writer, written = ExternalRole(DEPLOYED), ControllerRole(DEPLOYED), b""
-    reader.open(0.0)
-    writer.open(0.0)
-    recorded = stream(NAME, source=PORT)
-    messages = reader.receive(recorded, 0.0)
-    assert messages == [*REGISTRATIONS, *READINGS]
-    for message in messages:
-        writer.send(message)
-        written += writer.outgoing(0.0) or b""
-    assert written == recorded
-    assert stream(NAME, destination=PORT) == b"", "the recorded external controller sent nothing"
 
 
 def test_the_recorded_devices_are_the_device_table_and_their_readings_on_the_keys_of_their_names() -> None:

@@ -39,7 +39,6 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol.plugin import Telemetry
 from zbridge.protocol.session import Role, State
 
 NAN, INF = math.nan, math.inf
@@ -155,10 +154,6 @@ class Scene(HqScene):
             return "refused"
         return " ".join(f"{topic.path.removeprefix('@cmd/')} {command.value:g}" for topic, command in said)  # type: ignore[attr-defined]
 
-    def means(self, data: bytes, client: int = 0) -> list[Telemetry]:
-        """What comes of bytes of a client when nothing follows."""
-        return [*self.says(data, client), *self.side.expire(self.clients[client], 1.0)]
-
 
 READY = "table CAR; is wc2ec; client; 0: CAR 7=-1"
 REAR_AND_X = "table CAR rear/9/distance x/10/type90; is wc2ec"
@@ -227,6 +222,14 @@ SHOWN = {
     "readings of a robot of another protocol are distance sensors, and no sectors are": """
         is tcpudp; reads battery 12.5; client; 0: battery/0/37 left/1/53 right/2/53 0=12.5
         reads battery 12.25; 0: 0=12.25""",
+    "the type byte is that of the kind, where it is known": f"""{READY}
+        table a/9/type255 b/10/type256 c/11/light d/12/type e/13/type²; reads b/10 2; reads c/11 2
+        0: a/9/255 b/10/37 c/11/37 d/12/37 e/13/37 9=0 10=2 11=2 12=0 13=0""",
+    "a number beyond 254 is replaced while there is a free one": f"""{READY}
+        table a/255/distance b/-1/distance; 0: a/2/37 b/3/37 2=-1 3=-1""",
+    "a name that a registration cannot hold is left out": f"""{READY}
+        table {"n" * 255}/9/distance {"n" * 256}/10/distance {"ü" * 128}/11/distance /12/distance
+        0: {"n" * 255}/9/37 9=-1""",
     "a motor is set by its name, never by the type alone": f"""{READY}
         0 sets 1 2.5 > motor/fr 2.5; 0 sets 4 -0.125 > motor/lift -0.125; 0:""",
     "what is no motor or no number is refused, and the next is taken": f"""{READY}
@@ -267,37 +270,11 @@ def test_sectors_are_counted_counter_clockwise_from_straight_ahead_and_free_as_f
     scene.play("0: EIGHT=-1")
 
 
-@pytest.mark.parametrize(
-    ("device", "shown"),
-    [
-        (Device("x", 9, "distance"), (37, 9, b"x")),
-        (Device("x", 9, "type255"), (255, 9, b"x")),
-        # a kind whose type byte is not known
-        *((Device("x", 9, kind), (37, 9, b"x")) for kind in ("type256", "light", "type", "type²")),
-        # a number beyond 254 is replaced while there is a free one
-        *((Device("x", number, "distance"), (37, 2, b"x")) for number in (255, -1)),
-        # names whose bytes are not UTF-8 are shown escaped, and reach controllers as the robot has them
-        (Device("caf\\xe9", 9, "distance"), (37, 9, b"caf\xe9")),
-        (Device("gr\u00fcn", 9, "distance"), (37, 9, b"gr\xc3\xbcn")),
-        # a name that a registration cannot hold
-        (Device("n" * 255, 9, "distance"), (37, 9, b"n" * 255)),
-        *((Device(name, 9, "distance"), None) for name in ("n" * 256, "ü" * 128, "")),
-    ],
-)
-def test_a_device_has_the_type_byte_of_its_kind_a_number_that_fits_and_a_name_that_fits(device, shown) -> None:
-    scene = Scene(READY)
-    scene.tell(topics.DEVICES, Devices((device,)))
-    if shown is None:
-        assert scene.told() == b""
-    else:
-        kind, number, _ = shown
-        assert scene.told() == registration(*shown) + data(number, -1.0 if device.kind == "distance" else 0.0, kind)
-
-
-def test_a_name_that_is_not_utf_8_is_the_same_in_its_key() -> None:
-    scene = Scene("table caf\\xe9/0/distance r\\xe4der/1/rotational; is wc2ec; client")
+def test_a_name_that_is_not_utf_8_is_shown_escaped_and_reaches_a_controller_as_the_robot_has_it() -> None:
+    scene = Scene("table caf\\xe9/0/distance r\\xe4der/1/rotational gr\u00fcn/2/distance; is wc2ec; client")
     scene.tell(topics.SENSOR("caf\udce9"), Reading(1.0, "distance", 0))
-    assert scene.told() == registration(DISTANCE, 0, b"caf\xe9") + registration(ROTATIONAL, 1, b"r\xe4der") + data(0, 1)
+    registered = registration(DISTANCE, 0, b"caf\xe9") + registration(ROTATIONAL, 1, b"r\xe4der")
+    assert scene.told() == registered + registration(DISTANCE, 2, b"gr\xc3\xbcn") + data(0, 1.0) + data(2, -1.0)
     assert scene.sets(1, 3.0) == "motor/r%E4der 3"
 
 
@@ -344,40 +321,29 @@ def test_a_command_that_no_controller_of_the_field_sends_ends_its_session_and_no
     assert [client.state for client in scene.clients] == [State.CLOSED, State.ESTABLISHED]
 
 
+OTHER = Wheels(wheel_radius_m=0.1, track_m=0.5, speed_full_m_s=2.0, turn_full_rad_s=4.0)
+
+
 @pytest.mark.parametrize(
-    ("left", "right", "forward", "turn"),
+    ("wheels", "left", "right", "forward", "turn"),
     [
-        (-5.0, -5.0, -0.5, 0.0),
-        (-3.0, 3.0, 0.0, 1.0),
-        (3.5, 6.5, 0.5, 0.5),
-        (0.0, 3.0, 0.15, 0.5),
-        (8.0, 16.0, 0.9, 1.0),
-        (1e9, -1e9, 0.0, -1.0),
-        (0.0, 0.0, 0.0, 0.0),
+        # wheels of 5 cm, 30 cm apart; full scale is 0.5 m/s and 1 rad/s
+        (Wheels(), -3.0, 3.0, 0.0, 1.0),
+        (Wheels(), 3.5, 6.5, 0.5, 0.5),
+        (Wheels(), 8.0, 16.0, 0.9, 1.0),  # 1.2 and 4/3: too fast keeps the curve
+        (Wheels(), 1e9, -1e9, 0.0, -1.0),
+        (Wheels(), 0.0, 0.0, 0.0, 0.0),
+        (OTHER, 5.0, 15.0, 0.5, 0.5),
     ],
 )
-def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(left, right, forward, turn) -> None:
-    """Wheels of 5 cm, 30 cm apart; full scale is 0.5 m/s and 1 rad/s. Too fast keeps the curve: 1.2, 4/3 is 0.9, 1."""
-    scene = Scene("is tcpudp; client")
-    *neutral, (topic, command) = scene.means(set_value(0, left) + set_value(1, right))
+def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(wheels, left, right, forward, turn) -> None:
+    scene = Scene("is tcpudp; client; client", wheels=wheels)
+    scene.says(GO_RIGHT, client=1)  # every controller has wheels of its own
+    *neutral, (topic, command) = scene.says(set_value(0, left) + set_value(1, right))
     assert topic is topics.CMD_DRIVE
     assert neutral == ([(topic, Drive())] if left == 0.0 else []), "while all stand each is one: a stop never waits"
     assert isinstance(command, Drive)
-    assert (command.forward, command.turn) == pytest.approx((forward, turn), abs=1e-12)
-    assert (command.left, command.light) == (0.0, None)
-
-
-def test_the_wheels_of_the_kinematics_are_settings_and_every_controller_has_its_own() -> None:
-    wheels = Wheels(wheel_radius_m=0.1, track_m=0.5, speed_full_m_s=2.0, turn_full_rad_s=4.0)
-    scene = Scene("is alf; client; client", wheels=wheels)
-    scene.says(set_value(0, 9.0), client=0)
-    for client, said, drive in (
-        (1, set_value(0, 5.0) + set_value(1, 15.0), (0.5, 0.5)),
-        (0, set_value(1, 9.0), (0.45, 0.0)),
-    ):
-        ((_, command),) = scene.says(said, client=client)
-        assert isinstance(command, Drive)
-        assert (command.forward, command.turn) == pytest.approx(drive)
+    assert (command.forward, command.left, command.turn) == pytest.approx((forward, 0.0, turn), abs=1e-12)
 
 
 GO_LEFT, GO_RIGHT = set_value(0, 10.0), set_value(1, 10.0)

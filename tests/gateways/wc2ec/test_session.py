@@ -86,13 +86,9 @@ LIGHT = bytes.fromhex("00 00 03 000000000000d03f")
 @pytest.mark.parametrize(
     ("make", "dialect", "first", "bad"),
     [
-        (external, DEPLOYED, [WHEEL, READING], "7e 25 06 0011"),
         (external, DEPLOYED, [WHEEL, READING], "82 35 00 000000000000f83f"),
         (external, DEPLOYED, [WHEEL], "ff 25 06"),
-        (external, DEPLOYED, [], "80 00 00"),
-        (external, DRAFT, [], "01 00 03 0000"),
         (external, DRAFT, [LIGHT], "7f 00 03"),
-        (controller, DEPLOYED, [], "80 00 01"),
         (controller, DEPLOYED, [], "01 25 06 0000000000748740"),
         (controller, DRAFT, [], "84 00 00"),
     ],

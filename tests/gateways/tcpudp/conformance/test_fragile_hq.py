@@ -4,9 +4,6 @@ import asyncio
 import contextlib
 import logging
 import socket
-import struct
-import threading
-import time
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -15,30 +12,22 @@ import pytest
 from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes, simulate_fragile_hq
 from gateways.tcpudp.conformance.parser import Feature
 from tests import captures
-from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
+from tests.conformance.scene import Listening, calling, until
 from tests.conformance.script_table import table
+from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
+from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 
-GAP_S = 0.015
 QUICK = HqTimes(probe_s=0.1)
 VERSIONS = ("1.1", "1.2", "1.3")
 CELLS = "00010200" * 100
-NAMES = {
-    "START": "02000000 01 04",
-    "RECEIVED": "03000000 01 06 01",
-    "NOT_RECEIVED": "03000000 01 06 00",
-    "PROBE": "02000000 07 05",
-    "CONNECTED": "03000000 07 07 01",
-    "NOT_CONNECTED": "03000000 07 07 00",
+NAMES = SHARED | {
     "TEXT": "08000000 01 01 02000000 6869",
     "LIDAR_OFF": "06000000 01 33 02000000",
     "POSITION": "0e000000 01 37 0000c03f 000010c0 0000b442",
     "NO_MAP": "06000000 01 35 00000000",
     "MAP": "96010000 01 35 90010000" + CELLS,
     "GET_SCAN": "02000000 01 3c",
-    "IDLE": "02000000 07 0d",
-    "FORWARD": "0e000000 07 0b 00000000 0000803f 0000803f",
     "TURN": "06000000 07 0c 000040bf",
-    "LIST_13": "0b000000 312e312c312e322c312e33",
     "SETTINGS_1.1": "0f000000 01 02 07 03000000 312e31 0001010101",
     "SETTINGS_1.1_UDP": "0f000000 01 02 07 03000000 312e31 0101010101",
     "SETTINGS_1.2": "10000000 01 02 07 03000000 312e32 000101010101",
@@ -60,37 +49,23 @@ class Sockets(Listening):
         self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.udp.setblocking(False)
         self.udp.bind(("127.0.0.1", self.port))
-        self.source = ("127.0.0.1", 9)
 
     def close(self) -> None:
         super().close()
         self.udp.close()
 
 
-class Robot(Scene):
+class Robot(UdpScene):
     """The few habits of a robot that behaves."""
 
     names = NAMES
-    gap_s = GAP_S
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.udp = self.peer.udp
 
     async def accept(self, _: str) -> None:
         await self.peer.accept()
-
-    async def by_udp(self, text: str) -> None:
-        self.peer.udp.sendto(self.raw(text), self.peer.source)
-        await asyncio.sleep(GAP_S)
-
-    async def kind(self, kind: str) -> None:
-        head = await self.peer.read(4)
-        assert (await self.peer.read(struct.unpack("<i", head)[0]))[1] == int(kind)
-
-    async def datagram(self) -> bytes:
-        async with asyncio.timeout(LONG_S):
-            data, self.peer.source = await asyncio.get_running_loop().sock_recvfrom(self.peer.udp, 65536)
-        return bytes(data)
-
-    async def expect_udp(self, text: str) -> None:
-        assert await self.datagram() == self.raw(text)
 
     async def greet(self, settings: str) -> None:
         """Speak first, and take the answer 3."""
@@ -273,8 +248,8 @@ async def test_it_dies_of(options: dict[str, Any], steps: list[str]) -> None:
     after a lost probe 1.1 goes on by TCP | 1.1 quick | probing 1.1; < NOT_CONNECTED; does move 0 1; < FORWARD
     after a lost probe 1.3 goes on by UDP | 1.3 quick | probing; < CONNECTED; does move 0 1; expect_udp FORWARD
     with UDP agreed, the stick goes by UDP and 13 by TCP | 1.1 | shake 1.1 udp; does move 0 1; does rotate -0.75
-        ; does idle; expect_udp FORWARD; expect_udp TURN; < IDLE
-    1.3 loses the stick where no 4 was sent | 1.3 | shake; established; does move 0 1; does idle; < IDLE
+        ; does idle; expect_udp FORWARD; expect_udp TURN; < STOP
+    1.3 loses the stick where no 4 was sent | 1.3 | shake; established; does move 0 1; does idle; < STOP
         ; ? lost: packet 11 by UDP, the robot never sent 4
     a square map needs no announced size | 1.1 | shake 1.1; > SMALL_MAP; map SMALL_MAP; ok
     a map of 60 kB passes by UDP | 1.2 | shake 1.2 udp; by_udp MAP_60K; map MAP_60K; ok
@@ -290,7 +265,7 @@ async def test_it_dies_of(options: dict[str, Any], steps: list[str]) -> None:
         ; ? a wrong map size 51201 with the interval 2560; > MAP; ok
     one that skips the map flag sees the size where it is left out | skips the map flag
         | greet 20000000 01 02 07 LIST_13 000101010101 c8000000 0a000000; > MAP; quiet
-    the stick is repeated from the moment on that the session is established | repeats | shake 1.1; < IDLE IDLE IDLE
+    the stick is repeated from the moment on that the session is established | repeats | shake 1.1; < STOP STOP STOP
         ; does rotate -0.75; until TURN; < TURN TURN
     a viewer sends nothing | 1.1 | shake 1.1; > POSITION; count 55 1; nothing
     no common version may be said before closing | 1.1 | greet SETTINGS_1.2_UDP; > TEXT; says hi; close; over; ok
@@ -349,7 +324,7 @@ async def test_datagrams_from_elsewhere_are_not_heard() -> None:
     async with facing(hq) as robot:
         await robot.shake("1.3 udp")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            other.sendto(robot.raw("POSITION"), robot.peer.source)
+            other.sendto(robot.raw("POSITION"), robot.address)
             await robot.happened("not from the robot")
         assert (hq.position, hq.violations) == (None, [])
 
@@ -359,24 +334,9 @@ async def test_it_binds_the_port_of_deployed_programs_if_it_is_free() -> None:
     async with facing(first) as robot, facing(second) as other:
         await robot.shake("1.3 udp")
         await other.shake("1.3 udp")
-        port = other.peer.source[1]
-        assert robot.peer.source[1] == 11000 or any("UDP port 11000 is taken" in event for event in first.events)
+        port = other.address[1]
+        assert robot.address[1] == 11000 or any("UDP port 11000 is taken" in event for event in first.events)
         assert any(f"UDP port 11000 is taken, {port} instead" in event for event in second.events)
-
-
-async def test_it_reads_though_the_event_loop_is_busy() -> None:
-    async with facing(program("1.1")) as robot:
-        await robot.play(["shake 1.1", "wait 0.015"])
-
-        def send_spaced() -> None:
-            for _ in range(5):
-                robot.peer.tcp.send(robot.raw("TEXT"))
-                time.sleep(GAP_S)
-
-        thread = threading.Thread(target=send_spaced)
-        thread.start()
-        thread.join()  # the loop does nothing meanwhile
-        await robot.play(["says hi hi hi hi hi", "ok"])
 
 
 async def test_every_packet_of_the_operator_is_that_of_the_page() -> None:
@@ -387,8 +347,8 @@ async def test_every_packet_of_the_operator_is_that_of_the_page() -> None:
             (lambda: hq.mode(2), "06000000 07 0a 02000000"),
             (lambda: hq.move(0.0, 1.0), "FORWARD"),
             (lambda: hq.rotate(-0.75), "TURN"),
-            (hq.idle, "IDLE"),
-            (hq.stop, "IDLE"),
+            (hq.idle, "STOP"),
+            (hq.stop, "STOP"),
             (lambda: hq.move_ai(b"\x09"), "03000000 07 15 09"),
             (lambda: hq.chat(b"\x01\x02"), "04000000 07 28 0102"),
             (lambda: hq.lidar(on=False), "06000000 07 32 02000000"),
@@ -401,30 +361,11 @@ async def test_every_packet_of_the_operator_is_that_of_the_page() -> None:
             await robot.expect(packet)
 
 
-async def test_a_robot_that_reads_nothing_is_hung_up_on() -> None:
-    hq = program("1.1")
-    async with facing(hq) as robot:
-        await robot.play(["shake 1.1", "established"])
-        while not any("hung up" in event for event in hq.events):
-            hq.chat(bytes(60000))
-        await robot.play(["over", "ok"])
-
-
-async def test_every_list_is_bounded_and_each_violation_is_told() -> None:
-    told_of: list[str] = []
-    hq = program("1.1", keep=2, note=told_of.append)
-    async with facing(hq) as robot:
-        await robot.play(["shake 1.1", *["> 08000000 09 01 02000000 6869"] * 4, "count 1 4"])
-        assert [len(kept) for kept in (hq.violations, hq.received, hq.texts)] == [2, 2, 2]
-        assert len(told_of) == 4
-    assert repr(hq) == "<FragileHq 1.1 ENDED violations=2 alive=True>"
-
-
 async def test_the_command_logs_violations_and_prints_the_death(caplog, capsys) -> None:
     sockets = Sockets()
     with caplog.at_level(logging.ERROR):
         task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", sockets.port, version="1.1", udp=False))
-        await Robot(None, sockets, task).play(["shake 1.1", "< IDLE", "> 02000000 01 3c", "over"])
+        await Robot(None, sockets, task).play(["shake 1.1", "< STOP", "> 02000000 01 3c", "over"])
     sockets.close()
     assert "violation: unknown packet id 60" in caplog.text
     assert capsys.readouterr().out.startswith("died: unknown packet id 60")

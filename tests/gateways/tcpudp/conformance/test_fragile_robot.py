@@ -14,11 +14,12 @@ import pytest
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss, simulate_fragile
 from gateways.tcpudp.conformance.parser import Feature, Times
 from tests import captures
-from tests.conformance.scene import LONG_S, Peer, Scene, serving, until
+from tests.conformance.scene import LONG_S, Peer, serving, until
 from tests.conformance.script_table import table
+from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
+from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 
 QUICK = Times(read_s=0.002, probe_s=0.3, silence_s=0.3, part_s=0.08, flight_s=0.1, unasked_s=0)
-GAP_S = 0.015
 CLIENT = 7
 VERSIONS = ("1.1", "1.2", "1.3", "1.4")
 HELLO = {
@@ -28,25 +29,16 @@ HELLO = {
     "1.4": "18000000 07 03 0b000000 312e312c312e322c312e33",
 }
 FLAGS = {"1.1": "00000000", "1.2": "00000000 01", "1.3": "00000000 01 00", "1.4": "00000000 01 00"}
-NAMES = {
-    "START": "02000000 01 04",
-    "PROBE": "02000000 07 05",
-    "RECEIVED": "03000000 01 06 01",
-    "LOST": "03000000 01 06 00",
-    "CONNECTED": "03000000 07 07 01",
-    "NOT_CONNECTED": "03000000 07 07 00",
+NAMES = SHARED | {
     "NO_MODE": "06000000 07 0a 01000000",
     "JOYSTICK_MODE": "06000000 07 0a 02000000",
     "AI_MODE": "06000000 07 0a 03000000",
-    "FORWARD": "0e000000 07 0b 00000000 0000803f 0000803f",
     "TURN": "06000000 07 0c 0000003f",
-    "STOP": "02000000 07 0d",
     "GET_POSITION": "02000000 07 36",
     "GET_MAP": "02000000 07 34",
     "LIDAR_ON": "06000000 07 32 01000000",
     "SCAN": "a6050000 07 3d 68010000" + "0000c842" * 360,
     "HELLO": HELLO["1.3"] + "00" + FLAGS["1.3"],
-    "LIST_13": "0b000000 312e312c312e322c312e33",
     "LONG_4096": "fc0f0000 07 28" + "00" * 4090,
     "LONG_4098": "fe0f0000 07 28" + "00" * 4092,
 }
@@ -56,20 +48,16 @@ def hello(version: str, udp: bool) -> str:
     return HELLO[version] + ("01" if udp else "00") + FLAGS[version]
 
 
-class Hq(Scene):
+class Hq(UdpScene):
     """Plain sockets and the few habits of an HQ that behaves."""
 
     names = NAMES
-    gap_s = GAP_S
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.udp.setblocking(False)
-
-    async def by_udp(self, text: str) -> None:
-        self.udp.sendto(self.raw(text), ("127.0.0.1", self.peer.port))
-        await asyncio.sleep(GAP_S)
+        self.address = ("127.0.0.1", self.peer.port)
 
     async def established(self, _: str) -> None:
         await until(lambda: "ESTABLISHED" in repr(self.judge), repr(self.judge))
@@ -83,21 +71,6 @@ class Hq(Scene):
         async with asyncio.timeout(LONG_S):
             while not self.judge.violations:
                 await self.play([step])
-
-    async def packet(self) -> bytes:
-        head: bytes = await self.peer.read(4)
-        return head + bytes(await self.peer.read(struct.unpack("<i", head)[0]))
-
-    async def kind(self, kind: str) -> None:
-        """Read a packet of this id."""
-        assert (await self.packet())[5] == int(kind)
-
-    async def datagram(self) -> bytes:
-        async with asyncio.timeout(LONG_S):
-            return await asyncio.get_running_loop().sock_recv(self.udp, 65536)
-
-    async def expect_udp(self, text: str) -> None:
-        assert await self.datagram() == self.raw(text)
 
     async def meet(self, _: str) -> None:
         """Connect, and take the settings."""
@@ -187,8 +160,8 @@ def judged(lines: str) -> pytest.MarkDecorator:
     a split packet, once, and the next packet is read | 1.3 | greet; > 060000; > 00 07; > 0a 02000000; > STOP
         ; !! a split packet, 3 bytes in one read: 06 00 00; took 3 13
     packets too near to each other | slow | greet; > STOP; > STOP; > STOP; ! packets in one read: 02 00 00 00 07 0d 02
-    packets over 4096 bytes, which are lost | 1.3 | greet; > LONG_4098; ! a packet of 4098 bytes, over 4096
-        ; > LONG_4096; !! over 4096; took 3 40
+    packets over 4096 bytes, which are lost | 1.3 | greet; > LONG_4098; ! a packet of 4098 bytes, over 4096; > LONG_4096
+        ; !! over 4096; took 3 40
     a length of 0 | 1.3 | greet; > 00000000 07 0d; !! no packet in one read, its length field is wrong: 00 00 00 00 07
     a wrong id byte | 1.3 | greet; > 06000000 08 0a 02000000; !! id byte 8 instead of 7
     a wrong mode | 1.3 | greet; > 06000000 07 0a 04000000; !! control mode 4
@@ -202,8 +175,8 @@ def judged(lines: str) -> pytest.MarkDecorator:
     a text cut off | 1.3 | greet; > 08000000 07 01 03000000 6869; !! a wrong byte count of the string
     a text that is not ASCII | 1.3 | greet; > 07000000 07 01 01000000 ff; !! a text that is not ASCII
     two probes | 1.3 udp | probed; by_udp PROBE; ! 2 probes 5 by UDP instead of one
-    no probe | 1.3 udp | probing; < LOST; ! no 5 by UDP within 0.3 s of the 4
-    a late probe | 1.3 udp | probing; < LOST; by_udp PROBE; ! the probe 5 came later than 0.3 s after the 4
+    no probe | 1.3 udp | probing; < NOT_RECEIVED; ! no 5 by UDP within 0.3 s of the 4
+    a late probe | 1.3 udp | probing; < NOT_RECEIVED; by_udp PROBE; ! the probe 5 came later than 0.3 s after the 4
     a missing status | 1.3 udp | probed; ! no 7 within 0.6 s of the 4
     a second status | 1.3 udp | greet 1.3 udp; > CONNECTED; ! a second 7
     a status nobody asked for | 1.3 udp | greet; > CONNECTED; ! a 7 though the robot sent no 4
@@ -269,7 +242,8 @@ async def test_it_dies_of(options: dict[str, Any], steps: list[str]) -> None:
     a second connection hears nothing and does no harm | 1.3 | greet; crowd 20; > STOP; ok; took 3 13
     a 7 that denies the answer is an event, and all goes by TCP | 1.3 udp | probed; > NOT_CONNECTED; established
         ; > FORWARD; ok; ? 7(false) though 6(true) was sent by UDP; told 1
-    a lost probe is answered by TCP, as all is | no probe | probed; < LOST; > NOT_CONNECTED; > FORWARD; > STOP; ok
+    a lost probe is answered by TCP, as all is | no probe | probed; < NOT_RECEIVED; > NOT_CONNECTED; > FORWARD; > STOP
+        ; ok
     a lost answer ends with a late status | no answer | probed; awake; > NOT_CONNECTED; > FORWARD; ok
     the answers are those of the page | 1.1 | greet 1.1; > LIDAR_ON; < 06000000 01 33 01000000; > GET_POSITION
         ; < 0e000000 01 37 00000000 00000000 0000b4c2; > GET_MAP; < 02000000 01 35; > GET_MAP; < 16270000 01 35 10270000
@@ -374,19 +348,6 @@ async def test_a_datagram_from_another_socket_is_noted() -> None:
         with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
             other.sendto(hq.raw("FORWARD"), ("127.0.0.1", hq.peer.port))
         await hq.violated("not from where 5 came from")
-
-
-async def test_a_second_connection_may_work_and_lose_half_and_get_no_telemetry() -> None:
-    robot = quick("1.1", again=True, client_id=2, times=Times(read_s=0.002, unasked_s=0.01))
-    async with facing(robot) as hq:
-        await hq.play(["meet", f"> {hello('1.1', udp=False).replace('07', '02', 1)}"])
-        assert (await hq.packet())[5] in (1, 31, 40, 51, 53, 55)
-        await hq.play(["close", "wait 0.015", "again"])
-        assert (await hq.packet())[4:7] == bytes([1, 2, 3]), "client id 3"
-        lidar_on = NAMES["LIDAR_ON"].replace("07", "03", 1)
-        await hq.play([f"> {hello('1.1', udp=False).replace('07', '03', 1)}", *[f"> {lidar_on}"] * 60, "ok"])
-        assert 15 < [row[2] for row in robot.received].count(50) < 45
-        assert {(await hq.packet())[5] for _ in range(5)} == {51}
 
 
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:

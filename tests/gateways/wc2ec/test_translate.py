@@ -11,6 +11,7 @@ from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
+from tests.conformance.script_table import table
 from tests.gateways.rig import drained, planned
 from tests.gateways.wc2ec.golden import DISTANCE, LINEAR, ROTATIONAL, data, light, registration
 from zbridge.app import config
@@ -22,7 +23,7 @@ from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
 from zbridge.protocol.session import State
 
-NAN, INF = math.nan, math.inf
+TO_1000: dict[str, Any] = {"bounds_default": [0.0, 1000.0]}
 SIDES = {"left": ["fl", "rl"], "right": ["fr", "rr"]}
 FACTORS = {
     "factors": {"fl": {"forward": 10.0, "left": -4.0, "turn": -3.0}, "fr": {"forward": 10.0, "left": 4.0, "turn": 3.0}}
@@ -49,9 +50,12 @@ ROBOTS: dict[str, dict[str, Any]] = {
         "differential": {**SIDES, "wheel_radius_m": 0.1, "track_m": 0.3, "speed_full_m_s": 2.0, "turn_full_rad_s": 0.5}
     },
     "factors": FACTORS,
+    "to 1000": TO_1000,
+    "front to 5000": {"bounds": {"front": [-1.0, 5000.0]}, **TO_1000},
+    "falling": {"tables": {"front": [[0.0, 1.0], [1000.0, 0.02]]}, **TO_1000},
+    "bent": {"tables": {"front": [[0, 0], [10, 1], [30, 5]]}},
     "draft": DRAFT,
     "draft with 0 values": {**DRAFT, "values": 0},
-    "draft with 5 values": {**DRAFT, "values": 5},
     "draft with a motor": {**DRAFT, "devices": [{"name": "fl", "number": 0, "kind": "rotational"}], **FACTORS},
 }
 
@@ -71,7 +75,7 @@ class Wire:
     def __init__(self, greeting: bytes = b"", **options: Any) -> None:
         self.metrics = Metrics()
         self.robot = Wc2EcRobot(options_of(**options), 1, self.metrics)
-        self.now = 0.0
+        self.now, self.faults = 0.0, 0
         self.session: ExternalRole
         self.connect(greeting)
 
@@ -114,6 +118,35 @@ class Wire:
         command = topic.message(**named)
         return self.robot.command(topic, command, self.now).left_out
 
+    def play(self, steps: list[str]) -> None:
+        """Do what is said. After ``>`` it is what leaves, values of motors by number; after ``>>`` in hex."""
+        left_out = None
+        for step in steps:
+            match step.split():
+                case ["refused", *said]:
+                    with pytest.raises((Refused, EncodeError)):
+                        self.does(" ".join(said))
+                    assert self.frames() == []
+                case [number, "reads", value, ">", key, shown]:
+                    path, reading = self.reading(data(int(number), float(value)))
+                    self.faults += shown == "fault"
+                    assert (path, reading.device, reading.fault) == (key, int(number), shown == "fault")
+                    assert f"{reading.value:g}" == f"{float(value if reading.fault else shown):g}", step
+                    assert self.metrics.total("sensor_faults") == self.faults
+                case ["stop", seconds]:
+                    self.robot.stop(self.now, self.now + float(seconds))
+                case ["at", seconds]:
+                    self.now = float(seconds)
+                case [">", *expected]:
+                    told = " ".join(f"{number}={value:g}" for number, value in sorted(self.values().items()))
+                    assert (told or "nothing") == " ".join(expected), step
+                case [">>", *expected]:
+                    assert b"".join(self.frames()) == bytes.fromhex("".join(expected))
+                case ["left", "out", *expected]:
+                    assert (left_out or "").startswith(" ".join(expected))
+                case _:
+                    left_out = self.does(step)
+
     def frames(self) -> list[bytes]:
         return drained(self.session, self.now)
 
@@ -143,37 +176,23 @@ def test_a_reading_of_any_type_is_on_the_key_of_its_name_with_kind_device_and_st
 
 
 @pytest.mark.parametrize(
-    ("name", "chunk"),
-    [
-        (b"a/*#@%2F", "a%2F%2A%23%40%252F"),
-        (b"", "%"),
-        (b"\xff\xfe\x00", "%FF%FE%00"),
-    ],
+    ("name", "chunk"), [(b"a/*#@%2F", "a%2F%2A%23%40%252F"), (b"", "%"), (b"\xff\xfe\x00", "%FF%FE%00")]
 )
 def test_a_name_is_escaped_in_its_key_and_its_motor_is_found_by_it(name: bytes, chunk: str) -> None:
     wire = Wire()
     for _, message in wire.told(registration(ROTATIONAL, 8, name)):
         assert payload.decode(type(message), payload.encode(message)) == message
     assert wire.reading(data(8, 1.0))[0] == f"sensor/{chunk}"
-    wire.does(f"motor/{chunk} value=1.5")
-    assert wire.frames() == [bytes.fromhex("82 35 08 000000000000f83f")]
+    wire.play([f"motor/{chunk} value=1.5", ">> 82 35 08 000000000000f83f"])
 
 
 def test_the_numbers_of_node_types_are_options_and_motors_may_be_listed_by_name() -> None:
     wire = Wire(motor_types={"rotational": [60], "linear": [61, 62]}, motors={"rotational": ["k99"], "linear": ["k63"]})
     table = wire.table(b"".join(registration(kind, kind, b"k%d" % kind) for kind in (38, 46, 53, 60, 62, 63, 99)))
-    kinds = {entry.name: entry.kind for entry in table}
-    assert kinds == {"k38": "distance", "k46": "type46", "k53": "type53"} | {
-        "k60": "rotational",
-        "k62": "linear",
-        "k63": "linear",
-        "k99": "rotational",
-    }
-    wire.does("motor/k60 value=1.5")
-    wire.does("motor/k99 value=1.5")
-    assert wire.frames() == [bytes.fromhex("82 3c 3c 000000000000f83f"), bytes.fromhex("82 63 63 000000000000f83f")]
-    with pytest.raises(Refused):
-        wire.does("motor/k53 value=1.5")
+    kinds = ["distance", "type46", "type53", "rotational", "linear", "linear", "rotational"]
+    assert [entry.kind for entry in table] == kinds
+    wire.play(["motor/k60 value=1.5", ">> 82 3c 3c 000000000000f83f", "refused motor/k53 value=1.5"])
+    wire.play(["motor/k99 value=1.5", ">> 82 63 63 000000000000f83f"])
 
 
 def test_data_before_registration_is_shown_under_its_number_and_counted() -> None:
@@ -202,8 +221,7 @@ def test_the_device_table_grows_with_every_registration_and_a_name_that_is_taken
     assert [entry.name for entry in table] == [*(chunk.replace("%23", "#") for chunk in chunks), "lift"]
     assert [wire.reading(data(number, 1.0))[0] for number in (1, 2, 7, 8)] == [f"sensor/{chunk}" for chunk in chunks]
     for number, chunk in zip((2, 7, 8), chunks[1:], strict=True):
-        wire.does(f"motor/{chunk} value=1.5")
-        assert wire.values() == {number: 1.5}
+        wire.play([f"motor/{chunk} value=1.5", f"> {number}=1.5"])
 
 
 def test_a_number_that_is_registered_twice_is_a_protocol_error_and_changes_nothing(car: Wire) -> None:
@@ -217,11 +235,9 @@ def test_a_number_that_is_registered_twice_is_a_protocol_error_and_changes_nothi
 def test_a_new_connection_begins_with_a_fresh_table(car: Wire) -> None:
     car.session.lost("closed by peer")
     car.connect()
-    for table in ([], [Device("fl", 0, "distance")]):
-        with pytest.raises(Refused):
-            car.does("motor/fl value=1")
-        assert car.frames() == []
-        assert table or car.table(registration(DISTANCE, 0, b"fl")) == [Device("fl", 0, "distance")]
+    car.play(["refused motor/fl value=1"])
+    assert car.table(registration(DISTANCE, 0, b"fl")) == [Device("fl", 0, "distance")]
+    car.play(["refused motor/fl value=1"])
     assert car.reading(data(5, 1.0))[0] == "sensor/distance-5"
 
 
@@ -230,37 +246,6 @@ def test_255_devices_may_be_registered_and_every_rotational_motor_is_stopped_at_
     assert len(wire.table(registration(DISTANCE, 254, b"eye"))) == 255
     wire.robot.stop(0.0, 1.0)
     assert wire.values() == dict.fromkeys(range(254), 0.0)
-
-
-TO_1000: dict[str, Any] = {"bounds_default": [0.0, 1000.0]}
-FRONT_TO_5000: dict[str, Any] = {"bounds": {"front": [-1.0, 5000.0]}, **TO_1000}
-FALLING: dict[str, Any] = {"tables": {"front": [[0.0, 1.0], [1000.0, 0.02]]}, **TO_1000}
-BENT: dict[str, Any] = {"tables": {"front": [[0, 0], [10, 1], [30, 5]]}}
-
-
-@pytest.mark.parametrize(
-    ("options", "number", "value", "shown"),
-    [
-        *((TO_1000, 5, value, value) for value in (0.0, 500.0, 1000.0)),
-        *((TO_1000, 5, value, "fault") for value in (-0.001, 1000.001, NAN, INF, -INF)),
-        *((FRONT_TO_5000, 5, value, value) for value in (-1.0, 5000.0)),
-        (FRONT_TO_5000, 5, 5000.5, "fault"),
-        (FRONT_TO_5000, 99, 1001.0, "fault"),  # the others have the default
-        ({"bounds": {"front": [0.0, 0.0]}}, 5, 0.5, "fault"),
-        ({}, 5, -1e300, -1e300),
-        *(({}, 5, value, "fault") for value in (NAN, INF)),
-        *((FALLING, 5, value, shown) for value, shown in ((0.0, 1.0), (250.0, 0.755), (1000.0, 0.02))),
-        (FALLING, 5, 1500.0, "fault"),  # the bounds are of what the sensor said; a fault is not looked up
-        *((BENT, 5, value, shown) for value, shown in ((5.0, 0.5), (20.0, 3.0), (-50.0, 0.0), (200.0, 5.0))),
-        (BENT, 99, 20.0, 20.0),  # it is of one sensor
-    ],
-)
-def test_a_value_is_looked_up_in_its_table_or_a_fault_that_is_counted(options, number, value, shown) -> None:
-    wire = Wire(CAR, **options)
-    _, reading = wire.reading(data(number, value))
-    assert reading.fault is (shown == "fault")
-    assert repr(reading.value) == repr(value) if reading.fault else reading.value == pytest.approx(shown)
-    assert wire.metrics.total("sensor_faults") == reading.fault
 
 
 def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_connection() -> None:
@@ -276,61 +261,70 @@ def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_conn
     assert isinstance(scan, Scan)
     assert (scan.angle_min, scan.angle_increment) == pytest.approx((-math.pi / 2, math.pi / 2))
     assert (scan.range_min, scan.range_max, scan.stamp_ns) == (0.1, 2.0, STAMP)
-    assert scan.ranges.tolist() == pytest.approx([1.0, NAN, 2.0], nan_ok=True), "in metres; a fault is no distance"
+    assert scan.ranges.tolist() == pytest.approx([1.0, math.nan, 2.0], nan_ok=True), "in metres; a fault is no distance"
 
 
 # Commands
 
 
-@pytest.mark.parametrize(
-    ("robot", "said", "sent"),
-    [
-        ("no kinematics", "motor/fr value=1.5", ["82 35 01 000000000000f83f"]),
-        ("no kinematics", "motor/lift value=0.25", ["82 2e 04 000000000000d03f"]),
-        ("draft", "sensor/lamp enable=true", ["80 00 01"]),
-        ("draft", "sensor/lamp enable=false", ["81 00 01"]),
-        ("draft", "sensor/lamp index=2 value=0.25", ["82 00 01 02 000000000000d03f"]),
-        ("draft", "sensor/lamp enable=true index=0 value=1.5", ["80 00 01", "82 00 01 00 000000000000f83f"]),
-        ("draft", "sensor/lamp values=(1.5,1.5,1.5)", ["83 00 01" + "000000000000f83f" * 3]),
-        ("draft with 0 values", "sensor/a%2Fb values=()", ["83 00 00"]),
-        ("draft with 5 values", "sensor/a%2Fb values=(1.5,1.5,1.5,1.5,1.5)", ["83 00 00" + "000000000000f83f" * 5]),
-    ],
+@table(
+    """
+    bounds | to 1000 | 5 reads 0 > sensor/front 0; 5 reads 1000 > sensor/front 1000; 5 reads -0.001 > sensor/front fault
+        ; 5 reads 1000.001 > sensor/front fault; 5 reads nan > sensor/front fault; 5 reads -inf > sensor/front fault
+    bounds of one sensor | front to 5000 | 5 reads -1 > sensor/front -1; 5 reads 5000 > sensor/front 5000
+        ; 5 reads 5000.5 > sensor/front fault; 99 reads 1001 > sensor/distance-99 fault
+    no bounds | car | 5 reads -1e+300 > sensor/front -1e+300; 5 reads nan > sensor/front fault
+        ; 5 reads inf > sensor/front fault
+    bounds are of what the sensor said, and a fault is not looked up | falling | 5 reads 0 > sensor/front 1
+        ; 5 reads 250 > sensor/front 0.755; 5 reads 1000 > sensor/front 0.02; 5 reads 1500 > sensor/front fault
+    a lookup table of one sensor, which ends where it ends | bent | 5 reads 5 > sensor/front 0.5
+        ; 5 reads 20 > sensor/front 3; 5 reads -50 > sensor/front 0; 5 reads 200 > sensor/front 5
+        ; 99 reads 20 > sensor/distance-99 20
+    a rotational motor | no kinematics | motor/fr value=1.5; >> 82 35 01 000000000000f83f
+    a linear motor | no kinematics | motor/lift value=0.25; >> 82 2e 04 000000000000d03f
+    enable | draft | sensor/lamp enable=true; >> 80 00 01
+    disable | draft | sensor/lamp enable=false; >> 81 00 01
+    change | draft | sensor/lamp index=2 value=0.25; >> 82 00 01 02 000000000000d03f
+    enable and change | draft | sensor/lamp enable=true index=0 value=1.5; >> 80 00 01 82 00 01 00 000000000000f83f
+    set | draft | sensor/lamp values=(1.5,1.5,0.25); >> 83 00 01 000000000000f83f 000000000000f83f 000000000000d03f
+    set none | draft with 0 values | sensor/a%2Fb values=(); >> 83 00 00
+    two sides of wheels, 1/4 m/s and 1/2 rad/s | car | drive forward=0.5 turn=0.5; > 0=3.5 1=6.5 2=3.5 3=6.5; at 10
+        ; > nothing
+    other wheels, 1 m/s and 1/2 rad/s | fast car | drive forward=0.5 turn=1; > 0=9.25 1=10.75 2=9.25 3=10.75
+    factors | factors | drive forward=0.5 left=-0.25 turn=-1; > 0=9 1=1
+    a neutral drive | car | drive; > 0=0 1=0 2=0 3=0
+    what a car cannot do beside other motion | car | drive forward=1 left=0.5 light=true; left out left and light
+        ; > 0=10 1=10 2=10 3=10
+    sideways alone | car | refused drive left=0.5
+    the last word to each motor, where the link was slow | car | drive forward=0.25; drive forward=1; motor/fl value=5
+        ; > 0=5 1=10 2=10 3=10; motor/fl value=6; drive forward=0.5; > 0=5 1=5 2=5 3=5
+    no kinematics | no kinematics | refused drive forward=0.5
+    what is no motor: every later command would be stuck | no kinematics | refused motor/front value=1
+        ; refused motor/nobody value=1; refused motor/% value=1; refused motor/FL value=1; refused motor/%231 value=1
+        ; refused motor/0 value=1; refused motor/rotational-0 value=1
+    what is no number | no kinematics | refused motor/fl value=+nan; refused motor/fl value=+inf
+        ; refused motor/fl value=-inf
+    a 130 of the draft | no kinematics | refused sensor/front enable=true; refused sensor/front index=0 value=1
+    what a Webots robot has not | no kinematics | refused mode mode=manual; refused light on=true; refused lidar on=true
+        ; refused text text=hello; refused raw/wc2ec id=130
+    motors of the draft | draft with a motor | refused motor/fl value=1; refused drive forward=1; stop 1; > nothing
+    settings that cannot be | draft | refused sensor/nobody enable=true; refused sensor/lamp
+        ; refused sensor/lamp index=1; refused sensor/lamp value=1; refused sensor/lamp index=-1 value=1
+        ; refused sensor/lamp index=3 value=1; refused sensor/lamp index=0 value=+nan
+        ; refused sensor/lamp values=(1,inf,2); refused sensor/lamp values=(1,2); refused sensor/lamp values=(1,2,3,4)
+        ; refused sensor/lamp enable=true index=256 value=1; refused sensor/lamp enable=true values=(1,2)
+    a stop is first, leaves linear motors and what waits is forgotten | no kinematics | motor/fl value=5
+        ; motor/rr value=5; motor/lift value=0.25; stop 1
+        ; >> 823500 0000000000000000 823501 0000000000000000 823502 0000000000000000 823503 0000000000000000
+    a drive after a stop ends its repetition: who acquired anew drives | car | stop 1; > 0=0 1=0 2=0 3=0; at 0.05
+        ; drive forward=1; > 0=10 1=10 2=10 3=10; at 0.15; > nothing; at 0.5; > nothing; at 2; > nothing
+    a motor that is set after a stop is repeated no more | car | stop 1; > 0=0 1=0 2=0 3=0; at 0.05; motor/fl value=5
+        ; > 0=5; at 0.15; > 1=0 2=0 3=0; at 1; > 1=0 2=0 3=0
+    """,
+    ROBOTS,
 )
-def test_a_command_to_a_device_is(robot: str, said: str, sent: list[str]) -> None:
-    wire = Wire.of(robot)
-    wire.does(said)
-    assert wire.frames() == [bytes.fromhex(frame) for frame in sent]
-
-
-REFUSED = {
-    # after a 130 to a device that is no motor, or is unknown, every later command is stuck
-    "no kinematics": [
-        *(f"motor/{name} value=1" for name in ("front", "nobody", "%", "FL", "%231", "0", "rotational-0")),
-        *(f"motor/fl value={value}" for value in ("+nan", "+inf", "-inf")),
-        *("drive forward=0.5", "sensor/front enable=true", "sensor/front index=0 value=1"),
-        *("mode mode=manual", "light on=true", "lidar on=true", "text text=hello", "raw/wc2ec id=130"),
-    ],
-    "car": ["drive left=0.5"],
-    "draft with a motor": ["motor/fl value=1", "drive forward=1"],
-    "draft": [
-        "sensor/nobody enable=true",
-        *("sensor/lamp", "sensor/lamp index=1", "sensor/lamp value=1"),
-        *(f"sensor/lamp index={index} value=1" for index in (-1, 3, 256)),
-        *("sensor/lamp index=0 value=+nan", "sensor/lamp values=(1,inf,2)"),
-        *("sensor/lamp values=(1,2)", "sensor/lamp values=(1,2,3,4)"),
-        *("sensor/lamp enable=true index=256 value=1", "sensor/lamp enable=true values=(1,2)"),
-    ],
-}
-
-
-@pytest.mark.parametrize(("robot", "said"), [(robot, said) for robot, them in REFUSED.items() for said in them])
-def test_what_cannot_be_is_refused_whole_and_nothing_is_sent(robot: str, said: str) -> None:
-    wire = Wire.of(robot)
-    with pytest.raises((Refused, EncodeError)):
-        wire.does(said)
-    with pytest.raises(Refused):
-        wire.robot.ask(topics.RPC_MAP)
-    assert wire.frames() == []
+def test_what_is_told_of_the_robot_and_what_leaves_for_it(options: dict[str, Any], steps: list[str]) -> None:
+    Wire(b"" if "dialect" in options else READY, **options).play(steps)
 
 
 def test_before_the_first_connection_everything_is_refused() -> None:
@@ -344,31 +338,6 @@ def test_before_the_first_connection_everything_is_refused() -> None:
 # Drive and stop
 
 
-@pytest.mark.parametrize(
-    ("robot", "said", "left", "right"),
-    [
-        ("car", "drive forward=0.5 turn=0.5", 3.5, 6.5),
-        ("car", "drive", 0.0, 0.0),
-        ("fast car", "drive forward=0.5 turn=1", 9.25, 10.75),  # 1 m/s and 0.5 rad/s: (1 -+ 0.075) / 0.1
-        ("factors", "drive forward=0.5 left=-0.25 turn=-1", 9.0, 1.0),
-        ("factors", "drive", 0.0, 0.0),
-    ],
-)
-def test_a_drive_is_what_two_sides_of_wheels_or_factors_make_of_it(robot, said, left, right) -> None:
-    wire = Wire.of(robot)
-    assert wire.does(said) is None
-    rear = {} if robot == "factors" else {2: left, 3: right}
-    assert wire.values() == pytest.approx({0: left, 1: right, **rear})
-    wire.now = 10.0
-    assert wire.frames() == [], "a value holds until the next one"
-
-
-def test_what_a_car_cannot_do_is_left_out_beside_other_motion(car: Wire) -> None:
-    for more, said in (("left=0.5", "left"), ("light=true", "light")):
-        assert said in (car.does(f"drive forward=1 {more}") or "")
-        assert car.values() == pytest.approx({0: 10.0, 2: 10.0, 1: 10.0, 3: 10.0})
-
-
 @pytest.mark.parametrize(("kind", "name"), [(DISTANCE, b"fl"), (LINEAR, b"fl"), (ROTATIONAL, b"other")])
 def test_a_drive_is_refused_whole_where_one_of_its_motors_is_missing_or_none(kind: int, name: bytes) -> None:
     others = b"".join(registration(ROTATIONAL, n, wheel) for n, wheel in ((1, b"fr"), (2, b"rl"), (3, b"rr")))
@@ -376,32 +345,6 @@ def test_a_drive_is_refused_whole_where_one_of_its_motors_is_missing_or_none(kin
     with pytest.raises(Refused, match="fl"):
         car.does("drive forward=0.5")
     assert car.frames() == []
-
-
-def test_where_the_link_was_slow_the_last_word_to_each_motor_is_sent(car: Wire) -> None:
-    for number in range(200):
-        car.does(f"drive forward={number / 200}")
-    car.does("motor/fl value=5")
-    frames = car.frames()
-    assert len(frames) == 4
-    assert bytes.fromhex("82 35 00 0000000000001440") in frames
-    car.does("motor/fl value=6")
-    car.does("drive forward=0.5")
-    assert set(car.values().values()) == {5.0}
-
-
-def test_a_stop_sets_every_rotational_motor_to_0_before_what_waits_and_leaves_the_linear_ones() -> None:
-    wire = Wire.of("no kinematics")
-    for said in ("motor/fl value=5", "motor/rr value=5", "motor/lift value=0.25"):
-        wire.does(said)
-    wire.robot.stop(0.0, 1.0)
-    assert wire.frames() == [bytes((0x82, 0x35, number)) + bytes(8) for number in (0, 1, 2, 3)]
-
-
-def test_where_no_motor_is_registered_there_is_nothing_to_stop() -> None:
-    for wire in (Wire(data(9, 1.0, ROTATIONAL)), Wire.of("draft with a motor")):
-        wire.robot.stop(0.0, 1.0)
-        assert wire.frames() == []
 
 
 def test_a_stop_is_repeated_for_a_second_and_a_routine_one_sent_once(car: Wire) -> None:
@@ -415,21 +358,6 @@ def test_a_stop_is_repeated_for_a_second_and_a_routine_one_sent_once(car: Wire) 
             rounds += bool(values)
             assert values == {} or (values == STOPPED and step / 100 <= seconds + 0.01)
         assert least <= rounds <= most
-
-
-@pytest.mark.parametrize(
-    ("said", "moved"), [("motor/fl value=5", {0: 5.0}), ("drive forward=1", dict.fromkeys(STOPPED, 10.0))]
-)
-def test_a_command_after_a_stop_ends_its_repetition_for_its_motors(car: Wire, said, moved) -> None:
-    """Whoever acquired anew within the second in which the stop is repeated drives."""
-    car.robot.stop(0.0, 1.0)
-    car.frames()
-    car.now = 0.05
-    car.does(said)
-    assert car.values() == moved
-    for _ in range(20):
-        car.now += 0.1
-        assert not car.values().keys() & moved.keys()
 
 
 # Draft

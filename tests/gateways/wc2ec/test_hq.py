@@ -336,49 +336,46 @@ def test_what_is_set_on_left_and_right_is_a_drive_by_the_inverse_kinematics(whee
 
 
 GO_LEFT, GO_RIGHT = set_value(0, 10.0), set_value(1, 10.0)
-STOP_LEFT, STOP_RIGHT = set_value(0, 0.0), set_value(1, 0.0)
-ALONE = (0.3, -1.0)
-"""10 rad/s of the left wheel alone: 0.5 and -5/3, to full scale."""
 
 
-def joined(*said: tuple[float, bytes], join_s: float) -> list[tuple[float, float, float]]:
-    """The drives that come of what is said at these moments, with theirs."""
+def joined(said: str, join_s: float) -> str:
+    """The drives that come of what is set on the wheels, ``"0.1 left 10; 0.12 right 10"``: ``"0.12: 1 0"``."""
     scene = Scene("is tcpudp; client", join_s=join_s)
-    client, told = scene.clients[0], list[tuple[float, FleetMessage]]()
-    for at, now_said in (*said, (5.0, b"")):
+    client, told = scene.clients[0], list[tuple[float, Any]]()
+    for step in (*said.split("; "), "5"):
+        at, *setting = step.split()
         due = scene.side.deadline(client)
-        if due <= at:
+        if due <= float(at):
             assert scene.side.expire(client, due - 0.0001) == ()
             told += [(due, command) for _, command in scene.side.expire(client, due)]
             assert scene.side.deadline(client) == INF
-        told += [(at, command) for _, command in scene.says(now_said, now=at)]
-    return [(round(at, 3), round(one.forward, 3), round(one.turn, 3)) for at, one in told if isinstance(one, Drive)]
+        for wheel, value in (setting,) if setting else ():
+            set_to = set_value(["left", "right"].index(wheel), float(value))
+            told += [(float(at), command) for _, command in scene.says(set_to, now=float(at))]
+    return "; ".join(f"{at:g}: {drive.forward:.3g} {drive.turn + 0.0:.3g}" for at, drive in told)
 
 
 @pytest.mark.parametrize(
     ("join_s", "said", "driven"),
     [
         # deployed controllers take 11 to 20 ms from one wheel to the other
-        *((0.03, [(0.1, GO_LEFT), (at, GO_RIGHT)], [(at, 1.0, 0.0)]) for at in (0.1, 0.111, 0.129)),
-        (0.03, [(0.1, GO_RIGHT), (0.12, GO_LEFT)], [(0.12, 1.0, 0.0)]),
-        (0.03, [(0.1, GO_LEFT)], [(0.13, *ALONE)]),
-        (0.03, [(0.1, GO_LEFT), (0.14, GO_RIGHT), (0.16, GO_LEFT)], [(0.13, *ALONE), (0.16, 1.0, 0.0)]),
+        *((0.03, f"0.1 left 10; {at} right 10", f"{at}: 1 0") for at in (0.1, 0.111, 0.129)),
+        (0.03, "0.1 right 10; 0.12 left 10", "0.12: 1 0"),
+        # of one wheel alone there are 0.5 m/s and -5/3 rad/s, to full scale
+        (0.03, "0.1 left 10", "0.13: 0.3 -1"),
+        (0.03, "0.1 left 10; 0.14 right 10; 0.16 left 10", "0.13: 0.3 -1; 0.16: 1 0"),
         # a wheel that is set again does not put the drive off
-        (0.03, [(0.1, GO_LEFT), (0.11, GO_LEFT), (0.12, GO_LEFT)], [(0.13, *ALONE)]),
+        (0.03, "0.1 left 10; 0.11 left 10; 0.12 left 10", "0.13: 0.3 -1"),
         # what is set may be driven at once
-        (0.0, [(0.1, GO_LEFT), (0.11, GO_RIGHT)], [(0.1, *ALONE), (0.11, 1.0, 0.0)]),
+        (0.0, "0.1 left 10; 0.11 right 10", "0.1: 0.3 -1; 0.11: 1 0"),
         # a stop is never put off
-        (1.0, [(0.1, STOP_RIGHT)], [(0.1, 0.0, 0.0)]),
-        (1.0, [(0.1, GO_LEFT), (0.11, STOP_LEFT)], [(0.11, 0.0, 0.0)]),
-        (
-            1.0,
-            [(0.1, GO_LEFT), (0.11, GO_RIGHT), (0.2, STOP_LEFT), (0.215, STOP_RIGHT)],
-            [(0.11, 1.0, 0.0), (0.215, 0.0, 0.0)],
-        ),
+        (1.0, "0.1 right 0", "0.1: 0 0"),
+        (1.0, "0.1 left 10; 0.11 left 0", "0.11: 0 0"),
+        (1.0, "0.1 left 10; 0.11 right 10; 0.2 left 0; 0.215 right 0", "0.11: 1 0; 0.215: 0 0"),
     ],
 )
 def test_wheels_that_are_set_one_after_the_other_are_one_drive_but_a_stop_is_one_at_once(join_s, said, driven) -> None:
-    assert joined(*said, join_s=join_s) == driven
+    assert joined(said, join_s) == driven
 
 
 def test_what_waited_is_nothing_for_a_robot_that_has_motors_by_now_and_no_number_changes_no_wheel() -> None:

@@ -38,10 +38,15 @@ class CountingBus(FakeBus):
 
     def publisher(self, key: str, topic: Topic) -> Publisher:
         publisher = super().publisher(key, topic)
+        name, close = key.rpartition("/")[2], publisher.close
+
+        def closed() -> None:
+            close()
+            self.sensors.remove(name)
+
         if "/sensor/" in key:
-            name, close = key.rpartition("/")[2], publisher.close
             self.sensors.append(name)
-            publisher.close = lambda: (close(), self.sensors.remove(name))  # type: ignore[method-assign]
+            publisher.close = closed  # type: ignore[method-assign]
         return publisher
 
 

@@ -1,24 +1,27 @@
 """Sessions of WC2EC in both roles and dialects: bytes from the protocol page, by hand; time is an argument."""
 
-import random
-
 import numpy as np
 import pytest
 
 from gateways.wc2ec.messages import Error, RegisterSensor, SensorData, SetSensor, SetValue, Wc2EcMessage
 from gateways.wc2ec.session import ControllerRole, ExternalRole, Wc2EcSession
-from tests.conformance.side import plain
-from tests.gateways.rig import drained, exchange
-from tests.gateways.wc2ec.golden import DEPLOYED, DRAFT, GOLDEN, WC, Dialect
+from tests.gateways.rig import drained
+from tests.gateways.wc2ec.golden import DEPLOYED, DRAFT, Dialect
 from zbridge.errors import EncodeError
 from zbridge.protocol.session import Role, State
 
 WHEEL = bytes.fromhex("00 35 00 06 77 68 65 65 6c 31")
 DIST = bytes.fromhex("00 25 06 06 64 69 73 74 5f 63")
 READING = bytes.fromhex("01 25 06 0000000000748740")
-WHEEL_MESSAGE, DIST_MESSAGE = RegisterSensor(53, 0, b"wheel1"), RegisterSensor(37, 6, b"dist_c")
-READING_MESSAGE = SensorData(37, 6, 750.5)
-ERROR = bytes.fromhex("7f 25 09")
+WHEEL_MESSAGE, READING_MESSAGE = RegisterSensor(53, 0, b"wheel1"), SensorData(37, 6, 750.5)
+SAID = {
+    "WHEEL": (WHEEL, WHEEL_MESSAGE),
+    "DIST": (DIST, RegisterSensor(37, 6, b"dist_c")),
+    "HALF": (DIST[:5], None),
+    "READING": (READING, READING_MESSAGE),
+    "ERROR": (bytes.fromhex("7f 25 09"), Error(37, 9)),
+}
+"""Bytes, and the message that they complete."""
 
 
 def external(dialect: Dialect = DEPLOYED) -> ExternalRole:
@@ -47,35 +50,32 @@ def test_a_controller_and_both_sides_of_the_draft_are_established_at_once_and_st
 
 
 @pytest.mark.parametrize(
-    ("said", "until_s", "state"),
+    "script",
     [
-        # nothing is registered: five seconds
-        ([(0.0, b"", [])], 4.99, State.HANDSHAKING),
-        ([(0.0, ERROR, [Error(37, 9)])], 5.0, State.CLOSED),
-        # a tenth of a second after the last registration
-        ([(1.0, WHEEL, [WHEEL_MESSAGE]), (1.05, DIST[:5], [])], 1.09, State.HANDSHAKING),
-        ([(1.0, WHEEL, [WHEEL_MESSAGE]), (1.05, DIST[:5], [])], 1.11, State.ESTABLISHED),
-        ([(1.0, WHEEL, [WHEEL_MESSAGE]), (1.09, DIST, [DIST_MESSAGE])], 1.18, State.HANDSHAKING),
-        ([(1.0, WHEEL, [WHEEL_MESSAGE]), (1.09, DIST, [DIST_MESSAGE])], 100.0, State.ESTABLISHED),
-        # registrations may take longer than five seconds
-        ([(4.9 + step * 0.09, WHEEL, [WHEEL_MESSAGE]) for step in range(100)], 13.88, State.HANDSHAKING),
-        # the first data, in the same read or without any registration
-        ([(0.5, WHEEL + READING, [WHEEL_MESSAGE, READING_MESSAGE])], 0.5, State.ESTABLISHED),
-        ([(0.5, READING, [READING_MESSAGE]), (60.0, DIST, [DIST_MESSAGE])], 99.0, State.ESTABLISHED),
+        "4.99 is handshaking; 5 is closed",
+        "0 ERROR; 4.99 is handshaking; 5 is closed",
+        "1 WHEEL; 1.05 HALF; 1.09 is handshaking; 1.11 is established",
+        "1 WHEEL; 1.09 DIST; 1.18 is handshaking; 1.2 is established; 100 is established",
+        "4.9 WHEEL; 4.99 WHEEL; 5.08 WHEEL; 5.17 is handshaking; 5.19 is established",
+        "0.5 WHEEL READING; 0.5 is established",
+        "0.5 READING; 0.5 is established; 60 DIST; 99 is established",
     ],
 )
-def test_deployed_is_established_by_its_registrations_or_data_and_left_where_none_come(said, until_s, state) -> None:
+def test_deployed_is_established_by_its_registrations_or_data_and_left_where_none_come(script: str) -> None:
     session = external()
-    for at, data, heard in said:
-        session.expire(at)
-        assert session.receive(data, at) == heard
-    session.expire(until_s)
-    assert session.state is state
-    assert (session.deadline() is None) == (state is not State.HANDSHAKING)
-    if state is State.CLOSED:
-        assert session.reason == "connected, but no device was registered within 5 s"
-    session.close("gateway stopped", until_s)
-    assert drained(session, until_s) == [], "there is no word for it"
+    for step in script.split("; "):
+        at, *words = step.split()
+        session.expire(float(at))
+        if words[0] == "is":
+            assert session.state.value == words[1]
+            assert (session.deadline() is None) == (words[1] != "handshaking")
+        else:
+            said = [SAID[word] for word in words]
+            heard = [message for _, message in said if message is not None]
+            assert session.receive(b"".join(data for data, _ in said), float(at)) == heard
+    assert session.reason in (None, "connected, but no device was registered within 5 s")
+    session.close("gateway stopped", 100.0)
+    assert drained(session, 100.0) == [], "there is no word for it"
 
 
 # What breaks it
@@ -123,14 +123,3 @@ def test_a_message_of_the_other_dialect_cannot_be_sent(session: Wc2EcSession, me
     with pytest.raises(EncodeError, match=type(message).__name__):
         session.send(message)
     assert drained(session) == []
-
-
-@pytest.mark.parametrize(("dialect", "sender"), GOLDEN)
-def test_both_roles_understand_each_other_in_any_cut(dialect, sender) -> None:
-    us, them = (controller(dialect), external(dialect))[:: 1 if sender is WC else -1]
-    messages, rng = [message for message, _ in GOLDEN[dialect, sender]], random.Random(1)
-    for _ in range(50):
-        for message in messages:
-            us.send(message)
-        assert [plain(message) for message in exchange(us, them, 0.0, rng)] == list(map(plain, messages))
-    assert (them.state, them.traffic.malformed) == (State.ESTABLISHED, 0)

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance import parser
 from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
 from gateways.wc2ec.conformance.machine import Robot
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Reader, Times
@@ -253,18 +252,6 @@ def test_random_bytes_never_make_the_judge_raise() -> None:
         for size in (1, 7, 60):
             for one in reader.take(bytes(rng.choices(b"\x80\x81\x82\x83\x00\x01\x08\x35\x7f\xff", k=size))):
                 assert one.raw
-
-
-def test_its_messages_are_those_of_the_recording_cut_anywhere() -> None:
-    """Bytes of ``wc2ec-deployed.hex``."""
-    wheel, sensor = Device("wheel1", 0, 53, Kind.ROTATIONAL), Device("dist_c", 6, 37, Kind.DISTANCE)
-    assert parser.registration(wheel).hex() == "00350006776865656c31"
-    assert parser.measurement("deployed", sensor, 1000.0).hex() == "0125060000000000408f40"
-    assert parser.measurement("draft", DEFAULT["draft"][2], 1.0).hex() == "000002000000000000f03f"
-    rng, data = random.Random(1), bytes(11)
-    cuts = [parser.pieces(data, rng) for _ in range(200)]
-    assert all(b"".join(parts) == data and all(parts) for parts in cuts)
-    assert {len(parts[0]) for parts in cuts} == set(range(1, 12))
 
 
 @pytest.mark.parametrize(("left", "right", "turn"), [(2, 2, 0), (1, 2, 1), (2, 1, -1)])

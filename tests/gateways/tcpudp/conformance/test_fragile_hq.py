@@ -170,7 +170,6 @@ def judged(lines: str) -> pytest.MarkDecorator:
     a 1.1 falls back to TCP after a lost answer | 1.1 quick | probing 1.1; < NOT_CONNECTED; established; does move 0 1
         ; < FORWARD; > POSITION; count 55 1; ok; by_udp POSITION; ! packet 55 by UDP instead of TCP
     a map by TCP | 1.3 | shake 1.3 udp; > MAP; ! by TCP instead of UDP
-    a position by TCP | 1.3 | shake 1.3 udp; > POSITION; ! by TCP instead of UDP
     a text by UDP | 1.3 | shake 1.3 udp; by_udp TEXT; ! by UDP instead of TCP
     long settings | 1.3 | greet 22000000 01 02 07 LIST_13 00010101010101 c8000000 0a000000 00; ! 16 bytes of settings
     a client id of robots | 1.3 | greet 21000000 01 02 01 LIST_13 00010101010101 c8000000 0a000000; ! client id 1
@@ -188,7 +187,6 @@ def judged(lines: str) -> pytest.MarkDecorator:
     a split packet, and its rest is none | 1.1 | shake 1.1; > 0e000000 01 37 0000c03f; > 000010c0 0000b442; > POSITION
         ; count 55 1; ! a split packet
     two joined | 1.1 in time | shake 1.1; > TEXT POSITION; ! two packets in one read; lost_all
-    three joined | 1.1 in time | shake 1.1; > TEXT TEXT TEXT; ! 3 packets in one read; lost_all
     a packet and a part | 1.1 in time | shake 1.1; > TEXT 0e000000 01 37; ! 1 packets and a part of one; lost_all
     a part | 1.1 in time | shake 1.1; > 08000000 01 01 02000000; ! a split packet, 10 of 12 bytes in one read; lost_all
     a packet of 2200 bytes | 1.1 in time | shake 1.1; > MAP_2200; ! a packet of 2200 bytes, over 2199; lost_all
@@ -211,15 +209,11 @@ async def test_what_is_noted_and_survived(options: dict[str, Any], steps: list[s
     settings whose version is not ASCII | 1.1 | accept; > 0f000000 01 02 07 03000000 312eb1 0001010101; died no version
     a datagram too short | 1.3 | shake 1.3 udp; by_udp 03000000 01 35; died a datagram whose length field is wrong
     two in a datagram | 1.3 | shake 1.3 udp; by_udp POSITION POSITION; died a datagram whose length field is wrong
-    56 to a 1.1 | 1.1 | shake 1.1; > 02000000 01 38; died unknown packet id 56 for an HQ 1.1; eof; speaks
     56 to a 1.3 | 1.3 | shake; > 02000000 01 38; died unknown packet id 56 for an HQ 1.3; eof; speaks
     60 to a 1.1 | 1.1 | shake 1.1; > GET_SCAN; died unknown packet id 60
-    31 | 1.3 | shake; > 06000000 01 1f 01000000; died unknown packet id 31
-    40 | 1.3 | shake; > 03000000 01 28 00; died unknown packet id 40
     7 | 1.3 | shake; > CONNECTED; died unknown packet id 7
     a long 4 | 1.3 | shake; > 03000000 01 04 00; died a body of 1 bytes instead of 0
     a short 6 | 1.3 | shake; > 02000000 01 06; died a body of 0 bytes instead of 1
-    a short 51 | 1.3 | shake; > 03000000 01 33 01; died a body of 1 bytes instead of 4
     a short 55 | 1.3 | shake; > 0a000000 01 37 0000c03f 000010c0; died a body of 8 bytes instead of 12
     a text cut off | 1.3 | shake; > 08000000 01 01 03000000 6869; died a wrong byte count of the string
     a text that is not ASCII | 1.3 | shake; > 08000000 01 01 02000000 c3a9; died a text that is not ASCII

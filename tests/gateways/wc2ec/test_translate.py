@@ -338,13 +338,11 @@ def test_before_the_first_connection_everything_is_refused() -> None:
 # Drive and stop
 
 
-@pytest.mark.parametrize(("kind", "name"), [(DISTANCE, b"fl"), (LINEAR, b"fl"), (ROTATIONAL, b"other")])
-def test_a_drive_is_refused_whole_where_one_of_its_motors_is_missing_or_none(kind: int, name: bytes) -> None:
+def test_a_drive_is_refused_whole_where_one_of_its_motors_is_missing_or_none() -> None:
     others = b"".join(registration(ROTATIONAL, n, wheel) for n, wheel in ((1, b"fr"), (2, b"rl"), (3, b"rr")))
-    car = Wire(registration(kind, 0, name) + others, **ROBOTS["car"])
-    with pytest.raises(Refused, match="fl"):
-        car.does("drive forward=0.5")
-    assert car.frames() == []
+    for kind, name in ((DISTANCE, b"fl"), (LINEAR, b"fl"), (ROTATIONAL, b"other")):
+        wire = Wire(registration(kind, 0, name) + others, **ROBOTS["car"])
+        wire.play(["refused drive forward=0.5"])
 
 
 def test_a_stop_is_repeated_for_a_second_and_a_routine_one_sent_once(car: Wire) -> None:
@@ -396,6 +394,12 @@ def test_a_sensor_of_the_draft_is_enabled_while_somebody_listens_and_a_pinned_on
         wire.connect()
         assert wire.frames() == [bytes.fromhex("80 00 01"), bytes.fromhex("80 00 02")]
         wire.session.lost("closed by peer")
+
+
+def test_all_sensors_may_be_pinned_and_are_enabled_at_once() -> None:
+    devices = [{"name": f"light{number}", "number": number} for number in range(200)]
+    wire = Wire(dialect="draft", devices=devices, pinned=[str(device["name"]) for device in devices])
+    assert sorted(wire.frames()) == [bytes((0x80, 0, number)) for number in range(200)]
 
 
 # Options

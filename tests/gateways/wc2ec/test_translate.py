@@ -143,7 +143,7 @@ class Wire:
                 case [">>", *expected]:
                     assert b"".join(self.frames()) == bytes.fromhex("".join(expected))
                 case ["left", "out", *expected]:
-                    assert (left_out or "").startswith(" ".join(expected))
+                    assert (left_out or "nothing").startswith(" ".join(expected)), step
                 case _:
                     left_out = self.does(step)
 
@@ -288,8 +288,8 @@ def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_conn
     enable and change | draft | sensor/lamp enable=true index=0 value=1.5; >> 80 00 01 82 00 01 00 000000000000f83f
     set | draft | sensor/lamp values=(1.5,1.5,0.25); >> 83 00 01 000000000000f83f 000000000000f83f 000000000000d03f
     set none | draft with 0 values | sensor/a%2Fb values=(); >> 83 00 00
-    two sides of wheels, 1/4 m/s and 1/2 rad/s | car | drive forward=0.5 turn=0.5; > 0=3.5 1=6.5 2=3.5 3=6.5; at 10
-        ; > nothing
+    two sides of wheels, 1/4 m/s and 1/2 rad/s | car | drive forward=0.5 turn=0.5; left out nothing
+        ; > 0=3.5 1=6.5 2=3.5 3=6.5; at 10; > nothing
     other wheels, 1 m/s and 1/2 rad/s | fast car | drive forward=0.5 turn=1; > 0=9.25 1=10.75 2=9.25 3=10.75
     factors | factors | drive forward=0.5 left=-0.25 turn=-1; > 0=9 1=1
     a neutral drive | car | drive; > 0=0 1=0 2=0 3=0
@@ -325,6 +325,12 @@ def test_sensors_with_bearings_are_a_scan_too_once_each_has_a_value_of_this_conn
 )
 def test_what_is_told_of_the_robot_and_what_leaves_for_it(options: dict[str, Any], steps: list[str]) -> None:
     Wire(b"" if "dialect" in options else READY, **options).play(steps)
+
+
+def test_a_webots_robot_cannot_be_asked_for_anything(car: Wire) -> None:
+    for topic in (topics.RPC_MAP, topics.RPC_POSE):
+        with pytest.raises(Refused):
+            car.robot.ask(topic)
 
 
 def test_before_the_first_connection_everything_is_refused() -> None:

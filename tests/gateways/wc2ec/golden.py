@@ -83,7 +83,6 @@ def _side(dialect: Dialect, sender: Sender) -> Side:
 SIDES = [_side(*side) for side in GOLDEN]
 
 DISTANCE, LINEAR, ROTATIONAL = 37, 46, 53
-NODE_TYPES = {"distance": DISTANCE, "linear": LINEAR, "rotational": ROTATIONAL}
 
 
 def registration(kind: int, number: int, name: bytes) -> bytes:

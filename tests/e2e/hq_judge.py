@@ -170,7 +170,7 @@ class Ec(Program):
 
     def __init__(self) -> None:
         self.judge = FragileController(split=True)
-        self._forward = 0.0
+        self._forward, self._setting = 0.0, asyncio.Lock()
 
     @property
     def ready(self) -> bool:
@@ -183,9 +183,10 @@ class Ec(Program):
     async def drive(self, forward: float) -> None:
         """Set both wheels once, it holds: 10 rad/s are full scale of the robots here."""
         self._forward = forward
-        for name in self._wheels:
-            await self.judge.set(name, 10.0 * forward)
-            await asyncio.sleep(BETWEEN_S)
+        async with self._setting:  # an idle that has begun is not mixed with it
+            for name in self._wheels:
+                await self.judge.set(name, 10.0 * forward)
+                await asyncio.sleep(BETWEEN_S)
 
     async def idle(self) -> None:
         await self.drive(0.0)

@@ -140,7 +140,7 @@ class Scene:
         """Where a driver finds what listens here."""
         port = free_port()
         self.endpoint = f"tcp/{HOST}:{port}"
-        self._listen = f"tcp/0.0.0.0:{port}"
+        self._listen = f"tcp/0.0.0.0:{port}" if cut else self.endpoint
         self.reach = f"tcp/{self.here}:{port}"
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         self.router = router(stack, self._listen)

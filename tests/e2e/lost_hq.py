@@ -4,8 +4,8 @@
     python -m tests.e2e.lost_hq --program alf --way cut
 
 A real gateway process, a router, a listener in a process of its own (`process-frozen`: in the gateway's), and a driving
-HQ program in one more. Every motion has a value of its own. A program that is cut off
-is in a network namespace of its own, and every packet on the way is lost.
+HQ program in one more. Every motion has a value of its own. A program that is cut off is in a network namespace of its
+own, and every packet on the way is lost.
 
 An external controller sets velocities once and its listener holds them for as long as its connection stands: such a
 controller that is frozen moves its robot on, and one that is cut off does until keep-alive has given it up.
@@ -21,7 +21,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from tests.e2e import loss
-from tests.e2e.conftest import free_port, until
+from tests.e2e.conftest import HOST, free_port, until
 from tests.e2e.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
 from tests.e2e.processes import module, report
 
@@ -61,8 +61,8 @@ class HqScene(Scene):
     def __init__(self, stack: contextlib.ExitStack, program: str, *, cut: bool = False, together: bool = False) -> None:
         driven = DRIVEN[program]
         self._program = program
-        self._port = free_port()
-        self._listener = f'[[hq]]\nprotocol = "{driven.protocol}"\nlisten = "tcp://0.0.0.0:{self._port}"\n'
+        self._port, host = free_port(), "0.0.0.0" if cut else HOST
+        self._listener = f'[[hq]]\nprotocol = "{driven.protocol}"\nlisten = "tcp://{host}:{self._port}"\n'
         self._listener += f"options = {{ {driven.options} }}\n"
         super().__init__(stack, cut=cut, parts=self._listener if together else "", deadman_s=driven.deadman_s)
         self.hq = self.gateway if together else self.run("hq", self._listener)

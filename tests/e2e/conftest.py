@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import random
 import signal
@@ -19,12 +20,13 @@ import msgpack
 import pytest
 import zenoh
 
+from tests.e2e.robots import Robot
 from tests.machine import Patience, Withheld, contended_s
 from tests.proofs import Holder, packed
 
 T = TypeVar("T")
 WAIT_S = 10.0
-
+HOST = "127.0.0.1"
 
 _PORTS = range(20_000, 32_000)
 """Below those that the kernel gives to connections."""
@@ -46,8 +48,8 @@ def free_port() -> int:
             continue
         _given.add(port)
         with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
-            tcp.bind(("127.0.0.1", port))
-            udp.bind(("127.0.0.1", port))
+            tcp.bind((HOST, port))
+            udp.bind((HOST, port))
             return port
 
 
@@ -64,15 +66,114 @@ def until(condition: Callable[[], T], timeout_s: float = WAIT_S, what: str = "co
         time.sleep(0.01)
 
 
+# The bus
+
+
+def configuration(mode: str, *endpoints: str) -> zenoh.Config:
+    """Configure a session without multicast: a router that listens, or a client that connects."""
+    config = zenoh.Config()
+    config.insert_json5("mode", json.dumps(mode))
+    config.insert_json5(f"{'listen' if mode == 'router' else 'connect'}/endpoints", json.dumps(endpoints))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+def ask(session: zenoh.Session, key: str, payload: bytes = b"", timeout_s: float = 3.0, **fields: Any) -> list[Any]:
+    """Plain get: the decoded replies, errors too."""
+    payload = payload or (packed(fields) if fields else b"")
+    replies = session.get(key, payload=payload or None, timeout=timeout_s)
+    return [msgpack.unpackb((reply.ok or reply.err).payload.to_bytes()) for reply in replies]
+
+
+class Lease:
+    """The lease of one robot by plain Zenoh and MessagePack, renewed on a thread until it is closed or has ended."""
+
+    def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
+        self._session, self._key = session, f"fleet/{robot}/@rpc/control/"
+        self.answer = self._ask(f"{how}/{wishes['who']}", packed(wishes))
+        assert self.answer.get("ok"), self.answer
+        self.lost = False
+        self.held = Holder.of(self.answer, robot)
+        self._closed = threading.Event()
+        threading.Thread(target=self._renew, daemon=True).start()
+
+    def _ask(self, name: str, payload: bytes) -> dict[str, Any]:
+        answers = ask(self._session, self._key + name, payload)
+        return answers[0] if answers else {}
+
+    def _renew(self) -> None:
+        with contextlib.suppress(zenoh.ZError):  # the session was closed
+            while not self._closed.wait(self.answer["expires_in_s"] / 3):
+                if not self._ask("renew", self.held.question("renew")).get("ok"):
+                    self.lost = True
+                    return
+
+    def close(self) -> None:
+        """Renew it no longer."""
+        self._closed.set()
+
+
+class Fleet:
+    """A Zenoh session of the test, what it saw, and the robots it holds."""
+
+    def __init__(self, session: zenoh.Session, keys: str = "fleet/**") -> None:
+        self.session = session
+        self.seen: dict[str, list[dict[str, Any]]] = {}
+        self._leases: dict[str, Lease] = {}
+        self.subscriber: Any = session.declare_subscriber(keys, self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        fields = msgpack.unpackb(sample.payload.to_bytes())
+        self.seen.setdefault(str(sample.key_expr), []).append({**fields, "at": time.monotonic()})
+
+    def last(self, path: str) -> dict[str, Any]:
+        return (self.seen.get(f"fleet/{path}") or [{}])[-1]
+
+    def get(self, key: str, **fields: Any) -> list[Any]:
+        return ask(self.session, key, **fields)
+
+    def hold(self, robot: str = "r1", who: str = "test", *, how: str = "acquire", **wishes: Any) -> None:
+        """Acquire a robot and keep its lease; from now on every command for it is the holder's."""
+        if robot in self._leases:
+            self._leases.pop(robot).close()
+        self._leases[robot] = Lease(self.session, robot, how, {"who": who, **wishes})
+
+    def put(self, path: str, payload: bytes = b"", **fields: Any) -> None:
+        payload = payload or packed(fields)
+        robot, _, command = path.partition("/@cmd/")
+        lease = self._leases.get(robot)
+        attachment = lease.held.attachment(command, payload) if lease is not None else None
+        congestion = zenoh.CongestionControl.BLOCK
+        self.session.put(f"fleet/{path}", payload, attachment=attachment, congestion_control=congestion)
+
+    def close(self) -> None:
+        """Renew nothing any more."""
+        while self._leases:
+            self._leases.popitem()[1].close()
+
+    def tokens(self, key: str = "fleet/*/@alive/gateway") -> list[str]:
+        return [str(reply.ok.key_expr) for reply in self.session.liveliness().get(key, timeout=2) if reply.ok]
+
+    def state(self, robot: str = "r1") -> str | None:
+        return self.last(f"{robot}/status").get("state")
+
+    def reason(self, robot: str = "r1") -> str:
+        return self.last(f"{robot}/status").get("reason") or ""
+
+    def refusal(self, robot: str = "r1", **wanted: Any) -> dict[str, Any] | None:
+        """Find what ``control`` shows as refused with these fields."""
+        entries = self.last(f"{robot}/control").get("refusals", [])
+        return next((entry for entry in entries if wanted.items() <= entry.items()), None)
+
+
+# Processes
+
+
 def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "zbridge", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        **popen,
-    )
+    """Start a command of zbridge."""
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, **popen}
+    command = [sys.executable, "-m", "zbridge", *arguments]
+    return subprocess.Popen(command, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}, **output)
 
 
 def end(process: subprocess.Popen[str], number: int = signal.SIGTERM, within_s: float = 5.0) -> str:
@@ -88,101 +189,51 @@ def end(process: subprocess.Popen[str], number: int = signal.SIGTERM, within_s: 
                 process.kill()
 
 
-class Lease:
-    """The lease of one robot by plain Zenoh and MessagePack, renewed on a thread until it is closed or has ended."""
+class Gateway:
+    """A process of ``zbridge run``; its log goes to a file, for a pipe that nobody reads would stop it.
 
-    def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
-        self._session = session
-        self._key = f"fleet/{robot}/@rpc/control/"
-        self.answer = self._ask(f"{how}/{wishes['who']}", packed(wishes))
-        assert self.answer["ok"], self.answer
-        self.held = Holder.of(self.answer, robot)
-        self._closed = threading.Event()
-        threading.Thread(target=self._renew, daemon=True).start()
+    ``parts``: of its configuration, besides robot and bus. It is killed with the stack.
+    """
 
-    def _ask(self, name: str, payload: bytes) -> dict[str, Any]:
-        """Ask one thing about the lease; an error is no answer."""
-        for reply in self._session.get(self._key + name, payload=payload, timeout=3.0):
-            if reply.ok is not None:
-                answer: dict[str, Any] = msgpack.unpackb(reply.ok.payload.to_bytes())
-                return answer
-        return {"ok": False, "reason": f"no answer to {name}"}
+    def __init__(self, stack: contextlib.ExitStack, file: Path, endpoint: str, *parts: str, robot: str = "r1") -> None:
+        bus = f'[bus]\nconnect = ["{endpoint}"]\nmulticast = false\n'
+        file.write_text(f'[robot]\nname = "{robot}"\n' + "".join(parts) + bus)
+        self._log = file.with_suffix(".log")
+        with self._log.open("ab") as log:
+            self.process = start("run", str(file), stdout=log, stderr=log)
+        stack.callback(end, self.process, signal.SIGKILL)
 
-    def _renew(self) -> None:
-        with contextlib.suppress(zenoh.ZError):  # the session was closed
-            while not self._closed.wait(self.answer["expires_in_s"] / 3):
-                if not self._ask("renew", self.held.question("renew"))["ok"]:
-                    return
+    @property
+    def log(self) -> str:
+        """What it has logged."""
+        return self._log.read_text()
 
-    def release(self) -> dict[str, Any]:
-        """Give the lease back."""
-        self.close()
-        return self._ask("release", self.held.question("release"))
+    def listens(self, count: int) -> bool:
+        """Whether so many listeners are open; a process that has ended says why."""
+        if self.process.poll() is not None:
+            raise AssertionError(f"the gateway ended: {self.log}")
+        return self.log.count("HQ programs connect at") >= count
 
-    def close(self) -> None:
-        """Renew it no longer."""
-        self._closed.set()
+    def signal(self, number: int) -> None:
+        self.process.send_signal(number)
+
+    def end(self) -> str:
+        """End it; an exit that is not clean is an error. Give what it has logged."""
+        end(self.process)
+        assert self.process.returncode == 0, self.log
+        assert "Traceback" not in self.log, self.log
+        return self.log
 
 
-class Fleet:
-    """A Zenoh session of the test, what it saw, and the robots it holds."""
+def device(port: int, protocol: str = "tcpudp", options: str = "", *more: int) -> str:
+    """Write ``[device]``."""
+    connect = json.dumps([f"tcp://{HOST}:{one}" for one in (port, *more)])
+    return f'[device]\nprotocol = "{protocol}"\nconnect = {connect}\n[device.options]\n{options}\n'
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self.session = session
-        self.seen: dict[str, list[dict[str, Any]]] = {}
-        self._leases: dict[str, Lease] = {}
-        self._subscriber = session.declare_subscriber("fleet/**", self._take)
 
-    def _take(self, sample: zenoh.Sample) -> None:
-        fields = msgpack.unpackb(sample.payload.to_bytes())
-        self.seen.setdefault(str(sample.key_expr), []).append({**fields, "at": time.monotonic()})
-
-    def last(self, path: str) -> dict[str, Any]:
-        return (self.seen.get(f"fleet/{path}") or [{}])[-1]
-
-    def get(self, key: str, timeout_s: float = 3.0, **fields: Any) -> list[Any]:
-        """Plain get: the decoded replies, errors too."""
-        payload = msgpack.packb(fields) if fields else None
-        return [
-            msgpack.unpackb((reply.ok or reply.err).payload.to_bytes())
-            for reply in self.session.get(key, payload=payload, timeout=timeout_s)
-        ]
-
-    def hold(self, robot: str, who: str = "test", *, how: str = "acquire", **wishes: Any) -> Lease:
-        """Acquire a robot and keep its lease; from now on every command for it is the holder's."""
-        self.let_go(robot)
-        lease = self._leases[robot] = Lease(self.session, robot, how, {"who": who, **wishes})
-        return lease
-
-    def let_go(self, robot: str) -> None:
-        """Renew the lease no longer, and command without it."""
-        lease = self._leases.pop(robot, None)
-        if lease is not None:
-            lease.close()
-
-    def put(self, path: str, **fields: Any) -> None:
-        self.put_payload(path, msgpack.packb(fields))
-
-    def put_payload(self, path: str, payload: bytes) -> None:
-        robot, _, command = path.partition("/@cmd/")
-        lease = self._leases.get(robot)
-        self.session.put(
-            f"fleet/{path}",
-            payload,
-            attachment=lease.held.attachment(command, payload) if lease is not None else None,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-
-    def close(self) -> None:
-        """Renew nothing any more."""
-        for robot in tuple(self._leases):
-            self.let_go(robot)
-
-    def tokens(self, key: str = "fleet/*/@alive/gateway") -> list[str]:
-        return [str(reply.ok.key_expr) for reply in self.session.liveliness().get(key, timeout=2) if reply.ok]
-
-    def state(self, robot: str) -> str | None:
-        return self.last(f"{robot}/status").get("state")
+def listener(name: str, protocol: str, port: int, more: str = "") -> str:
+    """Write one ``[[hq]]``."""
+    return f'[[hq]]\nname = "{name}"\nprotocol = "{protocol}"\nlisten = "tcp://{HOST}:{port}"\n{more}\n'
 
 
 class Bench:
@@ -190,32 +241,36 @@ class Bench:
 
     def __init__(self, folder: Path, stack: contextlib.ExitStack) -> None:
         self.folder = folder
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self._stack = stack
+        self.endpoint = f"tcp/{HOST}:{free_port()}"
+        self.stack = stack
         self._processes: list[int] = []
         self._withheld = Withheld()
-        self.fleet = Fleet(self._stack.enter_context(self.router()))
-        self._stack.callback(lambda: self.fleet.close())
+        self.fleet = Fleet(self.stack.enter_context(self.router()))
+        self.stack.callback(lambda: self.fleet.close())
 
     def router(self) -> zenoh.Session:
-        config = zenoh.Config()
-        config.insert_json5("mode", '"router"')
-        config.insert_json5("listen/endpoints", f'["{self.endpoint}"]')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        return zenoh.open(config)
+        return zenoh.open(configuration("router", self.endpoint))
 
-    def zbridge(self, *arguments: str, **popen: Any) -> subprocess.Popen[str]:
-        process = start(*arguments, **popen)
-        self.count(process.pid)
-        self._stack.callback(end, process, signal.SIGKILL)
+    @contextlib.contextmanager
+    def bus_away(self) -> Iterator[None]:
+        """Take the router away, and bring it back."""
+        self.fleet.session.close()
+        yield
+        self.fleet = Fleet(self.stack.enter_context(self.router()))
+
+    def zbridge(self, *arguments: str) -> subprocess.Popen[str]:
+        process = start(*arguments)
+        self._processes.append(process.pid)
+        self.stack.callback(end, process, signal.SIGKILL)
         return process
 
-    def count(self, pid: int) -> None:
-        """Count what is withheld from this process too."""
-        self._processes.append(pid)
+    @property
+    def withheld_s(self) -> float:
+        """The processor time that was withheld so far from this process and those it started: what excuses a delay."""
+        return self._withheld.seconds(self._processes)
 
     def ended_within(self, process: subprocess.Popen[str], seconds: float) -> None:
-        """Wait for the end of a process.
+        """Wait for the orderly end of a process.
 
         A busy machine excuses as long as anything waited for a processor: a process that has ended cannot be asked.
         """
@@ -223,33 +278,26 @@ class Bench:
         until(lambda: process.poll() is not None, what="the end of the process")
         took_s = time.monotonic() - began
         assert took_s < seconds + contended_s() - contended, f"it took {took_s:.2f} s"
+        assert process.returncode == 0
 
-    @property
-    def withheld_s(self) -> float:
-        """The processor time that was withheld so far from this process and those it started: what excuses a delay."""
-        return self._withheld.seconds(self._processes)
-
-    def simulator(self, port: int, protocol: str = "tcpudp", *more: str) -> subprocess.Popen[str]:
-        process = self.zbridge("simulate", protocol, "--listen", f"tcp://127.0.0.1:{port}", *more)
+    def simulator(self, protocol: str = "tcpudp", *more: str, port: int = 0) -> int:
+        """Start a simulated robot; give its port."""
+        port = port or free_port()
+        process = self.zbridge("simulate", protocol, "--listen", f"tcp://{HOST}:{port}", *more)
         assert process.stdout is not None
         assert "listening" in process.stdout.readline()
+        return port
+
+    def gateway(self, *parts: str, robot: str = "r1", name: str = "", endpoint: str = "") -> Gateway:
+        """Start a process for a robot with these parts of a configuration."""
+        file = self.folder / f"{name or robot}.toml"
+        process = Gateway(self.stack, file, endpoint or self.endpoint, *parts, robot=robot)
+        self._processes.append(process.process.pid)
         return process
 
-    def configuration(self, robot: str, port: int, more: str = "") -> Path:
-        file = self.folder / f"{robot}.toml"
-        file.write_text(
-            f'[robot]\nname = "{robot}"\n'
-            f'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{port}"]\n'
-            f'[bus]\nconnect = ["{self.endpoint}"]\nmulticast = false\n{more}'
-        )
-        return file
-
-    def gateway(self, robot: str, port: int, more: str = "") -> subprocess.Popen[str]:
-        return self.zbridge("run", str(self.configuration(robot, port, more)))
-
-    def serve(self, robot: str, port: int, more: str = "") -> subprocess.Popen[str]:
-        """Start a gateway and wait until its robot is established."""
-        process = self.gateway(robot, port, more)
+    def serve(self, port: int, *more: str, robot: str = "r1") -> Gateway:
+        """Start the gateway of a TCP/UDP robot and wait until the robot is established."""
+        process = self.gateway(device(port), *more, robot=robot)
         until(lambda: self.fleet.state(robot) == "established", what="established")
         return process
 
@@ -258,3 +306,9 @@ class Bench:
 def bench(tmp_path: Path) -> Iterator[Bench]:
     with contextlib.ExitStack() as stack:
         yield Bench(tmp_path, stack)
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    with contextlib.closing(Robot()) as scripted:
+        yield scripted

@@ -29,13 +29,17 @@ from typing import Any
 import msgpack
 import zenoh
 
-from tests.e2e.loss import SCALE, STOP, Frame, Scene, commander, configuration, kill, query, start
+from tests.e2e.conftest import configuration
+from tests.e2e.loss import Scene, commander, query
+from tests.e2e.processes import Part, module
+from tests.e2e.robots import SCALE, STOP, Frame
 from tests.proofs import Holder
 
 NAMES = ("anna", "bert")
 LEASE_S, DEADMAN_S = 0.4, 0.15
 GRANTS = {"acquired", "taken over"}
 ENDS = {"released", "ended"}
+WRITTEN = {"acquire": "acquired", "takeover": "taken over", "release": "released"}
 SLACK_S = 0.1
 """Seconds by which clocks of one machine, read in several processes, may disagree when it is busy."""
 _NUMBERS = 100
@@ -132,7 +136,7 @@ class Driver:
 
 def be_driver(endpoint: str, name: str, seconds: float, seed: str) -> None:
     """Wait for the word, and fight."""
-    with zenoh.open(configuration("client", [endpoint])) as session:
+    with zenoh.open(configuration("client", endpoint)) as session:
         driver = Driver(session, name, random.Random(f"{name} {seed}"))
         print("ready", flush=True)
         if sys.stdin.readline():
@@ -152,24 +156,16 @@ class Story:
     frames: list[Frame] = field(default_factory=list)
     clock_s: float = 0.0
     """What the monotonic clock lags behind Unix time."""
-    log: str = ""
 
     def __str__(self) -> str:
-        told = Counter(
-            f"{a['what']} {'granted' if a['ok'] else 'denied'}" for a in self.accounts if a["what"] != "stop"
-        )
-        told["stop"] = sum(account["what"] == "stop" for account in self.accounts)
-        runs = [holder for holder, _ in itertools.groupby(who for _, who in self.motions())]
+        told = Counter(f"{account['what']} {'granted' if account['ok'] else 'denied'}" for account in self.accounts)
+        leases = {holder_of(frame) for frame in self.frames if frame.moves}
         return (
             f"drivers: {dict(told)}\naudit: {dict(Counter(line['event'] for line in self.audit))}\n"
             f"control: {len(self.control)} messages\n"
-            f"robot: {sum(1 for _ in self.motions())} motions of {len(runs)} leases, "
+            f"robot: {sum(frame.moves for frame in self.frames)} motions of {len(leases)} leases, "
             f"{sum(frame.packet_id == STOP for frame in self.frames)} stops"
         )
-
-    def motions(self) -> list[tuple[Frame, str]]:
-        """Give the motions that arrived, each with the name that its lease was asked for under."""
-        return [(frame, holder_of(frame)) for frame in self.frames if frame.moves]
 
 
 def holder_of(frame: Frame) -> str:
@@ -188,26 +184,17 @@ def fight(seconds: float, seed: int = 1) -> Story:
                 "fleet/r1/control", lambda sample: story.control.append(msgpack.unpackb(sample.payload.to_bytes()))
             )
         )
-        command = [sys.executable, "-m", "tests.e2e.fight", "--be", "driver", scene.endpoint]
-        drivers = [start(*command, name, str(seconds), str(seed)) for name in NAMES]
-        for driver in drivers:
-            stack.callback(kill, driver)
-            assert driver.stdout is not None
-            assert driver.stdout.readline() == "ready\n"
-        for driver in drivers:
-            assert driver.stdin is not None
-            driver.stdin.write("go\n")
-            driver.stdin.flush()
-        for driver in drivers:
-            output, _ = driver.communicate(timeout=seconds + 20)
-            story.accounts += map(json.loads, output.splitlines())
-            assert driver.returncode == 0
+        driver = ("fight", "--be", "driver", scene.endpoint)
+        drivers = [Part(stack, *module(*driver, name, seconds, seed)) for name in NAMES]
+        for driver_part in drivers:
+            assert driver_part.line() == "ready"
+        for driver_part in drivers:
+            driver_part.say("go")
+        for driver_part in drivers:
+            story.accounts += map(json.loads, driver_part.rest(seconds + 20))
         time.sleep(LEASE_S + 1.2)  # what refusals repeat themselves is written once a second
-        scene.gateway.terminate()
-        assert scene.gateway.wait(timeout=5) == 0
+        scene.gateway.end()
         story.audit = [json.loads(line) for line in audit.read_text().splitlines()]
-        scene.log.seek(0)
-        story.log = scene.log.read()
     return story
 
 
@@ -218,182 +205,113 @@ def faults(story: Story) -> list[str]:
     """Hold the accounts against one another; give every contradiction."""
     if not story.audit or not story.accounts or not story.frames:
         return ["nothing happened"]
-    found = [
-        *_shape(story.audit),
-        *_one_holder(story.audit),
-        *_grants(story),
-        *_releases_and_stops(story),
-        *_refusals(story),
-        *_control(story),
-        *_robot(story),
-    ]
-    if "Traceback" in story.log:
-        found.append(f"the gateway failed: {story.log}")
-    return found
+    held, found = _held(story.audit)
+    found += [*_answers(story), *_stops(story)]
+    return [*found, *_control(story, [*held]), *_robot(story, held)]
 
 
-def _shape(audit: list[dict[str, Any]]) -> list[str]:
-    """Check that every line has a time in UTC with milliseconds, in order, and what happened to which robot."""
-    found, last = [], ""
-    for line in audit:
-        at = datetime.fromisoformat(line["time"])
-        if at.utcoffset() is None or at.utcoffset() or line["time"] != at.isoformat(timespec="milliseconds"):
-            found.append(f"time {line['time']!r} is not UTC with milliseconds")
-        if line["time"] < last:
-            found.append(f"{line['time']} after {last}")
-        last = line["time"]
-        if line["robot"] != "r1" or not line["event"]:
-            found.append(f"no robot or event: {line}")
-    return found
+def _at(line: dict[str, Any]) -> float:
+    return datetime.fromisoformat(line["time"]).timestamp()
 
 
-def _one_holder(audit: list[dict[str, Any]]) -> list[str]:
-    """Check that the lease was given only when nobody had it, and ended only for who had it."""
+def _held(audit: list[dict[str, Any]]) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    """Read from the log who held the robot, in order, from when to when in Unix time.
+
+    The lease must be given only when nobody has it, and end only for who has it.
+    """
+    held: dict[str, tuple[float, float]] = {}
     found, holder = [], None
     for line in audit:
         event, who = line["event"], line.get("who")
         if event in GRANTS:
             if holder is not None:
                 found.append(f"{who} was given the lease of {holder}")
-            holder = who
-        elif event in ENDS:
+            holder, held[who] = who, (_at(line), float("inf"))
+        elif event in (*ENDS, "stopped"):
             if who != holder:
                 found.append(f"{event} {who} while {holder} held the lease")
-            holder = None
-        elif event == "stopped":
-            if who != holder:
-                found.append(f"stopped {who} while {holder} held the lease")
             if line.get("reason") != "deadman":  # after a deadman the lease stays
+                held[who] = (held.get(who, (0.0, 0.0))[0], _at(line))
                 holder = None
-    return found
+    return held, found
 
 
-def _grants(story: Story) -> list[str]:
-    """Check that the drivers were granted what the log says, when it says, in its order."""
-    granted = {a["who"]: a for a in story.accounts if a["ok"] and a["what"] in ("acquire", "takeover")}
-    lines = [line for line in story.audit if line["event"] in GRANTS]
+def _answers(story: Story) -> list[str]:
+    """Check that what the drivers were answered is in the log, in its order and at its time, and nothing else."""
+    written = {(line["event"], line.get("who")): line for line in story.audit}
+    answered = {(WRITTEN[a["what"]], a["who"]): a for a in story.accounts if a["ok"] and a["what"] in WRITTEN}
     unanswered = {account["who"] for account in story.accounts if not account["answered"]}
-    found = [
-        f"{who} was granted, the log has no word of it" for who in granted.keys() - {line["who"] for line in lines}
-    ]
+    found = [f"{who} was answered, the log has not {event}" for event, who in answered.keys() - written.keys()]
     began = 0.0
-    for line in lines:
-        account = granted.get(line["who"])
+    for (event, who), line in written.items():
+        account = answered.get((event, who))
         if account is None:
-            if line["who"] not in unanswered:
-                found.append(f"the log says {line['event']}, {line['who']} was not granted it")
+            if event in GRANTS and who not in unanswered:
+                found.append(f"the log has {event}, {who} was not granted it")
             continue
-        if (account["what"] == "takeover") != (line["event"] == "taken over"):
-            found.append(f"the log says {line['event']}, {line['who']} asked for {account['what']}")
-        if account["ended"] < began:
-            found.append(f"{line['who']} was granted before the one that the log has before")
-        began = max(began, account["began"])
-        found += _in_time(line, account)
-    return found
-
-
-def _in_time(line: dict[str, Any], account: dict[str, Any]) -> list[str]:
-    at = datetime.fromisoformat(line["time"]).timestamp()
-    if account["began"] - SLACK_S <= at <= account["ended"] + SLACK_S:
-        return []
-    return [f"{line} is not in the time of {account}"]
+        if event in GRANTS:
+            if account["ended"] < began:
+                found.append(f"{who} was granted before the one that the log has before")
+            began = max(began, account["began"])
+        if not account["began"] - SLACK_S <= _at(line) <= account["ended"] + SLACK_S:
+            found.append(f"{line} is not in the time of {account}")
+    refused = {(line.get("who"), line.get("reason")) for line in story.audit if line["event"] == "refused"}
+    denied = [a for a in story.accounts if a["what"] in ("acquire", "takeover") and a["answered"] and not a["ok"]]
+    reasons = {(account["who"], account["reason"]) for account in denied}
+    return found + [f"{who} was denied ({reason}), the log has no word of it" for who, reason in reasons - refused]
 
 
 SAME_STOP_S = 0.3
 """Seconds after a stop within which another one may be counted with it, however late the machine is."""
 
 
-def _releases_and_stops(story: Story) -> list[str]:
-    """Check that every release that was answered, and every stop, is written down."""
-    released = {line["who"]: line for line in story.audit if line["event"] == "released"}
-    accounts = {a["who"]: a for a in story.accounts if a["what"] == "release" and a["ok"]}
-    found = [f"{who} released, the log has no word of it" for who in accounts.keys() - released.keys()]
-    found += [fault for who in accounts.keys() & released.keys() for fault in _in_time(released[who], accounts[who])]
+def _stops(story: Story) -> list[str]:
+    """Check that every stop is written down."""
     stops = sorted(account["began"] for account in story.accounts if account["what"] == "stop")
     apart = sum(later - sooner > SAME_STOP_S for sooner, later in itertools.pairwise([0.0, *stops]))
-    written = sum(
-        line.get("count", 1) for line in story.audit if line["event"] == "stopped" and line.get("reason") == "stop"
-    )
-    if not apart <= written <= len(stops):
-        found.append(f"{len(stops)} stops were put, {apart} of them apart, {written} are in the log")
-    return found
+    lines = [line for line in story.audit if line["event"] == "stopped" and line.get("reason") == "stop"]
+    written = sum(line.get("count", 1) for line in lines)
+    if apart <= written <= len(stops):
+        return []
+    return [f"{len(stops)} stops were put, {apart} of them apart, {written} are in the log"]
 
 
-def _refusals(story: Story) -> list[str]:
-    """Check that who was denied the lease is in the log with the reason that it was told."""
-    written = {(line.get("who"), line.get("reason")) for line in story.audit if line["event"] == "refused"}
-    denied = [a for a in story.accounts if a["what"] in ("acquire", "takeover") and a["answered"] and not a["ok"]]
-    return [
-        f"{a['who']} was denied ({a['reason']}), the log has no word of it"
-        for a in denied
-        if (a["who"], a["reason"]) not in written
-    ]
-
-
-def _control(story: Story) -> list[str]:
+def _control(story: Story, order: list[str]) -> list[str]:
     """Check that ``control`` shows one holder at most, and the holders in the log's order."""
-    order = _order(story)
-    found, last = [], -1
-    for shown in story.control:
-        holder = shown.get("holder")
-        if (shown["state"] == "held") != (holder is not None):
-            found.append(f"control: {shown['state']} by {holder}")
-        if holder is None:
-            continue
-        if holder not in order:
-            found.append(f"control shows {holder}, who is not in the log")
-        elif order[holder] < last:
-            found.append(f"control shows {holder} after a later holder")
-        else:
-            last = order[holder]
-    return found
+    found = [
+        f"control: {shown['state']} by {shown.get('holder')}"
+        for shown in story.control
+        if (shown["state"] == "held") != (shown.get("holder") is not None)
+    ]
+    holders = [shown["holder"] for shown in story.control if shown.get("holder") is not None]
+    return found + _in_order("control shows", holders, order)
 
 
-def _order(story: Story) -> dict[str, int]:
-    lines = [line["who"] for line in story.audit if line["event"] in GRANTS]
-    return {who: number for number, who in enumerate(lines)}
+def _in_order(what: str, holders: list[str], order: list[str]) -> list[str]:
+    """Check that every holder is in the log, and comes in its order."""
+    strangers = {holder for holder in holders if holder not in order}
+    places = [order.index(holder) for holder in holders if holder in order]
+    back = [order[later] for sooner, later in itertools.pairwise(places) if later < sooner]
+    found = [f"{what} {holder}, who is not in the log" for holder in strangers]
+    return found + [f"{what} {holder} after a later holder" for holder in back]
 
 
-def _robot(story: Story) -> list[str]:
+def _robot(story: Story, held: dict[str, tuple[float, float]]) -> list[str]:
     """Check that the robot moved for one holder after the other, in the log's order, and was stopped in between."""
-    order, times = _order(story), _times(story)
-    found: list[str] = []
+    found = _in_order("the robot moved for", [holder_of(frame) for frame in story.frames if frame.moves], [*held])
     moving: str | None = None
-    last = -1
     for frame in story.frames:
         if not frame.moves:
             moving = None if frame.packet_id == STOP else moving
             continue
-        who = holder_of(frame)
-        if who not in order:
-            found.append(f"the robot moved for {who}, who is not in the log")
-            continue
-        if order[who] < last:
-            found.append(f"the robot moved for {who} after a later holder")
+        who, at = holder_of(frame), frame.at + story.clock_s
         if moving not in (None, who):
             found.append(f"the robot moved for {moving} and then for {who} without a stop")
-        begins, ends = times[who]
-        if not begins - SLACK_S <= frame.at + story.clock_s <= ends + SLACK_S:
-            found.append(f"the robot moved for {who} at {frame.at + story.clock_s - begins:.3f} s of its lease")
-        moving, last = who, max(last, order[who])
-    if moving is not None:
-        found.append(f"the robot was left moving for {moving}")
-    return found
-
-
-def _times(story: Story) -> dict[str, tuple[float, float]]:
-    """Give when each lease began and ended, in Unix time."""
-    times: dict[str, tuple[float, float]] = {}
-    holder: str | None = None
-    for line in story.audit:
-        at = datetime.fromisoformat(line["time"]).timestamp()
-        if line["event"] in GRANTS:
-            holder = line["who"]
-            times[holder] = (at, float("inf"))
-        elif holder is not None and line["event"] != "refused" and line.get("reason") != "deadman":
-            times[holder] = (times[holder][0], at)
-            holder = None
-    return times
+        begins, ends = held.get(who, (0.0, float("inf")))
+        if not begins - SLACK_S <= at <= ends + SLACK_S:
+            found.append(f"the robot moved for {who} at {at - begins:.3f} s of its lease")
+        moving = who
+    return found + ([f"the robot was left moving for {moving}"] if moving is not None else [])
 
 
 def main() -> None:

@@ -1,40 +1,192 @@
 """Fragile robots, each a process of its own, so that nothing but the machine makes it late.
 
-``python -m tests.e2e.fragile NAME [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its connection; any
-other ends it, and it prints what it received and what was violated as one JSON object, bytes as hex. NAME is one of
-:data:`ROBOTS`; OPTIONS: more arguments of the robot's class, and ``times``, as a JSON object.
+``python -m tests.e2e.fragile NAME HOST [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its connection;
+any other ends it, and it prints what it received and what was violated as one JSON object, bytes as hex. NAME is one of
+:data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``times``, and ``tells``, as a JSON object.
+
+A robot that ``tells`` prints a line ``AT SPEED`` (monotonic seconds, fraction of full scale) for each change of what it
+last obeyed, and waits for its own sends as long as its kernel does: deployed ones block in them.
 """
 
 import asyncio
 import contextlib
 import json
+import math
 import re
-import subprocess
+import socket
+import struct
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
 from gateways.tcpudp.conformance import parser as tcpudp_wire
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.wc2ec.conformance import parser as wc2ec_wire
 from gateways.wc2ec.conformance.fragile_robot import FragileController
+from tests.e2e.processes import Part, module
 
-ROBOTS: dict[str, Callable[..., Any]] = {
+SEND_S = 3600.0
+HELD_UP_S = 0.1
+"""Seconds of one send after which a robot's program counts as held up by it."""
+GOES_ON = "on"
+"""The word after the time at which such a program goes on."""
+WHEEL_M, FULL_M_S = 0.05, 0.5
+WHEELS = f"""
+bounds_default = [0.0, 1000.0]
+[device.options.differential]
+left = ["left wheel motor"]
+right = ["right wheel motor"]
+wheel_radius_m = {WHEEL_M}
+track_m = 0.3
+speed_full_m_s = {FULL_M_S}
+turn_full_rad_s = 1.0
+"""
+"""The options of the fragile Webots controller: 10 rad/s of both wheels are full scale."""
+DRAFT = """
+values = 3
+pinned = ["light3"]
+devices = [
+  { name = "light0", number = 0 }, { name = "light1", number = 1 },
+  { name = "light2", number = 2 }, { name = "light3", number = 3 },
+]
+"""
+
+# The robots
+
+
+class Kind(NamedTuple):
+    """One kind of fragile robot; what its gateway is told of it, and the name that reports give it."""
+
+    make: Callable[..., Any]
+    protocol: str
+    version: str
+    options: str = ""
+    udp: bool = False
+
+
+def package(version: str, udp: bool) -> Kind:
+    """Make a TCP/UDP robot; it tells the speed of 11, the turn of 12, and 0 for 13."""
+
+    def make(tells: bool, times: dict[str, float], **options: Any) -> FragileRobot:
+        times = {"send_s": SEND_S} if tells else {"part_s": 0.2, **times}
+        robot = FragileRobot(version=version, udp=udp, times=tcpudp_wire.Times(**times), **options)
+        followed(robot.machine, "steer", told)
+        return robot
+
+    def told(body: bytes) -> float:
+        values = struct.unpack(f"<{len(body) // 4}f", body)
+        return math.hypot(*values[:2]) * values[2] if len(values) == 3 else sum(values)
+
+    return Kind(make, "tcpudp", version + " UDP" * udp, udp=udp)
+
+
+def vehicle(dialect: alf_wire.Dialect) -> Kind:
+    """Make an ALF vehicle; it tells the speed of 3, and 0 when its motor stops by itself."""
+
+    def make(tells: bool, times: dict[str, float], **options: Any) -> FragileVehicle:
+        waits = alf_wire.Times(**{"send_s": SEND_S} if tells else {"info_s": 0.2, **times})
+        robot = FragileVehicle(dialect, laser=True, drive=True, times=waits, **options)
+        followed(robot.machine, "obey", lambda dialect, fields: fields[0] / alf_wire.FULL_PERCENT)
+        followed(robot.machine, "stop", lambda: 0.0)
+        return robot
+
+    return Kind(make, "alf", dialect, f'dialect = "{dialect}"\n')
+
+
+class _Controller(FragileController):
+    """Tells when it goes on after its own send held it up: it sends and reads one after the other.
+
+    Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
+    """
+
+    async def _send(self, conn: socket.socket, messages: list[bytes]) -> None:
+        begun = time.monotonic()
+        await super()._send(conn, messages)
+        if telling and time.monotonic() - begun > HELD_UP_S:
+            print(f"{time.monotonic():.6f} {GOES_ON}", flush=True)
+
+
+def controller(dialect: wc2ec_wire.Dialect, told: str) -> Kind:
+    """Make a Webots controller; it tells the speed of its fastest wheel."""
+
+    def make(tells: bool, times: dict[str, float], **options: Any) -> FragileController:
+        waits = wc2ec_wire.Times(**{"send_s": SEND_S} if tells else times)
+        made = _Controller(dialect, times=waits, **options)
+
+        def fastest(_: object) -> float:
+            motors = [motor for motor in made.robot.motors.values() if motor.device.kind is wc2ec_wire.Kind.ROTATIONAL]
+            return max(abs(motor.velocity) for motor in motors) * WHEEL_M / FULL_M_S
+
+        followed(made.robot, "set_motor", fastest)
+        return made
+
+    return Kind(make, "wc2ec", dialect, f'dialect = "{dialect}"\n{told}')
+
+
+ROBOTS = {
     **{
-        f"tcpudp-{version}{'-udp' * udp}": lambda version=version, udp=udp, times=(), **options: FragileRobot(
-            version=version, udp=udp, times=tcpudp_wire.Times(**{"part_s": 0.2, **dict(times)}), **options
-        )
+        f"tcpudp-{version}{'-udp' * udp}": package(version, udp)
         for version in ("1.1", "1.2", "1.3", "1.4")
         for udp in (False, True)
     },
-    "alf": lambda **options: FragileVehicle(
-        "text", laser=True, drive=True, times=alf_wire.Times(info_s=0.2), **options
-    ),
-    "wc2ec-deployed": lambda **options: FragileController("deployed", **options),
-    "wc2ec-draft": lambda **options: FragileController("draft", **options),
+    "alf": vehicle("text"),
+    "alf-binary": vehicle("binary"),
+    "wc2ec": controller("deployed", WHEELS),
+    "wc2ec-draft": controller("draft", DRAFT),
 }
 
+# What they tell
+
+telling = False
+_known = 0.0
+
+
+def followed(machine: Any, name: str, speed: Callable[..., float]) -> None:
+    """Tell the speed that a machine was commanded by one of its methods, each time that it is another one."""
+    method = getattr(machine, name)
+
+    def obeyed(*arguments: Any) -> None:
+        global _known
+        method(*arguments)
+        commanded = round(speed(*arguments), 3)
+        if telling and commanded != _known:
+            _known = commanded
+            print(f"{time.monotonic():.6f} {commanded:g}", flush=True)
+
+    setattr(machine, name, obeyed)
+
+
+async def main() -> None:
+    global telling
+    name, host, told = sys.argv[1:]
+    options = {"tells": False, "times": {}, **json.loads(told)}
+    telling = options["tells"]
+    robot = ROBOTS[name].make(**options)
+    serving = asyncio.create_task(robot.serve(host, 0, lambda port: print(port, flush=True)))
+    while await asyncio.to_thread(sys.stdin.readline) == "cut\n":
+        robot.cut()
+    left = serving.done()
+    serving.cancel()
+    await asyncio.wait([serving])
+    report = {
+        "violations": robot.violations,
+        "events": robot.events,
+        "alive": robot.alive and not getattr(robot, "stuck", False),
+        "left": left,
+        "moving": robot.machine.moving if hasattr(robot, "machine") else robot.robot.moving,
+        **{name: [*map(shown, getattr(robot, name, ()))] for name in ("received", "misread", "piled")},
+    }
+    print(json.dumps(report))
+
+
+def shown(row: Any) -> list[Any]:
+    return [value.hex() if isinstance(value, bytes) else value for value in row]
+
+
+# For those who start them
 
 DISTURBED = 5
 """Most runs against one robot that is disturbed each time."""
@@ -57,49 +209,26 @@ def disturbed(report: dict[str, Any]) -> bool:
     return any(packet_id in _HANDSHAKE for _, _, packet_id, _ in report["piled"])
 
 
+class Fragile(Part):
+    """A fragile robot that was started here."""
+
+    def __init__(self, stack: contextlib.ExitStack, name: str, *, seed: int = 1, **options: Any) -> None:
+        super().__init__(stack, *module("fragile", name, "127.0.0.1", json.dumps({"seed": seed, **options})))
+        self.kind = ROBOTS[name]
+        self.port = int(self.line())
+
+    def ended(self) -> dict[str, Any]:
+        """End it; give what it has to say."""
+        self.say("end")
+        report: dict[str, Any] = json.loads(self.rest()[-1])
+        return report
+
+
 @contextlib.contextmanager
-def fragile_robot(name: str, *, seed: int = 1, **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """Start a fragile robot; its first line is its port."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.e2e.fragile", name, json.dumps({"seed": seed, **options})],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def ended(robot: subprocess.Popen[str]) -> dict[str, Any]:
-    """End a fragile robot; give what it has to say."""
-    report: dict[str, Any] = json.loads(robot.communicate("end\n", timeout=20)[0])
-    return report
-
-
-async def main() -> None:
-    robot = ROBOTS[sys.argv[1]](**json.loads(sys.argv[2]) if len(sys.argv) > 2 else {})
-    serving = asyncio.create_task(robot.serve("127.0.0.1", 0, lambda port: print(port, flush=True)))
-    while await asyncio.to_thread(sys.stdin.readline) == "cut\n":
-        robot.cut()
-    left = serving.done()
-    serving.cancel()
-    await asyncio.wait([serving])
-    report = {
-        "violations": robot.violations,
-        "events": robot.events,
-        "alive": robot.alive and not getattr(robot, "stuck", False),
-        "left": left,
-        "moving": robot.machine.moving if hasattr(robot, "machine") else robot.robot.moving,
-        **{name: [*map(shown, getattr(robot, name, ()))] for name in ("received", "misread", "piled")},
-    }
-    print(json.dumps(report))
-
-
-def shown(row: Any) -> list[Any]:
-    return [value.hex() if isinstance(value, bytes) else value for value in row]
+def fragile_robot(name: str, **options: Any) -> Iterator[Fragile]:
+    """Start a fragile robot for a while."""
+    with contextlib.ExitStack() as stack:
+        yield Fragile(stack, name, **options)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,6 @@ import argparse
 import asyncio
 import contextlib
 import struct
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator, Iterable
@@ -27,9 +25,11 @@ from gateways.alf.conformance.parser import Dialect
 from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.tcpudp.conformance.parser import Feature
 from gateways.wc2ec.conformance.fragile_hq import FragileController
-from tests.e2e.conftest import Bench
-from tests.e2e.fragile import DISTURBED, charges, disturbed, ended, fragile_robot
-from tests.e2e.hq_scene import HOST, WHEELS, Gateway, device, gateway, listener, playing, ports, soon
+from tests.e2e import mixed
+from tests.e2e.conftest import HOST, Bench, Gateway, device, free_port, listener
+from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
+from tests.e2e.hq_scene import playing, ports, soon
+from tests.e2e.processes import report
 
 LEASE_S = 1.2
 """Seconds of neutral after which a robot is given back: short, so that the next program may have it soon."""
@@ -43,37 +43,66 @@ JOIN_S = 0.5
 """For how long the listener of an external controller waits for the other wheel."""
 RANGES = tuple(120.0 + degree / 2 for degree in range(360))
 """Simulated lidar data: centimetres, one a degree."""
+_AT_ONCE = {"misnamed": 0.0, "times": {"unasked_s": 0.05}}
 ROBOTS: dict[str, tuple[str, dict[str, Any]]] = {
-    "tcpudp-1.1": ("tcpudp-1.1", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
-    "tcpudp-1.2": ("tcpudp-1.2", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
-    "tcpudp-1.3": ("tcpudp-1.3-udp", {"misnamed": 0.0, "times": {"unasked_s": 0.05}}),
+    **{f"tcpudp-{version}": (f"tcpudp-{version}", _AT_ONCE) for version in ("1.1", "1.2")},
+    "tcpudp-1.3": ("tcpudp-1.3-udp", _AT_ONCE),
     "alf": ("alf", {}),
-    "wc2ec": ("wc2ec-deployed", {}),
+    "wc2ec": ("wc2ec", {}),
 }
 """The fragile robots, and what they are told."""
 ALF_FULL = {"text": 255, "binary": 100}
 _BEARINGS = ", ".join(f"ds{number} = {45.0 * number}" for number in range(8))
 _TABLES = ", ".join(f"ds{number} = [[0.0, 0.0], [1000.0, 2.0]]" for number in range(8))
-WEBOTS = f"scan_range_m = [0.0, 2.0]\nbearings_deg = {{ {_BEARINGS} }}\ntables = {{ {_TABLES} }}\n{WHEELS}"
+WEBOTS = f"scan_range_m = [0.0, 2.0]\nbearings_deg = {{ {_BEARINGS} }}\ntables = {{ {_TABLES} }}\n"
 
 
-class Tcp:
-    """A TCP/UDP program of one version, on a listener of its own."""
+class Program:
+    """An HQ program on a listener of its own; ``number``: of its client there."""
+
+    name: str
+    protocol: str
+    options = ""
+    number = 1
+    judge: Any
+
+    @property
+    def ready(self) -> bool:
+        return bool(self.judge.connected.is_set())
+
+    async def drive(self, forward: float) -> None:
+        """Push the stick."""
+        raise NotImplementedError
+
+    async def idle(self) -> None:
+        """Let go of the stick, if there is one."""
+
+    async def release(self) -> None:
+        """Give the robot back, if there is a word for it."""
+
+    def sees(self, robot: str) -> bool:
+        """Tell whether it was shown what the robot has."""
+        raise NotImplementedError
+
+    async def leave(self) -> None:
+        """Leave, if that is not left to the gateway."""
+
+
+class Tcp(Program):
+    """A TCP/UDP program of one version."""
+
+    protocol = "tcpudp"
 
     def __init__(self, version: str, *, udp: bool) -> None:
         self.name = f"tcp{version}"
-        (port,) = ports(1)  # each binds one of its own, as if it had a machine of its own
+        port = free_port()  # each binds one of its own, as if it had a machine of its own
         self.judge = TcpHq(version=version, udp=udp, lidar_sim=version != "1.1", udp_port=port)
-        self.protocol = "tcpudp"
         listed = '"1.1", "1.2", "1.3"' if version == "1.3" else f'"{version}"'
         self.options = f"options = {{ versions = [{listed}], client_port = {port} }}"
 
     @property
-    def number(self) -> int:
-        return self.judge.client_id
-
-    @property
     def ready(self) -> bool:
+        self.number = self.judge.client_id
         return self.judge.established.is_set()
 
     async def ask(self) -> None:
@@ -101,25 +130,17 @@ class Tcp:
             return judge.position is not None and bool(judge.map)
         return judge.settings is not None and judge.settings.features >= {Feature.JOYSTICK}
 
-    async def leave(self) -> None:
-        """Stay: the gateway ends first."""
 
-
-class Alf:
-    """The driving program of ALF in one dialect."""
+class Alf(Program):
+    """The driving program of ALF in one dialect, or the scanning one, which sends no commands."""
 
     protocol = "alf"
-    number = 1
 
-    def __init__(self, dialect: Dialect) -> None:
-        self.name = f"alf-{dialect}"
-        self.judge = AlfHq(dialect=dialect, deployed="driving")
+    def __init__(self, dialect: Dialect, *, scans: bool = False) -> None:
+        self.name = "alf-scans" if scans else f"alf-{dialect}"
+        self.judge = AlfHq(dialect=dialect, deployed="scanning" if scans else "driving")
         self.options = f'options = {{ dialect = "{dialect}" }}'
-        self._full = ALF_FULL[dialect]
-
-    @property
-    def ready(self) -> bool:
-        return self.judge.connected.is_set()
+        self._scans, self._full = scans, ALF_FULL[dialect]
 
     async def drive(self, forward: float) -> None:
         self.judge.drive(round(abs(forward) * self._full), int(forward < 0))
@@ -127,11 +148,10 @@ class Alf:
     async def idle(self) -> None:
         self.judge.idle()
 
-    async def release(self) -> None:
-        """Do nothing: there is no word for it."""
-
     def sees(self, robot: str) -> bool:
-        """Drive info of a vehicle."""
+        """Drive info of a vehicle, or measurements: a robot of 1.1 has none, nor can be fed with one."""
+        if self._scans:
+            return robot == "tcpudp-1.1" or (self.judge.scanner is not None and self.judge.scans > 0)
         return robot != "alf" or bool(self.judge.infos)
 
     async def leave(self) -> None:
@@ -140,49 +160,17 @@ class Alf:
             await self.judge.end()
 
 
-class AlfScanning:
-    """The scanning program of ALF, which sends no commands."""
-
-    protocol = "alf"
-    number = 1
-    name = "alf-scans"
-    options = ""
-
-    def __init__(self) -> None:
-        self.judge = AlfHq(deployed="scanning")
-
-    @property
-    def ready(self) -> bool:
-        return self.judge.connected.is_set()
-
-    async def drive(self, forward: float) -> None:
-        raise NotImplementedError
-
-    async def idle(self) -> None:
-        """Do nothing: it has no stick."""
-
-    release = idle
-
-    def sees(self, robot: str) -> bool:
-        """Measurements where there is any scan: a robot of 1.1 has none, nor can be fed with one."""
-        return robot == "tcpudp-1.1" or (self.judge.scanner is not None and self.judge.scans > 0)
-
-    async def leave(self) -> None:
-        """Stay: the gateway ends first."""
-
-
-class Ec:
+class Ec(Program):
     """An external controller that drives the wheels, and sets them to 0 again and again while it idles."""
 
     protocol = "wc2ec"
-    number = 1
     name = "ec"
     options = f"options = {{ join_s = {JOIN_S} }}"
     """On a busy machine its two wheels are further apart than elsewhere."""
 
     def __init__(self) -> None:
         self.judge = FragileController(split=True)
-        self._forward = 0.0
+        self._forward, self._setting = 0.0, asyncio.Lock()
 
     @property
     def ready(self) -> bool:
@@ -195,9 +183,10 @@ class Ec:
     async def drive(self, forward: float) -> None:
         """Set both wheels once, it holds: 10 rad/s are full scale of the robots here."""
         self._forward = forward
-        for name in self._wheels:
-            await self.judge.set(name, 10.0 * forward)
-            await asyncio.sleep(BETWEEN_S)
+        async with self._setting:  # an idle that has begun is not mixed with it
+            for name in self._wheels:
+                await self.judge.set(name, 10.0 * forward)
+                await asyncio.sleep(BETWEEN_S)
 
     async def idle(self) -> None:
         await self.drive(0.0)
@@ -208,9 +197,6 @@ class Ec:
                 if not self._forward:
                     await self.drive(0.0)
                 await asyncio.sleep(IDLE_S)
-
-    async def release(self) -> None:
-        """Do nothing: there is no word for it."""
 
     def sees(self, robot: str) -> bool:
         """The robot's own devices, else sectors of whatever scan there is."""
@@ -228,45 +214,32 @@ class Ec:
         known = [self.judge.values.get(names[sensor], -1.0) >= 0.0 for sensor in sensors if sensor in names]
         return names.keys() == expected and (robot == "tcpudp-1.1" or all(known))
 
-    async def leave(self) -> None:
-        """Stay: the gateway ends first."""
 
-
-Program = Tcp | Alf | AlfScanning | Ec
 DRIVES = {"tcp1.1": 0.4, "alf-text": -0.4, "tcp1.2": 0.6, "alf-binary": -0.6, "tcp1.3": 0.8, "ec": -0.8}
 """Who drives, and at what fraction of full scale; each at its own, so that the robot can tell them apart."""
 
 
 @dataclass
-class Judgement:
+class Judgement(mixed.Judgement):
     """What came of one robot."""
 
-    robot: str
     drove: list[str] = field(default_factory=list)
-    seconds: float = 0.0
-    faults: list[str] = field(default_factory=list)
-    excused: list[str] = field(default_factory=list)
-    late_s: float = 0.0
-    """The processor time that was withheld from the gateway and the programs."""
     received: dict[str, int] = field(default_factory=dict)
     """Messages that each program got."""
 
-    @property
-    def clean(self) -> bool:
-        """Whether nobody has anything to complain of."""
-        return not self.faults
-
     def __str__(self) -> str:
         return (
-            f"{self.robot}: {', '.join(self.drove)} drove, {self.seconds:.0f} s, received {self.received}, "
+            f"{self.name}: {', '.join(self.drove)} drove, {self.seconds:.0f} s, received {self.received}, "
             f"{len(self.faults)} faults, {len(self.excused)} excused (the judge's process was late)"
         )
 
-    def hold_against(self, who: str, violations: Iterable[str]) -> None:
+    def hear(self, who: str, alive: bool, violations: Iterable[str]) -> None:
         """Take note of violations; of those by the judge's own lateness, or by the machine's, apart."""
         for text in violations:
             charged = charges([text], self.late_s)
             (self.faults if charged else self.excused).append(f"{who}: {text}")
+        if not alive:
+            self.faults.append(f"{who} died")
 
 
 class Stage:
@@ -288,101 +261,77 @@ class Stage:
 
         def blind() -> list[str]:
             feeder = self.program("tcp1.3").judge
-            assert isinstance(feeder, TcpHq)
             if feeder.counts[60] > self._fed:
                 self._fed = feeder.counts[60]
                 feeder.feed(RANGES)
             return [program.name for program in self.programs if not program.sees(self.robot)]
 
-        try:
-            await soon(lambda: not blind(), "all see the robot")
-        except AssertionError as error:
-            ec = self.program("ec").judge
-            assert isinstance(ec, FragileController)
-            known = {name: ec.values.get(number) for number, (_, name) in ec.devices.items()}
-            raise AssertionError(f"{error}: {blind()} do not; the controller knows {known}") from error
+        await soon(lambda: not blind(), "all see the robot")
 
-    async def drive(self, name: str, forward: float) -> None:
-        """Let one program drive, once the robot is nobody's, until it has moved as commanded; then idle."""
-        program = self.program(name)
-        await self._free()
-        before = dict(self.bench.fleet.last("r1/pose")), self._readings()
-        await program.drive(forward)
-        await soon(lambda: self._moved(before, forward), f"{name} moves {self.robot}")
-        self._check_holder(program)
-        await program.idle()
-        await soon(lambda: self._idle(), f"{name} lets go of {self.robot}")
-        await program.release()
+    async def drive(self, name: str, seconds: float = 0.0) -> None:
+        """Let one program drive, once the robot is nobody's, until it has moved as commanded; then idle.
 
-    async def drive_on(self, name: str, seconds: float) -> None:
-        """Let one program drive to and fro, while the others idle beside it."""
-        await self._free()
-        program, until = self.program(name), time.monotonic() + seconds
-        forward = DRIVES[name]
-        while time.monotonic() < until:
-            before = dict(self.bench.fleet.last("r1/pose")), self._readings()
+        ``seconds``: of going to and fro, while the others idle beside it.
+        """
+        await soon(lambda: self.control.get("state") == "free", f"{self.robot} is given back")
+        program, forward, ends = self.program(name), DRIVES[name], time.monotonic() + seconds
+        while True:
+            before = self._place()
             await program.drive(forward)
-            await soon(lambda before=before, forward=forward: self._moved(before, forward), "motion")  # type: ignore[misc]
+            await soon(lambda: self._moved(before, forward), f"{name} moves {self.robot}")  # noqa: B023
+            holder = f"hq.{program.name}.{program.number}"
+            assert (self.control["state"], self.control["holder"]) == ("held", holder), self.control
+            if time.monotonic() >= ends:
+                break
             await asyncio.sleep(0.3)
-            self._check_holder(program)
             forward = -forward
         await program.idle()
+        await soon(lambda: self.robot != "alf" or not self._place()[0], f"{name} lets go of {self.robot}")
+        await program.release()
 
-    async def _free(self) -> None:
-        await soon(lambda: self.control.get("state") == "free", f"{self.robot} is given back")
-
-    def _check_holder(self, program: Program) -> None:
-        expected = f"hq.{program.name}.{program.number}"
-        assert (self.control["state"], self.control["holder"]) == ("held", expected), self.control
-
-    def _readings(self) -> list[float]:
-        return [self.bench.fleet.last(f"r1/sensor/ds{number}").get("value", 0.0) for number in range(8)]
-
-    def _moved(self, before: tuple[dict[str, Any], list[float]], forward: float) -> bool:
-        """Tell by what the robot says whether it moved in this direction, or with Webots at all."""
-        fleet = self.bench.fleet
+    def _place(self) -> list[float]:
+        """Read what changes when the robot moves: its speed, what it sees around it, or its place along its way."""
+        last = self.bench.fleet.last
         if self.robot == "alf":
-            return bool((fleet.last("r1/motion").get("speed") or 0.0) * forward > 0.0)
+            return [last("r1/motion").get("speed") or 0.0]
         if self.robot == "wc2ec":
-            return any(abs(now - then) > 0.03 for now, then in zip(self._readings(), before[1], strict=True))
-        pose = fleet.last("r1/pose")  # the fragile robot looks along x
-        return bool((pose["x"] - before[0]["x"]) * forward > 0.03)
+            return [last(f"r1/sensor/ds{number}").get("value", 0.0) for number in range(8)]
+        return [last("r1/pose").get("x", 0.0)]
 
-    def _idle(self) -> bool:
-        """Whether the driver's neutral has had its effect, as far as the bus shows it."""
-        return self.robot != "alf" or self.bench.fleet.last("r1/motion").get("speed") == 0.0
+    def _moved(self, before: list[float], forward: float) -> bool:
+        """Tell whether it moved in this direction, or with Webots at all."""
+        now = self._place()
+        if self.robot == "alf":
+            return now[0] * forward > 0.0
+        changes = [after - then for after, then in zip(now, before, strict=True)]
+        return any(abs(change) > 0.03 and (self.robot == "wc2ec" or change * forward > 0.0) for change in changes)
 
 
 @contextlib.asynccontextmanager
-async def stage(robot: str, robot_process: subprocess.Popen[str], more: str = "") -> AsyncIterator[Stage]:
-    """Start a gateway with a listener for each program, and connect them all; ``more``: of its configuration."""
-    assert robot_process.stdout is not None
+async def stage(robot: str, process: Fragile) -> AsyncIterator[Stage]:
+    """Start a gateway with a listener for each program, and connect them all."""
+    ec, first = Ec(), Tcp("1.1", udp=False)
     programs: list[Program] = [
-        *(Tcp("1.1", udp=False), Tcp("1.2", udp=True), Tcp("1.3", udp=True)),
-        *(Alf("text"), Alf("binary"), AlfScanning(), Ec()),
+        *(first, Tcp("1.2", udp=True), Tcp("1.3", udp=True)),
+        *(Alf("text"), Alf("binary"), Alf("text", scans=True), ec),
     ]
-    protocol = robot.partition("-")[0]
     at = dict(zip((program.name for program in programs), ports(len(programs)), strict=True))
     with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), stack)
         parts = [listener(one.name, one.protocol, at[one.name], one.options) for one in programs]
-        options = WEBOTS if protocol == "wc2ec" else ""
-        parts.append(device(protocol, int(robot_process.stdout.readline()), options))
-        process = gateway(bench, stack, *parts, more, lease_s=LEASE_S)
-        await soon(lambda: process.listens(len(programs)), "listeners")
-        await soon(lambda: bench.fleet.state("r1") == "established", "established")
+        options = (WEBOTS if robot == "wc2ec" else "") + process.kind.options
+        parts += [device(process.port, process.kind.protocol, options), f"[control]\nlease_s = {LEASE_S}\n"]
+        gateway = bench.gateway(*parts)
+        await soon(lambda: gateway.listens(len(programs)), "listeners")
+        await soon(lambda: bench.fleet.state() == "established", "established")
         async with playing(*(program.judge.run(HOST, at[program.name]) for program in programs)):
             await soon(lambda: all(program.ready for program in programs), "all connected")
-            for program in programs:
-                if isinstance(program, Tcp) and program.judge.version == "1.1":
-                    await program.ask()
-            ec = programs[-1]
-            assert isinstance(ec, Ec)
+            await first.ask()
             async with playing(ec.keep_idle()):
-                yield Stage(robot, bench, process, programs)
+                yield Stage(robot, bench, gateway, programs)
                 for program in programs:
                     await program.leave()
-            process.end()
+            gateway.end()
             await asyncio.sleep(0.1)  # what a gateway says last is heard
 
 
@@ -392,13 +341,13 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
     Judges it again where the robot's own lateness spoilt its handshake, and where somebody complains though the machine
     was so late that two wheels of one command may have been taken for two.
     """
-    judgement = Judgement(robot, [*drivers], faults=["disturbed again and again: this machine is too busy"])
+    judgement = Judgement(robot, faults=["disturbed again and again: this machine is too busy"])
     for _ in range(DISTURBED):
         with fragile_robot(ROBOTS[robot][0], **ROBOTS[robot][1]) as process:
             try:
                 judgement = await _judged(robot, [*drivers], driver, seconds, process)
             except AssertionError:
-                if process.poll() is not None or not disturbed(await asyncio.to_thread(ended, process)):
+                if process.process.poll() is not None or not disturbed(await asyncio.to_thread(process.ended)):
                     raise
                 continue
         if judgement.clean or judgement.late_s < JOIN_S:
@@ -406,64 +355,49 @@ async def judge(robot: str, drivers: Iterable[str], *, driver: str = "", seconds
     return judgement
 
 
-async def _judged(
-    robot: str, drivers: list[str], driver: str, seconds: float, process: subprocess.Popen[str]
-) -> Judgement:
-    judgement = Judgement(robot, [*drivers])
+async def _judged(robot: str, drivers: list[str], driver: str, seconds: float, process: Fragile) -> Judgement:
+    judgement = Judgement(robot, drove=[*drivers])
     began = time.monotonic()
     async with stage(robot, process) as on:
         withheld_s = on.bench.withheld_s
         await on.all_see()
-        for name in judgement.drove:
-            await on.drive(name, DRIVES[name])
+        for name in drivers:
+            await on.drive(name)
         if seconds:
-            await on.drive_on(driver, seconds)
+            await on.drive(driver, seconds)
             judgement.drove.append(f"{driver} for {seconds:g} s")
         judgement.late_s = on.bench.withheld_s - withheld_s
-    report = await asyncio.to_thread(ended, process)
+    report = await asyncio.to_thread(process.ended)
     judgement.seconds = time.monotonic() - began
-    judgement.hold_against("robot", report["violations"])
-    if not report["alive"]:
-        judgement.faults.append("the robot died")
+    judgement.hear("robot", report["alive"], report["violations"])
     for program in on.programs:
-        judgement.hold_against(program.name, program.judge.violations)
+        judgement.hear(program.name, program.judge.alive, program.judge.violations)
         judgement.received[program.name] = len(program.judge.received)
-        if not program.judge.alive:
-            judgement.faults.append(f"{program.name} died")
-    commanded = {round(forward, 3) for row in report["received"] if (forward := _forward(robot, row)) is not None}
+    told = [command for row in report["received"] if (command := commanded(robot, row)) is not None]
+    forwards = sorted({round(forward, 3) for forward, _ in told})
     judgement.faults += [
-        f"the robot was never told to drive at {DRIVES[name]:g}, as {name} wanted; it was at {sorted(commanded)}"
+        f"the robot was never told to drive at {DRIVES[name]:g}, as {name} wanted; it was at {forwards}"
         for name in drivers
-        if DRIVES[name] not in commanded
+        if DRIVES[name] not in forwards
     ]
-    turns = [row for row in report["received"] if _turns(robot, row)]
-    judgement.faults += [f"the robot was told to turn, though nobody turns: {row}" for row in turns[:3]]
+    if any(turn for _, turn in told):
+        judgement.faults.append("the robot was told to turn, though nobody turns")
     return judgement
 
 
-def _turns(robot: str, row: list[Any]) -> bool:
-    """Tell whether the robot was commanded to turn: between two wheels of a controller, for example."""
-    if robot == "alf":  # 3: speed, direction, steering, light
-        _, kind, fields = row
-        return bool(kind == 3 and fields[2])
-    if robot == "wc2ec":  # its wheels are set one by one
-        return False
-    return bool(row[2] == 12)
-
-
-def _forward(robot: str, row: list[Any]) -> float | None:
-    """Give the fraction of full scale that the robot was commanded to drive forward, None for other commands."""
+def commanded(robot: str, row: list[Any]) -> tuple[float, float] | None:
+    """Give the fractions of full scale, forward and turning, that the robot was commanded; None for other commands."""
     if robot == "alf":  # 3: speed in percent, direction, steering, light
         _, kind, fields = row
-        return (-1 if fields[1] else 1) * fields[0] / 100 if kind == 3 else None
-    if robot == "wc2ec":  # 130: the velocity of the left wheel
+        return ((-1 if fields[1] else 1) * fields[0] / 100, fields[2]) if kind == 3 else None
+    if robot == "wc2ec":  # 130: the velocity of the left wheel; the wheels are set one by one
         _, command, _, number, value = row
-        return float(value) / 10 if (command, number) == (130, 8) else None
-    _, _, kind, body = row  # 11: x, y, speed
-    if kind != 11:
-        return None
-    _, y, speed = struct.unpack("<3f", bytes.fromhex(body))
-    return float(y * speed)
+        return (float(value) / 10, 0.0) if (command, number) == (130, 8) else None
+    _, _, kind, body = row
+    if kind == 11:  # x, y, speed
+        _, y, speed = struct.unpack("<3f", bytes.fromhex(body))
+        return y * speed, 0.0
+    return (0.0, struct.unpack("<f", bytes.fromhex(body))[0]) if kind == 12 else None
 
 
 def main() -> None:
@@ -472,14 +406,8 @@ def main() -> None:
     parser.add_argument("--robot", choices=ROBOTS)
     parser.add_argument("--driver", choices=DRIVES, default="tcp1.3", help="who drives all the time")
     wanted = parser.parse_args()
-    failed = False
-    for robot in [wanted.robot] if wanted.robot else ROBOTS:
-        judgement = asyncio.run(judge(robot, DRIVES, driver=wanted.driver, seconds=wanted.seconds))
-        print(judgement, flush=True)
-        for line in [*judgement.faults[:10], *judgement.excused[:10]]:
-            print("   ", line)
-        failed = failed or not judgement.clean
-    sys.exit(failed)
+    robots = [wanted.robot] if wanted.robot else ROBOTS
+    report(asyncio.run(judge(robot, DRIVES, driver=wanted.driver, seconds=wanted.seconds)) for robot in robots)
 
 
 if __name__ == "__main__":

@@ -1,45 +1,25 @@
-"""What the tests of the HQ side share: processes that log to files, listeners, and HQ programs written by hand."""
+"""What the tests of the HQ side share: waiting beside HQ programs, and a program written by hand."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
-import signal
 import socket
 import struct
-import subprocess
-import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
-from pathlib import Path
 from typing import Any, TypeVar
 
-from tests.e2e.conftest import Bench, end, free_port
+from tests.e2e.conftest import HOST, WAIT_S, Bench, free_port
 from tests.machine import Patience
 
 T = TypeVar("T")
-HOST = "127.0.0.1"
-WHEELS = """
-bounds_default = [0.0, 1000.0]
-[device.options.differential]
-left = ["left wheel motor"]
-right = ["right wheel motor"]
-wheel_radius_m = 0.05
-track_m = 0.3
-speed_full_m_s = 0.5
-turn_full_rad_s = 1.0
-"""
-"""The options of the fragile Webots controller's robot: 10 rad/s of both wheels are full scale."""
 ANSWER = bytes.fromhex("18000000 00 03 0b000000") + b"1.1,1.2,1.3" + bytes(7)
 """Packet 3 of a program of version 1.3 that has no feature, and no UDP."""
 NEUTRAL = bytes.fromhex("02000000 00 0d")
 
 
-async def soon(condition: Callable[[], T], what: str, timeout_s: float = 10.0) -> T:
-    """Wait until ``condition()`` is true and give its value, while HQ programs run on the same loop.
-
-    A busy machine puts the timeout off.
-    """
+async def soon(condition: Callable[[], T], what: str, timeout_s: float = WAIT_S) -> T:
+    """Wait as :func:`tests.e2e.conftest.until` does, while HQ programs run on the same loop."""
     patience = Patience(timeout_s)
     while True:
         over = patience.over
@@ -50,63 +30,9 @@ async def soon(condition: Callable[[], T], what: str, timeout_s: float = 10.0) -
         await asyncio.sleep(0.01)
 
 
-class Gateway:
-    """A process of ``zbridge run``; its log goes to a file, for a pipe that nobody reads would stop it."""
-
-    def __init__(self, file: Path) -> None:
-        self._log = file.with_suffix(".log")
-        with self._log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "zbridge", "run", str(file)],
-                stdout=log,
-                stderr=log,
-                text=True,
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
-            )
-
-    @property
-    def log(self) -> str:
-        """What it has logged."""
-        return self._log.read_text()
-
-    def listens(self, count: int) -> bool:
-        """Whether so many listeners are open; a process that ended says why."""
-        if self.process.poll() is not None:
-            raise AssertionError(f"the gateway ended: {self.log}")
-        return self.log.count("HQ programs connect at") >= count
-
-    def end(self) -> None:
-        """End it; an exit that is not clean is an error."""
-        end(self.process)
-        assert self.process.returncode == 0, self.log
-        assert "Traceback" not in self.log, self.log
-
-    def kill(self) -> None:
-        """End it whatever it does; idempotent."""
-        end(self.process, signal.SIGKILL)
-
-
-def listener(name: str, protocol: str, port: int, more: str = "") -> str:
-    """Write one ``[[hq]]``."""
-    return f'[[hq]]\nname = "{name}"\nprotocol = "{protocol}"\nlisten = "tcp://{HOST}:{port}"\n{more}\n'
-
-
-def device(protocol: str, port: int, options: str = "") -> str:
-    """Write ``[device]``."""
-    return f'[device]\nprotocol = "{protocol}"\nconnect = ["tcp://{HOST}:{port}"]\n[device.options]\n{options}\n'
-
-
-def gateway(bench: Bench, stack: contextlib.ExitStack, *parts: str, name: str = "r1", lease_s: float = 3.0) -> Gateway:
-    """Start a process for robot r1 with these parts of a configuration; it is killed with the stack."""
-    file = bench.folder / f"{name}.toml"
-    file.write_text(
-        '[robot]\nname = "r1"\n' + "".join(parts) + f"[control]\nlease_s = {lease_s}\n"
-        f'[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
-    )
-    process = Gateway(file)
-    bench.count(process.process.pid)
-    stack.callback(process.kill)
-    return process
+def ports(count: int) -> list[int]:
+    """Give so many free ports."""
+    return [free_port() for _ in range(count)]
 
 
 def sessions(bench: Bench) -> list[dict[str, Any]]:
@@ -121,13 +47,12 @@ class ByHand:
         self.reader, self.writer = reader, writer
 
     @classmethod
-    async def connect(cls, port: int, host: str = HOST, *, receive_bytes: int = 0) -> ByHand:
+    async def connect(cls, port: int, *, receive_bytes: int = 0) -> ByHand:
         """Connect; ``receive_bytes``: what the kernel is to keep for it."""
         conn = socket.socket()
         conn.setblocking(False)
         if receive_bytes:
             conn.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_bytes)
-        conn.bind((host, 0))
         try:
             await asyncio.get_running_loop().sock_connect(conn, (HOST, port))
         except BaseException:
@@ -184,11 +109,3 @@ async def playing(*programs: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
     for result in results:
         if isinstance(result, Exception):
             raise result
-
-
-def ports(count: int) -> list[int]:
-    """Give so many free ports."""
-    found: set[int] = set()
-    while len(found) < count:
-        found.add(free_port())
-    return list(found)

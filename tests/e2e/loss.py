@@ -6,32 +6,29 @@ from the first arrival of the last motion at the robot to the first stop that ar
 
 from __future__ import annotations
 
+import argparse
 import contextlib
-import json
 import math
 import os
 import random
 import select
-import shutil
 import signal
-import socket
-import struct
-import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgpack
 import zenoh
 
-from tests.e2e.conftest import free_port, until
-from tests.e2e.robots import SETTINGS
-from tests.machine import contended_s
+from tests.e2e.conftest import HOST, Gateway, Lease, configuration, device, end, free_port, until
+from tests.e2e.processes import LINE_S, Finding, Part, Road, frozen, go_apart, module
+from tests.e2e.robots import SCALE, STOP, Frame, Robot
+from tests.machine import Withheld, contended_s
+from tests.proofs import packed
 
 LATE_S = 0.05
 """Seconds after the deadman in which the stop must be at the robot."""
@@ -43,92 +40,22 @@ DISTURBED = 8
 """Repetitions that may be done again at least."""
 IN_HAND = 3
 """Commands that may have come since the last one that was written, and not be written yet."""
-MOVE, ROTATE, STOP = 11, 12, 13
-SCALE = 1_000_000
-"""A driver's command number n is the speed n / SCALE."""
-
-
-# The robot
-
-
-class Frame(NamedTuple):
-    """One packet that the robot got, and when."""
-
-    at: float
-    packet_id: int
-    body: bytes
-
-    @property
-    def moves(self) -> bool:
-        """Whether the packet sets the robot moving."""
-        return self.packet_id in (MOVE, ROTATE)
-
-    @property
-    def number(self) -> int:
-        """The driver's number of the command that this packet carries; negative when driving backwards."""
-        _, forward, speed = struct.unpack("<fff", self.body)
-        return round(forward * speed * SCALE)
-
-
-class Robot:
-    """A robot of the TCP/UDP package protocol: takes one HQ after the other, and keeps every packet with its time."""
-
-    def __init__(self) -> None:
-        self.frames: list[Frame] = []
-        self.ended: list[float] = []
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.port = int(self._server.getsockname()[1])
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
-        self._server.close()
-
-    def _serve(self) -> None:
-        while True:
-            try:
-                peer, _ = self._server.accept()
-            except OSError:
-                return
-            with peer, contextlib.suppress(OSError):
-                peer.sendall(SETTINGS)
-                self._read(peer)
-            self.ended.append(time.monotonic())
-
-    def _read(self, peer: socket.socket) -> None:
-        waiting = b""
-        while data := peer.recv(65536):
-            at = time.monotonic()
-            waiting += data
-            while len(waiting) >= 4 and len(waiting) >= (end := 4 + int.from_bytes(waiting[:4], "little")):
-                self.frames.append(Frame(at, waiting[5], waiting[6:end]))
-                waiting = waiting[end:]
 
 
 # The bus
 
 
-def configuration(mode: str, endpoints: Iterable[str]) -> zenoh.Config:
-    """Configure a session without multicast: a router that listens, or a client that connects."""
-    config = zenoh.Config()
-    config.insert_json5("mode", json.dumps(mode))
-    config.insert_json5(f"{'listen' if mode == 'router' else 'connect'}/endpoints", json.dumps(list(endpoints)))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    return config
-
-
 def query(session: zenoh.Session, path: str, payload: bytes = b"", **fields: Any) -> dict[str, Any]:
     """Ask ``fleet/r1/<path>``; {} where nobody answers or the question was refused."""
-    replies = session.get(f"fleet/r1/{path}", payload=payload or msgpack.packb(fields), timeout=1.0)
+    replies = session.get(f"fleet/r1/{path}", payload=payload or packed(fields), timeout=1.0)
     answers = [msgpack.unpackb(reply.ok.payload.to_bytes()) for reply in replies if reply.ok]
     return answers[0] if answers else {}
 
 
-def commander(session: zenoh.Session, path: str) -> zenoh.Publisher:
-    """Declare a publisher for ``fleet/r1/@cmd/<path>``, of the class that the design gives a command."""
+def commander(session: zenoh.Session, path: str, robot: str = "r1") -> zenoh.Publisher:
+    """Declare a publisher for ``fleet/<robot>/@cmd/<path>``, of the class that the design gives a command."""
     return session.declare_publisher(
-        f"fleet/r1/@cmd/{path}",
+        f"fleet/{robot}/@cmd/{path}",
         priority=zenoh.Priority.REAL_TIME,
         congestion_control=zenoh.CongestionControl.DROP if path == "drive" else zenoh.CongestionControl.BLOCK,
         express=True,
@@ -137,141 +64,58 @@ def commander(session: zenoh.Session, path: str) -> zenoh.Publisher:
 
 def be_router(endpoint: str) -> None:
     """Be a router until stdin ends."""
-    with zenoh.open(configuration("router", [endpoint])):
+    with zenoh.open(configuration("router", endpoint)):
         print("open", flush=True)
         sys.stdin.read()
 
 
-# Processes
+def router(stack: contextlib.ExitStack, endpoint: str) -> Part:
+    """Start a router in a process of its own."""
+    part = Part(stack, *module("loss", "router", endpoint))
+    assert part.line() == "open"
+    return part
 
 
-def start(*command: str) -> subprocess.Popen[str]:
-    """Start a part of the scene that ends when its stdin does."""
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+def driver(endpoint: str, robot: str, deadman_s: float, rate_hz: float, first: int, step: int = 1) -> list[str]:
+    """Give the command of a driver; its motions are first, first + step, ... of SCALE."""
+    return module("loss", "driver", endpoint, robot, deadman_s, rate_hz, first, step)
 
 
-def kill(process: subprocess.Popen[str]) -> None:
-    """End a process by its id, whatever state it is in; idempotent."""
-    process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            stream.close()
+def be_driver(endpoint: str, robot: str, deadman_s: str, rate_hz: str, first: str, step: str) -> None:
+    """Acquire the lease and drive until stdin ends; then leave without a release.
+
+    Words on stdin, each a neutral but the second: ``neutral``, ``silent``, ``again NUMBER``.
+    """
+    with zenoh.open(configuration("client", endpoint)) as session:
+        alive = f"operator.driver.{session.zid()}"
+        announced = session.liveliness().declare_token(f"fleet/{robot}/@alive/{alive}")
+        wishes = {"who": "driver", "deadman_s": float(deadman_s), "lease_s": 1.0, "alive": alive}
+        lease = until(lambda: _acquired(session, robot, wishes), LINE_S, "the lease")
+        commands = commander(session, "drive", robot)
+
+        def drive(number: int) -> None:
+            command = packed({"forward": number / SCALE})
+            commands.put(command, attachment=lease.held.attachment("drive", command))
+
+        number: int | None = int(first)
+        while not lease.lost:
+            if number is not None:
+                drive(number)
+                number += int(step)
+            if not select.select([sys.stdin], [], [], 1 / float(rate_hz))[0]:
+                continue
+            if not (words := sys.stdin.readline().split()):
+                break
+            number = int(words[1]) if words[1:] else None
+            if words[0] != "silent":
+                drive(0)
+        announced.undeclare()
 
 
-def frozen(pid: int) -> bool:
-    """Tell whether every thread of a process stands still: on a busy machine some are told late."""
-    states = [(task / "stat").read_text().rpartition(")")[2].split()[0] for task in Path(f"/proc/{pid}/task").iterdir()]
-    return set(states) == {"T"}
-
-
-def part(name: str, *arguments: object) -> list[str]:
-    """Give the command that runs a part of this module."""
-    return [sys.executable, "-m", "tests.e2e.loss", name, *map(str, arguments)]
-
-
-class Watch:
-    """A process on each processor that sleeps and wakes: late, that processor was late with everything."""
-
-    def __init__(self, stack: contextlib.ExitStack) -> None:
-        self._late: list[list[tuple[float, float]]] = []
-        for processor in sorted(os.sched_getaffinity(0))[:8]:
-            process = start(*part("watch", processor))
-            stack.callback(kill, process)
-            late: list[tuple[float, float]] = []
-            self._late.append(late)
-            reader = threading.Thread(target=self._read, args=(process, late), daemon=True)
-            reader.start()
-            stack.callback(reader.join)  # the end of the process ends it, however late; only then the pipe is closed
-            stack.callback(process.kill)
-
-    @property
-    def late_s(self) -> float:
-        """The longest time that one was late."""
-        return max((woke - due for late in self._late for due, woke in late), default=0.0)
-
-    def late_between(self, begin: float, end: float) -> float:
-        """Give how much of a stretch of time one was late for, seconds."""
-        return max(sum(max(0.0, min(woke, end) - max(due, begin)) for due, woke in late) for late in self._late)
-
-    @staticmethod
-    def _read(process: subprocess.Popen[str], late: list[tuple[float, float]]) -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.endswith("\n"):  # a process that is killed may leave a part of one
-                due, woke = map(float, line.split())
-                late.append((due, woke))
-
-
-def be_watch(processor: int) -> None:
-    """Tell when we should have woken and when we did, where that differs by more than 5 ms, until stdin ends."""
-    os.sched_setaffinity(0, {processor})
-    due = time.monotonic() + 0.005
-    while not select.select([sys.stdin], [], [], max(0.0, due - time.monotonic()))[0]:
-        woke = time.monotonic()
-        if woke - due > 0.005:
-            print(due, woke, flush=True)
-        due = time.monotonic() + 0.005
-
-
-class Cable:
-    """A network namespace for the driver, and a cable to it. To be used in a namespace of the test's own."""
-
-    HERE, THERE = "10.77.0.1", "10.77.0.2"
-
-    def __init__(self, stack: contextlib.ExitStack) -> None:
-        keeper = start("unshare", "--net", "cat")
-        stack.callback(kill, keeper)
-        assert keeper.stdin is not None
-        assert keeper.stdout is not None
-        keeper.stdin.write("there\n")
-        keeper.stdin.flush()
-        assert keeper.stdout.readline() == "there\n"
-        self.enter = ("nsenter", "--target", str(keeper.pid), "--net")
-        _run("ip", "link", "set", "lo", "up")
-        _run("ip", "link", "add", "here", "type", "veth", "peer", "name", "there", "netns", str(keeper.pid))
-        _run("ip", "address", "add", f"{self.HERE}/30", "dev", "here")
-        _run("ip", "link", "set", "here", "up")
-        _run(*self.enter, "ip", "address", "add", f"{self.THERE}/30", "dev", "there")
-        self.mend()
-
-    def cut(self) -> None:
-        """Take the cable away: nothing passes, and nobody is told."""
-        _run(*self.enter, "ip", "link", "set", "there", "down")
-
-    def mend(self) -> None:
-        """Plug the cable in again."""
-        _run(*self.enter, "ip", "link", "set", "there", "up")
-
-
-def _run(*command: str) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    if done.returncode:
-        raise OSError(f"{' '.join(command)}: {done.stderr.strip() or f'exit {done.returncode}'}")
-
-
-class NotHereError(Exception):
-    """This machine does not let us make network namespaces; says why."""
-
-
-_TRIAL = "ip link set lo up && ip link add here type veth peer name there && unshare --net true"
-_APART = (("unshare", "--net"), ("unshare", "--map-root-user", "--net"))
-
-
-def apart() -> tuple[str, ...]:
-    """Give the command that runs another one in a network namespace of its own; raise NotHereError."""
-    for tool in ("unshare", "nsenter", "ip"):
-        if shutil.which(tool) is None:
-            raise NotHereError(f"no {tool} on this machine")
-    reasons = []
-    for prefix in _APART:
-        try:
-            _run(*prefix, "sh", "-c", _TRIAL)
-        except OSError as error:
-            reasons.append(str(error))
-        else:
-            return prefix
-    raise NotHereError("; ".join(reasons))
+def _acquired(session: zenoh.Session, robot: str, wishes: dict[str, Any]) -> Lease | None:
+    with contextlib.suppress(AssertionError):
+        return Lease(session, robot, "acquire", wishes)
+    return None
 
 
 # The scene
@@ -283,30 +127,28 @@ class Scene:
     driven_s = (0.2, 0.5)
     """The shortest and the longest time for which it is driven before something is lost."""
 
-    def __init__(self, stack: contextlib.ExitStack, *, cable: bool = False, parts: str = "") -> None:
+    def __init__(
+        self, stack: contextlib.ExitStack, *, cut: bool = False, parts: str = "", deadman_s: float = 0.0
+    ) -> None:
         self.faults: list[str] = []
+        self.stack, self.deadman_s = stack, deadman_s
         self.robot = Robot()
         stack.callback(self.robot.close)
-        self.watch = Watch(stack)
-        self.cable = Cable(stack) if cable else None
+        self._withheld = Withheld()
+        self.road = Road(stack) if cut else None
+        self.here = self.road.near if self.road else HOST
+        """Where a driver finds what listens here."""
         port = free_port()
-        self.endpoint = f"tcp/127.0.0.1:{port}"
-        self._listen = f"tcp/0.0.0.0:{port}" if cable else self.endpoint
-        self.reach = f"tcp/{Cable.HERE}:{port}" if cable else self.endpoint
-        """Where a driver finds the router."""
+        self.endpoint = f"tcp/{HOST}:{port}"
+        self._listen = f"tcp/0.0.0.0:{port}" if cut else self.endpoint
+        self.reach = f"tcp/{self.here}:{port}"
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        device = f'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{self.robot.port}"]\n'
-        self._file = self.configured("gateway", device + parts)
-        self.log = stack.enter_context((self.folder / "log").open("w+"))
-        self.router = self._start_router()
-        stack.callback(lambda: kill(self.router))
-        self.gateway = self.run(self._file)
-        stack.callback(lambda: kill(self.gateway))
-        self.session = stack.enter_context(zenoh.open(configuration("client", [self.endpoint])))
+        self.router = router(stack, self._listen)
+        self._parts = device(self.robot.port) + parts
+        self.gateway = self.run("gateway", self._parts)
+        self.session = stack.enter_context(zenoh.open(configuration("client", self.endpoint)))
         self._stop = commander(self.session, "stop")
-        self.driver: subprocess.Popen[str] | None = None
-        self.deadman_s = 0.0
-        stack.callback(self.end_driver)
+        self._driver: Part | None = None
         self.wait()
 
     def drive(self, rng: random.Random) -> int:
@@ -314,25 +156,24 @@ class Scene:
         raise NotImplementedError
 
     @property
-    def driving(self) -> subprocess.Popen[str]:
-        """The driver's process."""
-        assert self.driver is not None
-        return self.driver
-
-    def start_driver(self, *command: str) -> None:
-        """Start a driver's process, behind the cable if there is one."""
-        self.driver = start(*(self.cable.enter if self.cable is not None else ()), *command)
+    def late_s(self) -> float:
+        """The time that this machine withheld so far from what happens here: what excuses a delay."""
+        pids = [self.router.pid, self.gateway.process.pid, self.driver.pid]
+        return max(contended_s(), self._withheld.seconds(pids))
 
     @property
-    def end_of_log(self) -> str:
-        """Give the last words of what :meth:`run` started."""
-        return (self.folder / "log").read_text()[-2000:]
+    def driver(self) -> Part:
+        """The driver's process."""
+        assert self._driver is not None
+        return self._driver
+
+    def start_driver(self, *command: str) -> None:
+        """Start a driver's process, at the end of the road if there is one."""
+        self._driver = Part(self.stack, *(self.road.enter if self.road is not None else ()), *command)
 
     def end_driver(self) -> None:
         """End the driver of the moment, whatever state it is in."""
-        if self.driver is not None:
-            kill(self.driver)
-            self.driver = None
+        self.driver.kill()
 
     def moved(self, begun: int) -> int | None:
         """Find the first motion among the robot's packets from ``begun`` on."""
@@ -341,7 +182,7 @@ class Scene:
 
     def stop(self) -> None:
         """Stop the robot, as anybody may."""
-        self._stop.put(msgpack.packb({}))
+        self._stop.put(packed({}))
 
     def wait(self) -> None:
         """Wait until the gateway is on the bus and the robot can be used."""
@@ -349,107 +190,34 @@ class Scene:
 
     def restart_router(self) -> None:
         """Start the router again."""
-        kill(self.router)
-        self.router = self._start_router()
+        self.router.kill()
+        self.router = router(self.stack, self._listen)
         self.wait()
 
     def restart_gateway(self) -> None:
         """Start the gateway again."""
-        kill(self.gateway)
-        self.gateway = self.run(self._file)
+        self.gateway = self.run("gateway", self._parts, self.gateway)
         self.wait()
 
-    def configured(self, name: str, parts: str) -> Path:
-        """Write a configuration of this robot and bus with further ``parts``."""
-        file = self.folder / f"{name}.toml"
-        bus = f'[bus]\nconnect = ["{self.endpoint}"]\nmulticast = false\n'
-        file.write_text(f'[robot]\nname = "r1"\n{bus}{parts}')
-        return file
-
-    def run(self, file: Path) -> subprocess.Popen[str]:
-        """Start a process of ``zbridge``."""
-        command = [sys.executable, "-m", "zbridge", "run", str(file)]
-        return subprocess.Popen(command, stdout=self.log, stderr=self.log, text=True)
-
-    def _start_router(self) -> subprocess.Popen[str]:
-        router = start(*part("router", self._listen))
-        assert router.stdout is not None
-        assert router.stdout.readline() == "open\n"
-        return router
+    def run(self, name: str, parts: str, former: Gateway | None = None) -> Gateway:
+        """Start a process of ``zbridge`` for this robot and bus."""
+        if former is not None:
+            end(former.process, signal.SIGKILL)
+        return Gateway(self.stack, self.folder / f"{name}.toml", self.endpoint, parts)
 
 
 S = TypeVar("S", bound=Scene)
 
 
-# The ways to be lost: each does it and tells when. What is done afterwards must not move the robot
-
-
-def kill_driver(scene: Scene) -> float:
-    """Kill the driver."""
-    at = time.monotonic()
-    scene.driving.kill()
-    return at
-
-
-def freeze_driver(scene: Scene) -> float:
-    """Freeze the driver."""
-    at = time.monotonic()
-    scene.driving.send_signal(signal.SIGSTOP)
-    return at
-
-
-def thaw_driver(scene: Scene) -> None:
-    """Let it go on."""
-    scene.driving.send_signal(signal.SIGCONT)
-
-
-def cut_driver_off(scene: Scene) -> float:
-    """Take the cable to the driver away."""
-    assert scene.cable is not None
-    at = time.monotonic()
-    scene.cable.cut()
-    return at
-
-
-def mend_cable(scene: Scene) -> None:
-    """Plug it in again."""
-    assert scene.cable is not None
-    scene.cable.mend()
-    time.sleep(0.5)  # what waits in TCP's queues is sent again only now
-
-
-def let_driver_end(scene: Scene) -> float:
-    """Let the driver end as it does in good order."""
-    assert scene.driving.stdin is not None
-    at = time.monotonic()
-    scene.driving.stdin.close()
-    return at
-
-
-def freeze_gateway(scene: Scene) -> float:
-    """Freeze the gateway while the driver drives on; the time runs from when it goes on."""
-    scene.gateway.send_signal(signal.SIGSTOP)
-    until(lambda: frozen(scene.gateway.pid), what="a frozen gateway")
-    time.sleep(READ_S)
-    quiet = len(scene.robot.frames)
-    time.sleep(scene.deadman_s + FROZEN_S)
-    if len(scene.robot.frames) > quiet:
-        scene.faults.append("a frozen gateway wrote to the robot")
-    at = time.monotonic()
-    scene.gateway.send_signal(signal.SIGCONT)
-    return at
-
-
-def nothing(scene: Scene) -> None:
-    """Mend nothing."""
+# The ways to be lost. What is done to mend it must not move the robot
 
 
 @dataclass(frozen=True)
 class Way(Generic[S]):
     """One way to lose the driver, or what stands between it and the robot."""
 
-    lose: Callable[[S], float]
-    mend: Callable[[S], None] = nothing
+    lose: Callable[[S], object]
+    mend: Callable[[S], object] = lambda scene: None
     often: bool = False
     at_once: bool = False
     """Others see it: nobody has to wait for the deadman."""
@@ -457,6 +225,51 @@ class Way(Generic[S]):
     """The robot gets no stop: its connection ends."""
     resumes: bool = False
     """The time runs from when it goes on, and then the stop must come before everything else."""
+
+
+def cut_off(scene: Scene) -> None:
+    assert scene.road is not None
+    scene.road.cut()
+
+
+def mend_road(scene: Scene) -> None:
+    assert scene.road is not None
+    scene.road.mend()
+    time.sleep(0.5)  # what waits in TCP's queues is sent again only now
+
+
+def freeze_gateway(scene: Scene) -> float:
+    """Freeze the gateway while the driver drives on; the time runs from when it goes on."""
+    scene.gateway.signal(signal.SIGSTOP)
+    until(lambda: frozen(scene.gateway.process.pid), what="a frozen gateway")
+    time.sleep(READ_S)
+    quiet = len(scene.robot.frames)
+    time.sleep(scene.deadman_s + FROZEN_S)
+    if len(scene.robot.frames) > quiet:
+        scene.faults.append("a frozen gateway wrote to the robot")
+    at = time.monotonic()
+    scene.gateway.signal(signal.SIGCONT)
+    return at
+
+
+def see_off(scene: Scene, process: Gateway) -> None:
+    """Wait for the end of a process that was told to end."""
+    code = process.process.wait(timeout=5)
+    if code != 0:
+        scene.faults.append(f"a process of zbridge ended with {code}")
+
+
+EVERYWHERE: dict[str, Way[Any]] = {
+    "killed": Way(lambda scene: scene.driver.signal(signal.SIGKILL), often=True, at_once=True),
+    "frozen": Way(
+        lambda scene: scene.driver.signal(signal.SIGSTOP),
+        lambda scene: scene.driver.signal(signal.SIGCONT),
+        often=True,
+    ),
+    "cut": Way(cut_off, mend_road, often=True),
+    "gateway-frozen": Way(freeze_gateway, resumes=True),
+}
+"""Ways in which any driver may be lost."""
 
 
 # Measuring
@@ -469,7 +282,7 @@ def stop_since(frames: list[Frame], begun: int, lost_at: float) -> int | None:
 
 
 @dataclass
-class Result:
+class Result(Finding):
     """What was measured of one way, in seconds."""
 
     way: str
@@ -481,8 +294,7 @@ class Result:
     disturbed: int = 0
     """Repetitions that were done again: the driver was late and stopped before it was lost, or the machine was late."""
     machine_late_s: float = 0.0
-    """How late a processor of this machine was at most, whatever it had to do."""
-    faults: list[str] = field(default_factory=list)
+    """How late this machine was at most while a stop was awaited, whatever it had to do."""
 
     @property
     def late_s(self) -> list[float]:
@@ -493,34 +305,33 @@ class Result:
     @property
     def clean(self) -> bool:
         """Whether every stop came in time and nothing moved after it."""
-        return bool(self.since_loss_s) and not self.late_s and not self.faults
+        return super().clean and bool(self.since_loss_s) and not self.late_s
 
     def __str__(self) -> str:
-        row = f"{self.way:29} {len(self.since_loss_s):4}  {_distribution(self.since_motion_s)}  "
-        row += f"{_distribution(self.since_loss_s)}  {self.limit_s * 1000:7.0f} "
-        row += f"{'loss' if self.from_loss else 'motion':6}  "
-        row += f"{len(self.late_s):4}  {self.disturbed:9}  {len(self.faults):6}  {self.machine_late_s * 1000:7.1f}"
-        return "\n".join([row, *(f"    {fault}" for fault in self.faults[:10])])
+        times = [*_distribution(self.since_motion_s), *_distribution(self.since_loss_s), f"{self.limit_s * 1000:.0f}"]
+        counts = [len(self.late_s), self.disturbed, len(self.faults), f"{self.machine_late_s * 1000:.1f}"]
+        return _row(self.way, len(self.since_loss_s), *times, "loss" if self.from_loss else "motion", *counts)
+
+
+def _row(way: str, *cells: object) -> str:
+    return f"{way:29}" + "".join(f" {cell!s:>8}" for cell in cells)
 
 
 def heading() -> str:
     """Give the heading of the rows of results."""
-    four = f"{'least':>7} {'median':>7} {'p99':>7} {'most':>7}"
+    four = ("least", "median", "p99", "most")
     return (
         "Milliseconds to the first stop at the robot's socket. gateway-killed: to the end of the connection, there is\n"
         "no stop; gateway-frozen, process-frozen: since it goes on. machine: how late the machine was, at most.\n"
-        f"{'':35} {'since the last motion':^31}  {'since the loss':^31}\n"
-        f"{'way':29} {'n':>4}  {four}  {four}  {'limit':>7} {'since':6}  "
-        f"{'late':>4}  {'disturbed':>9}  {'faults':>6}  {'machine':>7}"
+        f"{'':38}{'since the last motion':^36}{'since the loss':^36}\n"
+        + _row("way", "n", *four, *four, "limit", "since", "late", "again", "faults", "machine")
     )
 
 
-def _distribution(times_s: list[float]) -> str:
-    if not times_s:
-        return " ".join(f"{'-':>7}" for _ in range(4))
+def _distribution(times_s: list[float]) -> list[str]:
     ordered = sorted(times_s)
     ranks = (0, (len(ordered) - 1) // 2, math.ceil(0.99 * len(ordered)) - 1, -1)
-    return " ".join(f"{ordered[rank] * 1000:7.1f}" for rank in ranks)
+    return [f"{ordered[rank] * 1000:.1f}" if ordered else "-" for rank in ranks]
 
 
 def measured(scene: S, way: Way[S], result: Result, *, repetitions: int, rng: random.Random) -> Result:
@@ -531,31 +342,7 @@ def measured(scene: S, way: Way[S], result: Result, *, repetitions: int, rng: ra
         if result.disturbed > max(DISTURBED, repetitions // 10):
             scene.faults.append("disturbed again and again: this machine is too busy")
             break
-    result.machine_late_s = scene.watch.late_s
     return result
-
-
-def measured_apart(module: str, *arguments: object, timeout_s: float) -> list[Result]:
-    """Let a module measure in a network namespace of its own: nothing is changed in that of the caller.
-
-    Raises NotHereError where this machine does not allow it.
-    """
-    command = [*apart(), sys.executable, "-m", module, "--be", "measurement", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        try:
-            output, _ = process.communicate(timeout=timeout_s)
-        except BaseException:
-            process.terminate()
-            raise
-    if process.returncode:
-        raise AssertionError(f"{' '.join(command)}: exit {process.returncode}")
-    return [Result(**fields) for fields in json.loads(output)]
-
-
-def be_measurement(measure: Callable[[], list[Result]]) -> None:
-    """Measure here, and print the results for the process that asked."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    print(json.dumps([asdict(result) for result in measure()]))
 
 
 def _lose(scene: S, way: Way[S], rng: random.Random, result: Result) -> None:
@@ -568,7 +355,9 @@ def _lose(scene: S, way: Way[S], rng: random.Random, result: Result) -> None:
         scene.end_driver()
         result.disturbed += 1
         return
-    contended, lost_at = contended_s(), way.lose(scene)
+    late_s, lost_at = scene.late_s, time.monotonic()
+    resumed_at = way.lose(scene)
+    lost_at = resumed_at if isinstance(resumed_at, float) else lost_at
     patience_s = result.limit_s + 10
     if way.connection_ends:
         until(lambda: len(robot.ended) > ends, patience_s, "end of the connection")
@@ -576,7 +365,8 @@ def _lose(scene: S, way: Way[S], rng: random.Random, result: Result) -> None:
     else:
         stop = until(lambda: stop_since(robot.frames, begun, lost_at), patience_s, "stop")
         stop_at = robot.frames[stop].at
-    contended = contended_s() - contended
+    late_s = scene.late_s - late_s
+    result.machine_late_s = max(result.machine_late_s, late_s)
     way.mend(scene)
     time.sleep(0.3)
     scene.end_driver()
@@ -587,13 +377,12 @@ def _lose(scene: S, way: Way[S], rng: random.Random, result: Result) -> None:
         return
     since = lost_at if result.from_loss else _last_motion(driven).at
     too_long_s = stop_at - since - result.limit_s
-    machine_late_s = max(contended, scene.watch.late_between(since, stop_at))
-    if _stopped(driven) or 0 < too_long_s <= machine_late_s:
+    if _stopped(driven) or 0 < too_long_s <= late_s:
         result.disturbed += 1
         return
     if too_long_s > 0:
         times = f"{(stop_at - since) * 1000:.0f} ms, {(stop_at - lost_at) * 1000:.0f} ms of it since the loss"
-        scene.faults.append(f"late: {times}; this machine was late for {machine_late_s * 1000:.0f} ms")
+        scene.faults.append(f"late: {times}; this machine was late for {late_s * 1000:.0f} ms")
     result.since_loss_s.append(stop_at - lost_at)
     if not way.resumes:
         result.since_motion_s.append(stop_at - _last_motion(driven).at)
@@ -635,8 +424,29 @@ def _last_motion(frames: list[Frame]) -> Frame:
     return motions[first]
 
 
-_PARTS: dict[str, Callable[[str], None]] = {"router": be_router, "watch": lambda processor: be_watch(int(processor))}
+# The programs that measure
+
+
+def options(doc: str | None, ways: Iterable[str], repetitions: int) -> argparse.ArgumentParser:
+    """Give what all of them can be told."""
+    parser = argparse.ArgumentParser(description=(doc or "").splitlines()[0])
+    parser.add_argument("--repetitions", type=int, default=repetitions)
+    parser.add_argument("--way", choices=(*ways, "all"), default="all")
+    parser.add_argument("--seed", type=int, default=os.getpid(), help="of the moments")
+    return parser
+
+
+def possible(program: str, way: str, ways: Iterable[str]) -> list[str]:
+    """Give the ways that are wanted; become a program that can be cut off if that is among them. Print the heading."""
+    wanted = [name for name in ways if way in ("all", name)]
+    if "cut" in wanted and not go_apart(program):
+        wanted.remove("cut")
+    print(heading(), flush=True)
+    return wanted
+
+
+_PARTS: dict[str, Callable[..., None]] = {"router": be_router, "driver": be_driver}
 
 
 if __name__ == "__main__":
-    _PARTS[sys.argv[1]](sys.argv[2])
+    _PARTS[sys.argv[1]](*sys.argv[2:])

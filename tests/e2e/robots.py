@@ -5,32 +5,47 @@ import socket
 import struct
 import threading
 import time
+from typing import NamedTuple
 
 SETTINGS = bytes.fromhex("210000000102020b000000312e312c312e322c312e3300010101010101e803000064000000")
 """serverSettings: client id 2, "1.1,1.2,1.3", every feature but UDP, a map of 1000 in steps of 100."""
+MOVE, ROTATE, STOP = 11, 12, 13
+SCALE = 1_000_000
+"""A driver's command number n is the speed n / SCALE."""
 
 
-_STAMPS = 35
-"""Linux's SO_TIMESTAMPNS; Python does not name it."""
-_STAMP = struct.Struct("=qq")
+class Frame(NamedTuple):
+    """One packet that the robot got, and when."""
+
+    at: float
+    packet_id: int
+    body: bytes
+
+    @property
+    def moves(self) -> bool:
+        """Whether the packet sets the robot moving."""
+        return self.packet_id in (MOVE, ROTATE)
+
+    @property
+    def number(self) -> int:
+        """The driver's number of the command that this packet carries; negative when driving backwards."""
+        _, forward, speed = struct.unpack("<fff", self.body)
+        return round(forward * speed * SCALE)
 
 
-class ScriptedRobot:
-    """Accepts one HQ after the other, keeps every packet with its time, and sends what it is told."""
+class Robot:
+    """Takes one HQ after the other, keeps every packet with its time, and sends what it is told."""
 
     def __init__(self, settings: bytes = SETTINGS) -> None:
-        self.reads: list[tuple[float, bytes]] = []
-        """The packets, and when each was read. What the kernel joined while this process was late is cut again."""
-        self.arrivals: list[tuple[float, int]] = []
-        """When the last byte of each read arrived (time of day, by the kernel), and how many packets it was."""
+        self.frames: list[Frame] = []
         self.connections = 0
+        self.ended: list[float] = []
+        """When each connection ended."""
         self._settings = settings
         self._peer: socket.socket | None = None
         self._server = socket.create_server(("127.0.0.1", 0))
-        self._server.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)  # of its connections too
         self.port = int(self._server.getsockname()[1])
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
         while True:
@@ -41,42 +56,34 @@ class ScriptedRobot:
             self.connections += 1
             self._peer = peer
             with peer, contextlib.suppress(OSError):
-                if self._settings:
-                    peer.sendall(self._settings)
+                peer.sendall(self._settings)
                 self._read(peer)
+            self.ended.append(time.monotonic())
 
     def _read(self, peer: socket.socket) -> None:
-        while True:
-            data, stamps, _, _ = peer.recvmsg(4096, 64)
-            at, packets = time.monotonic(), 0
-            if not data:
-                return
-            while data:
-                end = 4 + int.from_bytes(data[:4], "little")
-                self.reads.append((at, data[:end]))
-                data, packets = data[end:], packets + 1
-            seconds, nanoseconds = _STAMP.unpack(stamps[0][2]) if stamps else (time.time(), 0)
-            self.arrivals.append((seconds + nanoseconds / 1e9, packets))
+        waiting = b""
+        while data := peer.recv(65536):
+            at = time.monotonic()
+            waiting += data
+            while len(waiting) >= 4 and len(waiting) >= (end := 4 + int.from_bytes(waiting[:4], "little")):
+                self.frames.append(Frame(at, waiting[5], waiting[6:end]))
+                waiting = waiting[end:]
 
     def send(self, data: bytes) -> None:
         assert self._peer is not None
         self._peer.sendall(data)
 
-    def packets(self, packet_id: int) -> list[tuple[float, bytes]]:
-        """The reads that were a packet of this id."""
-        return [(at, data) for at, data in self.reads if len(data) >= 6 and data[5] == packet_id]
-
-    def drop(self) -> None:
-        if self._peer is not None:
-            with contextlib.suppress(OSError):
-                self._peer.shutdown(socket.SHUT_RDWR)
+    def packets(self, packet_id: int, since: float = 0.0) -> list[Frame]:
+        """Give the packets of this id after a moment."""
+        return [frame for frame in tuple(self.frames) if frame.packet_id == packet_id and frame.at > since]
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._server.shutdown(socket.SHUT_RDWR)
+        """End the robot and its connection, without a word."""
+        for each in (self._server, self._peer):
+            if each is not None:
+                with contextlib.suppress(OSError):
+                    each.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        self.drop()
-        self._thread.join(5)
 
 
 def position(x: float, y: float, heading_deg: float) -> bytes:

@@ -4,7 +4,7 @@
     python -m tests.e2e.stalls --repetitions 2 --robots tcpudp-1.3,alf --stalls 2.5 --cuts 2 --out stalls.jsonl
 
 Each sitting has a real gateway process, a fragile robot in a process of its own that tells its commanded motion
-(:mod:`tests.e2e.moving_robot`), and a driver on the bus in a process of its own. It is driven for a moment; then
+(:mod:`tests.e2e.fragile`), and a driver on the bus in a process of its own. It is driven for a moment; then
 
 stall: the robot's process is stopped (SIGSTOP) and goes on after some seconds (SIGCONT);
 cut: what is between the robot's network namespace and the gateway's forwards nothing for some seconds. Both keep
@@ -24,34 +24,31 @@ go on after it, and the robot must be at rest after the driver's neutral.
 from __future__ import annotations
 
 import argparse
-import asyncio
 import contextlib
-import itertools
 import json
 import os
+import queue
 import random
-import shutil
 import signal
 import statistics
-import subprocess
 import sys
 import tempfile
+import threading
 import time
+import urllib.request
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import zenoh
 
-import zbridge
-from tests.e2e.conftest import free_port
-from tests.e2e.loss import NotHereError, Watch, apart, configuration
-from tests.e2e.moving_robot import GOES_ON, ROBOTS
-from zbridge.client import Fleet
-from zbridge.errors import BusError, LeaseLost, Refused
-from zbridge.fleet.messages import Status
+from tests.e2e import loss
+from tests.e2e.conftest import Fleet, Gateway, configuration, device, free_port
+from tests.e2e.fragile import GOES_ON, ROBOTS
+from tests.e2e.processes import LINE_S, Part, Road, go_apart, module
+from tests.e2e.robots import SCALE
 
 LIMIT_S = 1.5
 """Most seconds from going on to rest."""
@@ -65,22 +62,23 @@ DEADMAN_S = 0.5
 FIRST, AGAIN = 0.4, 0.8
 """Speed before, and speed of the driving that shows afterwards that the connection survived."""
 TOLERANCE = 0.02
-PERIOD_S = 0.04
-"""From one command of the driver to the next."""
+RATE_HZ = 25.0
+"""Commands of the driver in a second."""
 PATIENCE_S = 4.0
 """Longest wait for rest, and for motion afterwards; after a cut for as long as it was besides."""
-START_S = 20.0
-CPU_S = 0.4
-"""Processor time of one repetition: three interpreters start."""
 SHOWN_S = 2.0
 """The shortest cut that `status` and the counter must show."""
 LINK_STALLS = "zbridge_link_stalls_total"
 KERNEL = (6, 15)
 """The first Linux with TCP_RTO_MAX_MS."""
+AGAIN_AT_MOST = 10
+"""Repetitions that may be done again."""
 LANES = 10
 """Sittings at a time: they mostly wait."""
 SITTING = 6
 """Repetitions in a sitting."""
+MEASURED = [name for name in ROBOTS if name != "wc2ec-draft"]
+"""The robots that can be driven."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +88,6 @@ class Case:
     robot: str
     way: str
     seconds: float
-
-    @property
-    def duration_s(self) -> float:
-        """Expect a repetition to last so long, where the robot comes to rest."""
-        start_s = 3.0 + 2.5 * ROBOTS[self.robot].udp
-        return start_s / SITTING + self.seconds + 1.0 + REST_S
 
 
 @dataclass
@@ -113,201 +105,62 @@ class Outcome:
     link_stalls: int = 0
     held_up_s: float = 0.0
     """How long the robot's program waited for its own send after the link was back; the time to rest begins then."""
-    machine_late_s: float = 0.0
-    """How late this machine was between going on and rest."""
     judge: dict[str, Any] = field(default_factory=dict)
-    motion: list[tuple[float, float]] = field(default_factory=list)
-    """Seconds from going on, speed obeyed from then on."""
     log: list[str] = field(default_factory=list)
 
     @property
-    def drove_on(self) -> bool:
-        """Whether the robot was never at rest."""
-        return self.measured and self.rest_s is None
+    def verdict(self) -> str:
+        """Whether the robot was at rest in time, too late, or never."""
+        if self.rest_s is None:
+            return "drove on" if self.measured else ""
+        return "late" if self.rest_s > LIMIT_S else "at rest"
 
     @property
-    def late(self) -> bool:
-        """Whether the robot was at rest, but too late."""
-        return self.rest_s is not None and self.rest_s > LIMIT_S
+    def disturbed(self) -> bool:
+        """Whether the robot, before it was ever driven, was late itself, and lost packets that it joined."""
+        return not self.measured and bool(self.judge.get("piled"))
 
     @property
     def good(self) -> bool:
         """Whether everything was as it should be."""
-        return self.rest_s is not None and not self.late and not self.faults
-
-
-# Processes
-
-_ENDS_WITH_US = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
-_HERE = str(Path(__file__).parents[2])
-
-
-async def _started(stack: contextlib.AsyncExitStack, *command: str, output: Any = subprocess.PIPE) -> _Process:
-    """Start a process that is killed with the context, in a session of its own: Ctrl-C is for us alone."""
-    process = await asyncio.create_subprocess_exec(
-        *_ENDS_WITH_US,
-        *command,
-        stdin=subprocess.PIPE,
-        stdout=output,
-        stderr=output if output is not subprocess.PIPE else None,
-        start_new_session=True,
-        cwd=_HERE,
-    )
-    stack.push_async_callback(_killed, process)
-    return process
-
-
-async def _killed(process: _Process) -> None:
-    if process.returncode is None:
-        process.kill()
-    await asyncio.wait_for(process.wait(), 5)
-
-
-async def _line(process: _Process, timeout_s: float = START_S) -> str:
-    assert process.stdout is not None
-    line = await asyncio.wait_for(process.stdout.readline(), timeout_s)
-    if not line:
-        raise RuntimeError(f"a part of the scene ended with {await process.wait()}")
-    return line.decode().strip()
-
-
-def _tell(process: _Process, word: str) -> None:
-    assert process.stdin is not None
-    process.stdin.write(f"{word}\n".encode())
-
-
-_Process = asyncio.subprocess.Process
-
-
-# The road between gateway and robot
-
-_GATE = "echo open; while read on; do echo $on > /proc/sys/net/ipv4/ip_forward; echo done; done"
-_numbers = itertools.count()
-
-
-class Road:
-    """Two network namespaces: one forwards packets or not, in the other one lives the robot.
-
-    To be used in a namespace of the measurement's own. What holds them are two processes: they go with them.
-    """
-
-    def __init__(self, gate: _Process, keeper: _Process, number: int) -> None:
-        self._gate, self._number = gate, number
-        self._far = ("nsenter", "--target", str(keeper.pid), "--net")
-        self._net = f"10.{64 + number // 250 % 60}.{number % 250}"
-        self.host = f"{self._net}.6"
-        self.enter = self._far
-
-    @classmethod
-    async def lay(cls, stack: contextlib.AsyncExitStack) -> Road:
-        """Make the namespaces and connect them."""
-        gate = await _started(stack, "unshare", "--net", "sh", "-c", _GATE)
-        keeper = await _started(stack, "unshare", "--net", "sh", "-c", "echo open; exec cat")
-        for process in (gate, keeper):
-            await _line(process)
-        road = cls(gate, keeper, next(_numbers))
-        await asyncio.to_thread(road._connect, gate.pid, keeper.pid)
-        stack.callback(_ip, "", f"link delete near{road._number}")
-        await road.mend()
-        return road
-
-    def _connect(self, gate: int, keeper: int) -> None:
-        near = f"near{self._number}"
-        net = self._net
-        _ip(
-            "",
-            f"link add {near} type veth peer name left netns {gate}",
-            f"address add {net}.1/30 dev {near}",
-            f"link set {near} up",
-        )
-        _ip(
-            f"nsenter --target {gate} --net",
-            f"link add right type veth peer name robot netns {keeper}",
-            f"address add {net}.2/30 dev left",
-            f"address add {net}.5/30 dev right",
-            "link set left up",
-            "link set right up",
-        )
-        _ip(
-            f"nsenter --target {keeper} --net",
-            "link set lo up",
-            f"address add {net}.6/30 dev robot",
-            "link set robot up",
-            f"route add default via {net}.5",
-        )
-        _ip("", f"route add {net}.4/30 via {net}.2")
-
-    async def cut(self) -> None:
-        """Lose every packet, in both directions, from now on."""
-        await self._forward(0)
-
-    async def mend(self) -> None:
-        """Lose no packet any more."""
-        await self._forward(1)
-
-    async def _forward(self, on: int) -> None:
-        _tell(self._gate, str(on))
-        if await _line(self._gate) != "done":
-            raise RuntimeError("the kernel did not take ip_forward")
-
-
-def _ip(prefix: str, *lines: str) -> None:
-    done = subprocess.run(
-        [*prefix.split(), "ip", "-batch", "-"],
-        input="\n".join(lines) + "\n",
-        capture_output=True,
-        text=True,
-        timeout=10,
-    )
-    if done.returncode:
-        raise OSError(f"ip: {done.stderr.strip()}")
-
-
-# The robot
+        return self.verdict == "at rest" and not self.faults
 
 
 class MovingRobot:
-    """The fragile robot's process, and what it told of its motion."""
+    """A fragile robot's process, and what it tells of its motion."""
 
-    def __init__(self, process: _Process) -> None:
-        self.process = process
+    def __init__(self, stack: contextlib.ExitStack, name: str, host: str, enter: Sequence[str], seed: int) -> None:
         self.changes: list[tuple[float, float]] = [(0.0, 0.0)]
         """When it told a speed, and which."""
         self.report: dict[str, Any] = {}
         self.went_on = 0.0
         """When its program last went on after its own send held it up."""
-        self._moved = asyncio.Event()
+        self._ports: queue.Queue[int] = queue.Queue()
+        told = json.dumps({"seed": seed, "tells": True})
+        self.part = Part(stack, *enter, *module("fragile", name, host, told), heard=self._hear)
+        self.port = self._ports.get(timeout=LINE_S)
+
+    def _hear(self, line: str) -> None:
+        at, _, what = line.partition(" ")
+        if line.startswith("{"):
+            self.report = json.loads(line)
+        elif what == GOES_ON:
+            self.went_on = float(at)
+        elif what:
+            self.changes.append((float(at), float(what)))
+        else:
+            self._ports.put(int(line))
 
     @property
     def speed(self) -> float:
         """The speed of the last command that it obeyed."""
         return self.changes[-1][1]
 
-    async def listen(self) -> None:
-        """Take what it tells until it ends."""
-        assert self.process.stdout is not None
-        async for line in self.process.stdout:
-            if line.startswith(b"{"):
-                self.report = json.loads(line)
-                continue
-            at, what = line.split()
-            if what == GOES_ON.encode():
-                self.went_on = float(at)
-                continue
-            self.changes.append((float(at), float(what)))
-            self._moved.set()
-
-    async def moving(self, speed: float, timeout_s: float) -> bool:
+    def moving(self, speed: float, timeout_s: float) -> bool:
         """Wait until it moves at a speed; tell whether it does."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s):
-                while not _same(self.speed, speed):
-                    self._moved.clear()
-                    await self._moved.wait()
-                return True
-        return False
+        return _waited(lambda: abs(self.speed - speed) <= TOLERANCE, timeout_s)
 
-    async def rest(self, since: float, patience_s: float) -> float | None:
+    def rest(self, since: float, patience_s: float) -> float | None:
         """Wait until it has been at rest for REST_S; give when it came to rest, None if it did not in time."""
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline + REST_S:
@@ -316,65 +169,34 @@ class MovingRobot:
                 return None
             if not self.speed and time.monotonic() - came >= REST_S:
                 return came
-            await asyncio.sleep(0.02)
+            time.sleep(0.02)
         return None
 
 
-def _same(one: float, other: float) -> bool:
-    return abs(one - other) <= TOLERANCE
+def _waited(condition: Callable[[], bool], timeout_s: float) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
 
 
-# The driver
-
-
-async def be_driver(endpoint: str, robot: str, speed: str) -> None:
-    """Hold the lease and drive, until stdin ends. Words on stdin: neutral, silent, again SPEED."""
-    words = asyncio.StreamReader()
-    loop = asyncio.get_running_loop()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(words), sys.stdin)
-    driven: float | None = float(speed)
-    async with contextlib.AsyncExitStack() as stack:
-        fleet = await stack.enter_async_context(zbridge.connect([endpoint]))
-        drive = await stack.enter_async_context(fleet[robot].control("driver", deadman_s=DEADMAN_S, wait_s=START_S))
-        while True:
-            word: bytes | None = None
-            try:
-                if driven is not None:
-                    await drive(forward=driven)
-                async with asyncio.timeout(PERIOD_S):
-                    word = await words.readline()
-                if not word:
-                    return
-                what, *value = word.decode().split()
-                driven = float(value[0]) if value else None
-                if what != "silent":
-                    await drive()
-            except LeaseLost:
-                return
-            except (TimeoutError, Refused):
-                await asyncio.sleep(0 if word is None else PERIOD_S)
+def _sleep_until(at: float) -> None:
+    time.sleep(max(0.0, at - time.monotonic()))
 
 
 # One repetition
 
 
 class Scene:
-    """What all repetitions share: the bus, a program on it, and a watch of this machine."""
+    """What all repetitions share: the bus, and an onlooker on it."""
 
-    def __init__(self, fleet: Fleet, endpoint: str, watch: Watch, folder: Path, seed: int) -> None:
-        self.fleet, self.endpoint, self.watch, self.folder, self.seed = fleet, endpoint, watch, folder, seed
-
-
-@contextlib.asynccontextmanager
-async def scenery(seed: int) -> AsyncIterator[Scene]:
-    """Open a router here, and what else all repetitions share."""
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        watch = Watch(stack)
-        stack.enter_context(zenoh.open(configuration("router", [endpoint])))
-        async with zbridge.connect([endpoint]) as fleet:
-            yield Scene(fleet, endpoint, watch, folder, seed)
+    def __init__(self, stack: contextlib.ExitStack, seed: int) -> None:
+        self.seed, self.again = seed, AGAIN_AT_MOST
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        self.fleet = Fleet(stack.enter_context(zenoh.open(configuration("router", self.endpoint))), "fleet/*/status")
 
 
 class Sitting:
@@ -385,183 +207,132 @@ class Sitting:
         self._numbers = numbers
         self._name = f"{case.robot}-{case.way}-{case.seconds:g}-{numbers[0]}"
         self._rng = random.Random(f"{self._name} {scene.seed}")
-        self._statuses: list[tuple[float, Status]] = []
         self._patience_s = PATIENCE_S + case.seconds * (case.way == "cut")
+        self._gateway: Gateway | None = None
 
-    async def run(self, took: Callable[[Outcome], object]) -> None:
+    def run(self, took: Callable[[Outcome], object]) -> None:
         """Take numbers and measure; what does not come about is a fault, after which nothing more is done here."""
-        async with contextlib.AsyncExitStack() as stack:
+        with contextlib.ExitStack() as stack:
+            self._stack = stack
             try:
-                await self._begin()
-                await self._set_up(stack)
-                await self._drive(stack, FIRST)
-                await self._measure(stack)
+                self._begin()
+                self._set_up()
+                self._drive(FIRST)
+                self._measure()
                 while self._numbers and self.outcome.good:
                     took(self.outcome)
-                    await self._begin()
-                    _tell(self._driver, f"again {FIRST}")
-                    await self._measure(stack)
-                await self._report()
-            except (RuntimeError, OSError, TimeoutError, BusError) as error:
+                    self._begin()
+                    self._say_again(FIRST)
+                    self._measure()
+                self._report()
+            except (AssertionError, RuntimeError, OSError, queue.Empty, zenoh.ZError) as error:
                 self.outcome.faults.append(f"{type(error).__name__}: {error}")
-            if not self.outcome.good and (log := self._log_file).exists():
-                self.outcome.log = log.read_text(errors="replace").splitlines()[-12:]
-        self._log_file.unlink(missing_ok=True)
-        took(self.outcome)
+            if not self.outcome.good and self._gateway is not None:
+                self.outcome.log = self._gateway.log.splitlines()[-12:]
+        if self.outcome.disturbed and self._scene.again > 0:
+            self._scene.again -= 1
+            self._numbers.appendleft(self.outcome.number)
+        else:
+            took(self.outcome)
 
-    async def _begin(self) -> None:
+    def _begin(self) -> None:
         number, causes = self._numbers.popleft(), CAUSES[self._case.way]
-        cause = causes[(number + list(ROBOTS).index(self._case.robot)) % len(causes)]
+        cause = causes[(number + MEASURED.index(self._case.robot)) % len(causes)]
         self.outcome = Outcome(self._case, number, cause)
 
     # The scene
 
-    async def _set_up(self, stack: contextlib.AsyncExitStack) -> None:
-        self._road = await Road.lay(stack) if self._case.way == "cut" else None
-        host, enter = (self._road.host, self._road.enter) if self._road else ("127.0.0.1", ())
-        seed = str(self._rng.randrange(1 << 30))
-        robot = [*enter, sys.executable, "-m", "tests.e2e.moving_robot", self._case.robot, host, seed]
-        process = await _started(stack, *robot)
-        port = int(await _line(process))
-        self._robot = MovingRobot(process)
-        self._attend(stack, self._robot.listen())
-        self._attend(stack, self._watch_status())
-        with self._log_file.open("w") as log:
-            configured = self._configured(host, port)
-            self._gateway = await _started(
-                stack, sys.executable, "-m", "zbridge", "run", str(configured), output=log.fileno()
-            )
-        await self._until(lambda: self._status_is("established"), START_S, "established")
-
-    def _attend(self, stack: contextlib.AsyncExitStack, work: Any) -> None:
-        task = asyncio.create_task(work)
-
-        async def end() -> None:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
-
-        stack.push_async_callback(end)
-
-    @property
-    def _log_file(self) -> Path:
-        return self._scene.folder / f"{self._name}.log"
-
-    def _configured(self, host: str, port: int) -> Path:
+    def _set_up(self) -> None:
+        self._road = Road(self._stack) if self._case.way == "cut" else None
+        host, enter = (self._road.far, self._road.enter) if self._road else ("127.0.0.1", ())
+        self._robot = MovingRobot(self._stack, self._case.robot, host, enter, self._rng.randrange(1 << 30))
         self._metrics = free_port()
-        options = f"[device.options]\n{self._kind.options}" if self._kind.options else ""
-        file = self._scene.folder / f"{self._name}.toml"
-        file.write_text(
-            f'[robot]\nname = "{self._name}"\n'
-            f'[device]\nprotocol = "{self._kind.protocol}"\nconnect = ["tcp://{host}:{port}"]\n{options}'
-            f'[bus]\nconnect = ["{self._scene.endpoint}"]\nmulticast = false\n'
-            f'[metrics]\nlisten = "127.0.0.1:{self._metrics}"\n'
+        parts = (
+            device(self._robot.port, self._kind.protocol, self._kind.options).replace("127.0.0.1", host),
+            f'[metrics]\nlisten = "127.0.0.1:{self._metrics}"\n',
         )
-        return file
-
-    async def _watch_status(self) -> None:
-        async for status in self._scene.fleet[self._name].status:
-            self._statuses.append((time.monotonic(), status))
-
-    def _status_is(self, state: str) -> bool:
-        return bool(self._statuses) and self._statuses[-1][1].state == state
+        file = self._scene.folder / f"{self._name}.toml"
+        self._gateway = Gateway(self._stack, file, self._scene.endpoint, *parts, robot=self._name)
+        gone = self._gateway.process.poll
+        if not _waited(lambda: self._status.get("state") == "established" or gone() is not None, LINE_S):
+            raise RuntimeError(f"not established within {LINE_S:g} s; {self._status}")
+        if gone() is not None:
+            raise RuntimeError(f"the gateway ended with {gone()}")
 
     @property
-    def _reason(self) -> str | None:
-        return self._statuses[-1][1].reason
+    def _status(self) -> dict[str, Any]:
+        return self._scene.fleet.last(f"{self._name}/status")
 
-    async def _until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not condition():
-            if time.monotonic() > deadline:
-                raise RuntimeError(f"not {what} within {timeout_s:g} s; status {self._statuses[-1:]}")
-            if self._gateway.returncode is not None:
-                raise RuntimeError(f"the gateway ended with {self._gateway.returncode}")
-            await asyncio.sleep(0.02)
-
-    async def _counters(self) -> list[str]:
+    def _counters(self) -> list[str]:
         """Read the gateway's counters, a line each."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", self._metrics)
-        with contextlib.closing(writer):
-            writer.write(b"GET /metrics HTTP/1.0\r\n\r\n")
-            page = await asyncio.wait_for(reader.read(), 5)
-        return [line for line in page.decode().splitlines() if not line.startswith("#")]
+        with urllib.request.urlopen(f"http://127.0.0.1:{self._metrics}/metrics", timeout=5) as page:
+            return [line for line in page.read().decode().splitlines() if not line.startswith("#")]
 
-    async def _link_stalls(self) -> int:
+    def _link_stalls(self) -> int:
         """Give the gateway's count of links that took nothing."""
-        return sum(int(line.split()[-1]) for line in await self._counters() if line.startswith(LINK_STALLS))
+        return sum(int(line.split()[-1]) for line in self._counters() if line.startswith(LINK_STALLS))
 
     # What is measured
 
-    async def _drive(self, stack: contextlib.AsyncExitStack, speed: float) -> None:
-        part = [sys.executable, "-m", "tests.e2e.stalls", "--be-driver", self._scene.endpoint, self._name, str(speed)]
-        self._driver = await _started(stack, *part)
+    def _drive(self, speed: float) -> None:
+        number = round(speed * SCALE)
+        driver = loss.driver(self._scene.endpoint, self._name, DEADMAN_S, RATE_HZ, number, 0)
+        self._driver = Part(self._stack, *driver)
 
-    async def _measure(self, stack: contextlib.AsyncExitStack) -> None:
+    def _say_again(self, speed: float) -> None:
+        self._driver.say(f"again {round(speed * SCALE)}")
+
+    def _measure(self) -> None:
         outcome, robot = self.outcome, self._robot
-        if not await robot.moving(FIRST, START_S):
-            counted = [line for line in await self._counters() if not line.endswith(" 0")]
-            await self._report()
-            raise RuntimeError(f"the robot was never driven; status {self._statuses[-1:]}; counters {counted}")
-        await asyncio.sleep(self._rng.uniform(0.3, 0.8))
-        before, stalls = self._reason, await self._link_stalls()
-        went, ended, on = await self._disturb()
-        gated = not self._kind.udp or await self._link_stalls() > stalls
+        if not robot.moving(FIRST, LINE_S):
+            counted = [line for line in self._counters() if not line.endswith(" 0")]
+            self._report()
+            raise RuntimeError(f"the robot was never driven; {self._status}; counters {counted}")
+        time.sleep(self._rng.uniform(0.3, 0.8))
+        before, stalls = self._status["reason"], self._link_stalls()
+        went, ended, on = self._disturb()
+        gated = not self._kind.udp or self._link_stalls() > stalls
         if outcome.cause == "driving" and not gated:  # its datagrams were lost, and what it says now is fresh
-            await asyncio.sleep(REST_S)
-            _tell(self._driver, "neutral")
+            time.sleep(REST_S)
+            self._driver.say("neutral")
             ended = time.monotonic()
         since = max(on, ended)
-        rested = await robot.rest(since, self._patience_s)
+        rested = robot.rest(since, self._patience_s)
         since = max(since, robot.went_on)
         outcome.held_up_s = max(0.0, robot.went_on - on)
         outcome.measured = True
         outcome.rest_s = None if rested is None else max(0.0, rested - since)
-        outcome.motion = [(at - on, speed) for at, speed in robot.changes if at > went]
-        outcome.machine_late_s = self._scene.watch.late_between(since, rested or time.monotonic())
-        outcome.link_stalls = await self._link_stalls() - stalls
+        outcome.link_stalls = self._link_stalls() - stalls
         if self._case.way == "cut":
             self._judge_status(before, went, on, ended)
         elif outcome.link_stalls:
             outcome.faults.append("link_stalls counted a robot whose kernel took everything")
         if rested is not None:
-            await self._drive_again(stack)
-        if self._case.way == "cut" and outcome.reasons and self._reason in outcome.reasons:
-            outcome.faults.append(f"status still shows the cut: {self._reason}")
+            self._drive_again()
+        if self._case.way == "cut" and self._status["reason"] in outcome.reasons:
+            outcome.faults.append(f"status still shows the cut: {self._status['reason']}")
 
-    async def _disturb(self) -> tuple[float, float, float]:
+    def _disturb(self) -> tuple[float, float, float]:
         """Stall the robot or cut its link; tell when, when the driver's motion had to end, and when it went on."""
-        seconds, cut = self._case.seconds, self._road is not None
+        seconds, road, cause = self._case.seconds, self._road, self.outcome.cause
         went = time.monotonic()
-        await self._halt()
-        share = self._rng.uniform(0.1, 0.6 if cut else 0.9)
-        await _sleep_until(went + share * seconds)
-        ended = self._let_go()
-        await _sleep_until(went + seconds)
-        on = time.monotonic()
-        await self._go_on()
-        return went, ended, on
-
-    async def _halt(self) -> None:
-        if self._road is not None:
-            await self._road.cut()
+        if road is not None:
+            road.cut()
         else:
-            os.kill(self._robot.process.pid, signal.SIGSTOP)
-
-    async def _go_on(self) -> None:
-        if self._road is not None:
-            await self._road.mend()
-        else:
-            os.kill(self._robot.process.pid, signal.SIGCONT)
-
-    def _let_go(self) -> float:
-        """Let the driver do what it does meanwhile; tell by when its motion must have ended."""
-        cause = self.outcome.cause
+            self._robot.part.signal(signal.SIGSTOP)
+        _sleep_until(went + self._rng.uniform(0.1, 0.6 if road is not None else 0.9) * seconds)
         if cause == "killed":
-            self._driver.kill()
+            self._driver.signal(signal.SIGKILL)
         elif cause != "driving":
-            _tell(self._driver, cause)
-        return time.monotonic() + DEADMAN_S * (cause == "silent")
+            self._driver.say(cause)
+        ended = time.monotonic() + DEADMAN_S * (cause == "silent")
+        _sleep_until(went + seconds)
+        on = time.monotonic()
+        if road is not None:
+            road.mend()
+        else:
+            self._robot.part.signal(signal.SIGCONT)
+        return went, ended, on
 
     def _judge_status(self, before: str | None, went: float, on: float, ended: float) -> None:
         """Note what `status` said during the cut; a longer one must be shown, there and by the counter.
@@ -569,7 +340,8 @@ class Sitting:
         Datagrams are not acknowledged: a robot driven by them needs a stop by TCP that is not.
         """
         outcome = self.outcome
-        said = {status.reason for at, status in self._statuses if went < at < on}
+        statuses = self._scene.fleet.seen[f"fleet/{self._name}/status"]
+        said = {status["reason"] for status in statuses if went < status["at"] < on}
         outcome.reasons = sorted(reason for reason in said if reason and reason != before)
         if self._case.seconds < SHOWN_S or (self._kind.udp and (outcome.cause == "driving" or on - ended < 1.0)):
             return
@@ -578,26 +350,24 @@ class Sitting:
         if not outcome.link_stalls:
             outcome.faults.append("link_stalls did not count the cut")
 
-    async def _drive_again(self, stack: contextlib.AsyncExitStack) -> None:
+    def _drive_again(self) -> None:
         """Drive again, after a neutral: the connection must have survived, and no motion of before may come."""
         again = len(self._robot.changes)
-        if self.outcome.cause == "killed" or self._driver.returncode is not None:
-            await self._drive(stack, AGAIN)
+        if self.outcome.cause == "killed" or self._driver.process.poll() is not None:
+            self._drive(AGAIN)
         else:
-            _tell(self._driver, f"again {AGAIN}")
-        if not await self._robot.moving(AGAIN, self._patience_s + DEADMAN_S):
-            self.outcome.faults.append(f"not driven again: {self._statuses[-1][1]}")
-        old = [speed for _, speed in self._robot.changes[again:] if speed and not _same(speed, AGAIN)]
-        if old:
+            self._say_again(AGAIN)
+        if not self._robot.moving(AGAIN, self._patience_s + DEADMAN_S):
+            self.outcome.faults.append(f"not driven again: {self._status}")
+        speeds = [speed for _, speed in self._robot.changes[again:]]
+        if old := [speed for speed in speeds if speed and abs(speed - AGAIN) > TOLERANCE]:
             self.outcome.faults.append(f"obeyed an old drive: {old[:5]}")
 
-    async def _report(self) -> None:
+    def _report(self) -> None:
         """End the robot, and take what its judge noted: it must have had one connection all the time."""
-        self._robot.process.send_signal(signal.SIGCONT)
-        _tell(self._robot.process, "end")
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._robot.process.wait(), 5)
-        await asyncio.sleep(0)
+        self._robot.part.signal(signal.SIGCONT)
+        self._robot.part.say("end")
+        _waited(lambda: bool(self._robot.report), 5)
         report = self._robot.report
         self.outcome.judge = {key: value[-5:] if isinstance(value, list) else value for key, value in report.items()}
         if not report.get("alive", True):
@@ -607,14 +377,10 @@ class Sitting:
             self.outcome.faults.append(f"the connection was lost: {lost[0]}")
 
 
-async def _sleep_until(at: float) -> None:
-    await asyncio.sleep(max(0.0, at - time.monotonic()))
-
-
 # The plan
 
 
-async def measure(
+def measure(
     cases: Sequence[Case],
     *,
     repetitions: int,
@@ -625,34 +391,35 @@ async def measure(
     """Do every case so often, so many at a time, and call ``took`` with each outcome; the longest go first."""
     plan = [
         (case, deque(range(first, min(first + SITTING, repetitions))))
-        for case in sorted(cases, key=lambda case: case.duration_s, reverse=True)
+        for case in sorted(cases, key=lambda case: case.seconds, reverse=True)
         for first in range(0, repetitions, SITTING)
     ]
-    waiting = iter(plan)
-    outcomes: list[Outcome] = []
+    waiting, outcomes, taking = iter(plan), list[Outcome](), threading.Lock()
 
     def take(outcome: Outcome) -> None:
-        outcomes.append(outcome)
-        took(outcome)
+        with taking:
+            outcomes.append(outcome)
+            took(outcome)
 
-    async with scenery(seed) as scene:
+    def lane() -> None:
+        for case, numbers in waiting:
+            while numbers:
+                Sitting(scene, case, numbers).run(take)
 
-        async def lane() -> None:
-            for case, numbers in waiting:
-                while numbers:
-                    await Sitting(scene, case, numbers).run(take)
-
-        async with asyncio.TaskGroup() as tasks:
-            for _ in range(min(lanes, len(plan))):
-                tasks.create_task(lane())
+    with contextlib.ExitStack() as stack:
+        scene = Scene(stack, seed)
+        threads = [threading.Thread(target=lane) for _ in range(min(lanes, len(plan)))]
+        try:
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        except KeyboardInterrupt:  # what has begun comes to its end
+            for _, numbers in plan:
+                numbers.clear()
+            for thread in threads:
+                thread.join()
     return outcomes
-
-
-def estimate_s(cases: Iterable[Case], repetitions: int, lanes: int) -> float:
-    """Expect the whole plan to last so long: the waiting, or the work of this machine's processors."""
-    each = [case.duration_s for case in cases]
-    work_s = CPU_S * len(each) * repetitions / (os.cpu_count() or 1)
-    return max(sum(each) * repetitions / lanes, work_s, max(each, default=0.0))
 
 
 def table(outcomes: Iterable[Outcome]) -> Iterator[str]:
@@ -662,15 +429,14 @@ def table(outcomes: Iterable[Outcome]) -> Iterator[str]:
     cells: dict[Case, list[Outcome]] = {}
     for outcome in outcomes:
         cells.setdefault(outcome.case, []).append(outcome)
-    names = list(ROBOTS)
-    for case in sorted(cells, key=lambda case: (case.way != "stall", names.index(case.robot), case.seconds)):
+    for case in sorted(cells, key=lambda case: (case.way != "stall", MEASURED.index(case.robot), case.seconds)):
         yield _row(case, cells[case])
 
 
 def _row(case: Case, outcomes: list[Outcome]) -> str:
     kind = ROBOTS[case.robot]
     times = [outcome.rest_s for outcome in outcomes if outcome.rest_s is not None]
-    drove_on, late = sum(outcome.drove_on for outcome in outcomes), sum(outcome.late for outcome in outcomes)
+    drove_on, late = (sum(outcome.verdict == verdict for outcome in outcomes) for verdict in ("drove on", "late"))
     median, worst = (f"{of(times):.2f}" if times else "-" for of in (statistics.median, max))
     held_up = max(outcome.held_up_s for outcome in outcomes)
     faults = [fault for outcome in outcomes for fault in outcome.faults]
@@ -685,95 +451,62 @@ def _row(case: Case, outcomes: list[Outcome]) -> str:
     )
 
 
-def beyond_kernel(case: Case) -> bool:
-    """Tell whether a cut is longer than a kernel without TCP_RTO_MAX_MS allows."""
-    release = tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])
-    return case.way == "cut" and release < KERNEL and case.seconds > 4.0
-
-
 def _parsed() -> argparse.Namespace:
     def seconds(text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(",") if part)
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--repetitions", type=int, default=30)
-    parser.add_argument("--robots", default=",".join(ROBOTS), help="some of %(default)s")
+    parser.add_argument("--robots", default=",".join(MEASURED), help="some of %(default)s")
     parser.add_argument("--stalls", type=seconds, default=STALLS_S, help='seconds, as in 0.3,2.5; "" for none')
     parser.add_argument("--cuts", type=seconds, default=CUTS_S, help='seconds; "" for none')
     parser.add_argument("--lanes", type=int, default=LANES, help="repetitions at a time")
     parser.add_argument("--out", type=Path, help="where one JSON line a repetition goes")
     parser.add_argument("--seed", type=int, default=os.getpid(), help="of the moments")
-    parser.add_argument("--apart", action="store_true", help=argparse.SUPPRESS)
     wanted = parser.parse_args()
     wanted.robots = wanted.robots.split(",")
-    if unknown := [name for name in wanted.robots if name not in ROBOTS]:
-        parser.error(f"no robot {', '.join(unknown)}: expected some of {', '.join(ROBOTS)}")
+    if unknown := [name for name in wanted.robots if name not in MEASURED]:
+        parser.error(f"no robot {', '.join(unknown)}: expected some of {', '.join(MEASURED)}")
     return wanted
 
 
 def _cases(wanted: argparse.Namespace) -> list[Case]:
-    ways = [("stall", seconds) for seconds in wanted.stalls] + [("cut", seconds) for seconds in wanted.cuts]
-    cases = [Case(robot, way, seconds) for way, seconds in ways for robot in wanted.robots]
-    allowed = [case for case in cases if not beyond_kernel(case)]
-    if len(allowed) < len(cases):
+    """List what is wanted; a kernel without TCP_RTO_MAX_MS is not cut off for long."""
+    release = tuple(int(part) for part in os.uname().release.split("-")[0].split(".")[:2])
+    cuts = [seconds for seconds in wanted.cuts if release >= KERNEL or seconds <= 4.0]
+    if len(cuts) < len(wanted.cuts):
         print("This kernel has no TCP_RTO_MAX_MS: cuts of up to 4 s only.")
-    return allowed
-
-
-def _go_apart(wanted: argparse.Namespace) -> None:
-    """Become the same program in a network namespace of its own, if cuts are wanted; without one leave them out."""
-    if wanted.apart:
-        _ip("", "link set lo up")
-    elif wanted.cuts:
-        try:
-            prefix = apart()
-        except NotHereError as error:
-            print(f"No cuts: {error}")
-            wanted.cuts = ()
-        else:
-            again = [sys.executable, "-m", "tests.e2e.stalls", *sys.argv[1:], "--apart", "--seed", str(wanted.seed)]
-            os.execvp(prefix[0], [*prefix, *again])
-
-
-def _measure(cases: list[Case], wanted: argparse.Namespace, out: TextIO | None) -> list[Outcome]:
-    """Measure until done or interrupted."""
-    outcomes: list[Outcome] = []
-    count, began = len(cases) * wanted.repetitions, time.monotonic()
-
-    def took(outcome: Outcome) -> None:
-        outcomes.append(outcome)
-        if out is not None:
-            print(json.dumps({**asdict(outcome), "good": outcome.good}), file=out, flush=True)
-        if len(outcomes) % max(1, count // 20) == 0:
-            bad = sum(not outcome.good for outcome in outcomes)
-            passed = time.monotonic() - began
-            print(f"{len(outcomes)} of {count} after {passed:.0f} s, {bad} bad", file=sys.stderr, flush=True)
-
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell's script
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(measure(cases, repetitions=wanted.repetitions, lanes=wanted.lanes, seed=wanted.seed, took=took))
-    return outcomes
+    ways = [("stall", seconds) for seconds in wanted.stalls] + [("cut", seconds) for seconds in cuts]
+    return [Case(robot, way, seconds) for way, seconds in ways for robot in wanted.robots]
 
 
 def main() -> None:
-    if sys.argv[1:2] == ["--be-driver"]:
-        asyncio.run(be_driver(*sys.argv[2:]))
-        return
     wanted = _parsed()
-    _go_apart(wanted)
+    if wanted.cuts and not go_apart("stalls"):
+        wanted.cuts = ()
     os.nice(5)
     cases = _cases(wanted)
-    minutes = estimate_s(cases, wanted.repetitions, wanted.lanes) / 60
-    print(f"{len(cases)} cases, {wanted.repetitions} times each, {wanted.lanes} at a time: some {minutes:.0f} minutes")
+    count, done, began = len(cases) * wanted.repetitions, list[Outcome](), time.monotonic()
+    print(f"{len(cases)} cases, {wanted.repetitions} times each, {wanted.lanes} at a time")
     print(f"Linux {os.uname().release}, {os.cpu_count()} processors; seed {wanted.seed}", flush=True)
-    with contextlib.ExitStack() as stack:
-        out = stack.enter_context(wanted.out.open("a")) if wanted.out else None
-        outcomes = _measure(cases, wanted, out)
-    print("\n".join(table(outcomes)))
-    good = sum(outcome.good for outcome in outcomes)
-    print(f"\n{good} of {len(outcomes)} as they should be; {len(cases) * wanted.repetitions - len(outcomes)} not done.")
-    sys.exit(not outcomes or good < len(outcomes))
+    out = wanted.out.open("a") if wanted.out else None
+
+    def took(outcome: Outcome) -> None:
+        done.append(outcome)
+        if out is not None:
+            print(json.dumps({**asdict(outcome), "good": outcome.good}), file=out, flush=True)
+        if len(done) % max(1, count // 20) == 0:
+            bad = sum(not outcome.good for outcome in done)
+            passed = time.monotonic() - began
+            print(f"{len(done)} of {count} after {passed:.0f} s, {bad} bad", file=sys.stderr, flush=True)
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell's script
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    measure(cases, repetitions=wanted.repetitions, lanes=wanted.lanes, seed=wanted.seed, took=took)
+    print("\n".join(table(done)))
+    good = sum(outcome.good for outcome in done)
+    print(f"\n{good} of {len(done)} as they should be; {count - len(done)} not done.")
+    sys.exit(not done or good < len(done))
 
 
 if __name__ == "__main__":

@@ -12,158 +12,125 @@ from typing import Any
 
 import pytest
 
-from tests.e2e.conftest import Bench, end, free_port, start, until
+from tests.e2e.conftest import Bench, device, end, free_port, listener, start, until
+from tests.e2e.robots import Robot
 from zbridge.protocol.plugin import protocol_names
 
 ROOT = Path(__file__).parents[2]
-TOML = '[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://x:1"]\n'
+FILE = '[robot]\nname = "r1"\n' + device(1, options="gap = 1")
+NOBODY = f"tcp://127.0.0.1:{free_port()}"
 
 
-def zbridge(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+def zbridge(*arguments: str, module: str = "zbridge") -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", module, *arguments]
     return subprocess.run(
-        [sys.executable, "-m", "zbridge", *arguments], capture_output=True, text=True, timeout=30, cwd=cwd or ROOT
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30, cwd=ROOT, check=False
     )
-
-
-def test_init_prints_a_configuration_that_check_takes(tmp_path: Path) -> None:
-    made = zbridge("init", "tcpudp", "--name", "arm-7")
-    assert tomllib.loads(made.stdout)["robot"]["name"] == "arm-7"
-    file = tmp_path / "arm.toml"
-    file.write_text(made.stdout)
-    checked = zbridge("check", str(file))
-    assert (checked.returncode, checked.stderr) == (0, "")
-    assert "fleet/arm-7, tcpudp at tcp://127.0.0.1:11001, bus as peer" in checked.stdout
 
 
 @pytest.mark.parametrize("protocol", protocol_names())
-def test_the_deployed_configurations_are_what_init_prints(protocol: str) -> None:
+def test_the_deployed_configurations_are_what_init_prints_and_check_takes_them(protocol: str, tmp_path: Path) -> None:
     assert (ROOT / f"deploy/config/{protocol}.toml").read_text() == zbridge("init", protocol).stdout
     assert (ROOT / f"deploy/config/hq-{protocol}.toml").read_text() == zbridge("init", protocol, "--hq").stdout
+    file, made = tmp_path / "arm.toml", zbridge("init", protocol, "--name", "arm-7").stdout
+    assert tomllib.loads(made)["robot"]["name"] == "arm-7"
+    file.write_text(made)
+    checked = zbridge("check", str(file))
+    assert (checked.returncode, checked.stderr) == (0, "")
+    assert f"fleet/arm-7, {protocol} at tcp://127.0.0.1:" in checked.stdout
 
 
-def test_a_bad_file_ends_run_with_2_and_names_file_key_and_value(tmp_path: Path) -> None:
-    file = tmp_path / "r1.toml"
-    file.write_text(
-        '[robot]\nname = "r1"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://x:1"]\noptions = {gap = 1}\n'
-    )
-    ran = zbridge("run", str(file))
-    assert ran.returncode == 2
-    assert f"{file}: device.options.gap = 1: unknown key; expected one of udp, gap_s," in ran.stderr
+@pytest.mark.parametrize("module", ["zbridge", "gateways.tcpudp"])
+def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str, tmp_path: Path) -> None:
+    bad = tmp_path / "r1.toml"
+    bad.write_text(FILE)
+    ran = zbridge(*(["run"] if module == "zbridge" else []), str(bad), module=module)
+    assert (ran.returncode, ran.stdout) == (2, "")
+    assert f"{bad}: device.options.gap = 1: unknown key; expected one of udp, gap_s," in ran.stderr
     assert "Traceback" not in ran.stderr
 
 
-def test_an_audit_log_that_cannot_be_written_ends_run_with_2_and_names_key_and_value(tmp_path: Path) -> None:
-    file = tmp_path / "r1.toml"
-    file.write_text(f'{TOML}[control]\naudit = "{file}/audit.jsonl"\n')
-    ran = zbridge("run", str(file))
-    assert ran.returncode == 2
-    assert f"control.audit = '{file}/audit.jsonl': " in ran.stderr
+@pytest.mark.parametrize(
+    ("command", "code", "said"),
+    [
+        ("stop", 2, "ROBOT"),
+        ("stop r1 --all", 2, "--all"),
+        ("stop a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
+        ("drive a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
+        ("simulate tcpudp", 2, "give either --listen"),
+        ("simulate tcpudp --listen udp://127.0.0.1:1", 1, "expected tcp://host:port"),
+        ("simulate tcpudp --listen tcp://127.0.0.1:0 --version 1.0", 2, "expected one of 1.1, 1.2, 1.3, 1.4"),
+        (f"simulate alf --hq {NOBODY}", 1, NOBODY),
+        (f"probe tcpudp {NOBODY}", 2, "uses it up"),
+    ],
+)
+def test_what_cannot_be_done_is_said_without_a_traceback(command: str, code: int, said: str) -> None:
+    ran = zbridge(*command.split())
+    assert (ran.returncode, ran.stdout) == (code, "")
+    assert said in ran.stderr
     assert "Traceback" not in ran.stderr
 
 
-def test_the_module_of_a_protocol_runs_only_that_protocol(tmp_path: Path) -> None:
-    file = tmp_path / "r1.toml"
-    file.write_text('[robot]\nname = "r1"\n[device]\nprotocol = "nothing"\nconnect = ["tcp://x:1"]\n')
-    ran = subprocess.run(
-        [sys.executable, "-m", "gateways.tcpudp", str(file)], capture_output=True, text=True, timeout=30, cwd=ROOT
-    )
-    assert ran.returncode == 2
-    assert "device.protocol = 'nothing': expected one of" in ran.stderr
-
-
-def test_ls_lists_the_robot_and_stop_confirms(bench: Bench) -> None:
-    port = free_port()
-    bench.simulator(port)
-    bench.serve("r1", port)
-    at = ("--connect", bench.endpoint)
+def test_ls_echo_and_stop_say_what_there_is_and_a_stop_takes_the_robot_from_its_driver(bench: Bench) -> None:
+    port, fleet, at = bench.simulator(), bench.fleet, ("--connect", bench.endpoint)
+    bench.serve(port)
     (robot,) = [json.loads(line) for line in zbridge("ls", "--json", *at).stdout.splitlines()]
     assert (robot["robot"], robot["state"], robot["version"]) == ("r1", "established", "1.3")
     assert "established" in zbridge("ls", *at).stdout
+    for line in zbridge("echo", "fleet/r1/pose", "--json", "--count", "2", *at).stdout.splitlines():
+        assert json.loads(line).keys() == {"key", "x", "y", "heading", "stamp_ns"}
+    until(lambda: fleet.last("r1/map"), what="a map")
+    (last,) = zbridge("echo", "fleet/r1/map", "--count", "1", *at).stdout.splitlines()
+    assert "cells=uint8[100, 100]" in last
+    nothing = zbridge("drive", "r1", *at)
+    assert (nothing.returncode, nothing.stderr) == (1, "zbridge: drive needs a terminal to read keys from\n")
+    fleet.hold("r1", "driver")
     stopped = zbridge("stop", "r1", *at)
     assert (stopped.returncode, stopped.stdout) == (0, "r1: stopped\n")
-    assert zbridge("stop", "--all", *at).stdout == "r1: stopped\n"
-    missing = zbridge("stop", "r2", *at)
-    assert missing.returncode == 1
-    assert "no gateway confirmed" in missing.stderr
+    fleet.put("r1/@cmd/drive", forward=0.5)
+    until(lambda: fleet.refusal(who="driver", reason="the lease has ended (stop)"), what="refusal")
+    missing = zbridge("stop", "r9", *at)
+    assert (missing.returncode, missing.stderr) == (1, "r9: stop sent, but no gateway confirmed it within 2 s\n")
+    bench.gateway(device(free_port()), robot="r2")
+    until(lambda: "refused" in fleet.reason("r2"), what="why it is offline")
+    both = zbridge("stop", "--all", *at)
+    assert (both.returncode, both.stdout) == (1, "r1: stopped\n")
+    assert both.stderr.startswith("r2: stop taken, but the robot is ")
+    elsewhere = zbridge("stop", "--all", "--realm", "lab", *at)
+    assert (elsewhere.returncode, elsewhere.stderr) == (1, "no gateways on lab/\n")
 
 
-def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it_on_a_narrow_screen_too(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    port, listener = free_port(), free_port()
-    bench.simulator(port)
-    address = f"tcp://127.0.0.1:{listener}"
-    bench.serve("r1", port, f'[[hq]]\nname = "desk"\nprotocol = "tcpudp"\nlisten = "{address}"\n')
-    program = bench.zbridge("simulate", "tcpudp", "--hq", address)
-    at = ("--sessions", "--connect", bench.endpoint)
+def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it(bench: Bench) -> None:
+    port = free_port()
+    bench.serve(bench.simulator(), listener("desk", "tcpudp", port))
+    program = bench.zbridge("simulate", "tcpudp", "--hq", f"tcp://127.0.0.1:{port}")
 
-    def listed() -> list[dict[str, Any]]:
-        return [json.loads(line) for line in zbridge("ls", "--json", *at).stdout.splitlines()]
+    def listed(state: str) -> list[dict[str, Any]]:
+        entries = zbridge("ls", "--json", "--sessions", "--connect", bench.endpoint).stdout.splitlines()
+        return [entry for entry in map(json.loads, entries) if (entry["name"], entry["state"]) == ("desk.2", state)]
 
-    entries = until(lambda: [entry for entry in listed() if entry["name"] == "desk.2" and entry["version"]])
-    assert (entries[0]["who"], entries[0]["role"], entries[0]["transport"]) == ("gateway", "robot", "udp")
-    monkeypatch.setenv("COLUMNS", "80")
-    shown = zbridge("ls", *at).stdout
-    assert "desk.2" in shown
-    assert entries[0]["peer"] in shown
+    (entry,) = until(lambda: listed("established"), what="the program")
+    assert (entry["who"], entry["role"], entry["transport"]) == ("gateway", "robot", "udp")
+    assert entry["version"] == "1.3"
     assert end(program) == "", "it complained of nothing"
     assert program.returncode == 0
-    gone = until(lambda: [entry for entry in listed() if entry["state"] == "closed"])
-    assert gone[0]["reason"] == "closed by peer"
+    (gone,) = until(lambda: listed("closed"), what="its end")
+    assert gone["reason"] == "closed by peer"
 
 
-def test_simulate_is_either_a_robot_or_an_hq_program() -> None:
-    assert "give either --listen" in zbridge("simulate", "tcpudp").stderr
-    address = f"tcp://127.0.0.1:{free_port()}"
-    nobody = zbridge("simulate", "alf", "--hq", address)
-    assert (nobody.returncode, nobody.stderr.count("\n")) == (1, 1)
-    assert address in nobody.stderr
-
-
-def test_a_stop_typed_by_anybody_takes_the_robot_from_its_driver(bench: Bench) -> None:
-    port = free_port()
-    bench.simulator(port)
-    bench.serve("r1", port)
-    bench.fleet.hold("r1", "driver")
-    bench.fleet.put("r1/@cmd/drive", forward=0.5)
-    assert zbridge("stop", "r1", "--connect", bench.endpoint).stdout == "r1: stopped\n"
-    bench.fleet.put("r1/@cmd/drive", forward=0.5)
-    refused = until(lambda: bench.fleet.last("r1/control")["refusals"], what="refusal")[0]
-    assert (refused["who"], refused["reason"]) == ("driver", "the lease has ended (stop)")
-
-
-def test_echo_prints_decoded_messages_with_the_last_states_first(bench: Bench) -> None:
-    port = free_port()
-    bench.simulator(port)
-    bench.gateway("r1", port)
-    until(lambda: bench.fleet.last("r1/map"))
-    at = ("--connect", bench.endpoint)
-    printed = zbridge("echo", "fleet/r1/pose", "--json", "--count", "2", *at)
-    for line in printed.stdout.splitlines():
-        assert json.loads(line).keys() == {"key", "x", "y", "heading", "stamp_ns"}
-    (line,) = zbridge("echo", "fleet/r1/map", "--count", "1", *at).stdout.splitlines()
-    assert "cells=uint8[100, 100]" in line
-
-
-def test_stop_needs_one_robot_or_all() -> None:
-    assert zbridge("stop").returncode == 2
-    assert zbridge("stop", "r1", "--all").returncode == 2
-
-
-@pytest.mark.parametrize("command", ["stop", "drive"])
-def test_a_robot_that_cannot_be_one_ends_with_2_and_one_line(command: str) -> None:
-    ran = zbridge(command, "a b")
-    line = "zbridge: ROBOT = 'a b': expected letters, digits, '_', '.' and '-' only\n"
-    assert (ran.returncode, ran.stdout, ran.stderr) == (2, "", line)
-
-
-def test_the_demo_shows_data_and_ends_by_itself() -> None:
-    shown = zbridge("demo", "--seconds", "4")
-    assert shown.returncode == 0, shown.stdout + shown.stderr
-    assert "established" in shown.stdout
-    for robot, protocol in (("alf1", "alf"), ("tcpudp1", "tcpudp"), ("wc2ec1", "wc2ec")):
-        assert robot in shown.stdout
-        assert f"zbridge simulate {protocol} --hq tcp://127.0.0.1:" in shown.stdout
+def test_probe_talks_to_a_robot_only_with_yes_and_asks_a_gateway_first(bench: Bench, robot: Robot) -> None:
+    probe = ("probe", "tcpudp", f"tcp://127.0.0.1:{robot.port}", "--connect", bench.endpoint)
+    assert zbridge(*probe).returncode == 2
+    assert robot.connections == 0
+    asked = zbridge(*probe, "--yes")
+    assert (asked.returncode, robot.connections) == (0, 1)
+    assert "version: 1.3" in asked.stdout
+    assert '"joystick"' in asked.stdout
+    bench.serve(robot.port)
+    served = zbridge(*probe)
+    assert (served.returncode, robot.connections) == (0, 2)
+    assert "served by the gateway of r1" in served.stdout
+    assert "version: 1.3" in served.stdout
 
 
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:
@@ -174,12 +141,4 @@ def test_the_demo_interrupted_leaves_no_process_behind() -> None:
     assert len(children) == 2 * len(protocol_names())
     end(demo, signal.SIGINT, within_s=20.0)  # seven processes; what counts is that none is left
     assert demo.returncode == 0
-    for child in children:
-        until(lambda child=child: not Path(f"/proc/{child}").exists(), what=f"end of {child}")  # type: ignore[misc]
-
-
-@pytest.mark.parametrize("address", ["127.0.0.1:1", "udp://127.0.0.1:1", "tcp://127.0.0.1"])
-def test_simulate_says_what_address_it_expects(address: str) -> None:
-    ran = zbridge("simulate", "tcpudp", "--listen", address)
-    assert ran.returncode == 1
-    assert "expected tcp://host:port" in ran.stderr
+    until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), what="the end of all")

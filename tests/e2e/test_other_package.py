@@ -1,13 +1,12 @@
-"""A protocol of another package that has no HQ side: the demo shows it, and listeners of others serve its robot."""
+"""Protocols of other packages: one that has no HQ side, and the example of the plug-in guide."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import shutil
 import subprocess
-from collections.abc import Iterator
+import sys
 from pathlib import Path
 
 import pytest
@@ -15,66 +14,66 @@ import pytest
 from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
 from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileController
-from tests.e2e.conftest import Bench, start
+from tests.e2e.conftest import HOST, Bench, device, listener
+from tests.e2e.fragile import charges
 from tests.e2e.hq_judge import LET_GO_S
-from tests.e2e.hq_scene import HOST, device, gateway, listener, playing, ports, soon
+from tests.e2e.hq_scene import playing, ports, soon
 
-PACKAGE = Path(__file__).parent / "other_package"
-NAMES = "[zbridge.protocols]\ntoy = toyrobot:PROTOCOL\n"
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "khepera"
+PACKAGES = {"khepera": EXAMPLE / "khepera", "toy": Path(__file__).parent / "other_package" / "toyrobot.py"}
 
 
 @pytest.fixture(autouse=True)
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Install the package for every process that is started, as an installer would."""
+def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install the packages for every process that is started, as an installer would."""
     site = tmp_path / "site"
-    about = site / "toyrobot-1.0.dist-info"
-    about.mkdir(parents=True)
-    shutil.copy(PACKAGE / "toyrobot.py", site)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toyrobot\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(NAMES)
+    for name, source in PACKAGES.items():
+        about = site / f"{name}robot-1.0.dist-info"
+        about.mkdir(parents=True)
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, site / source.name)
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}robot\nVersion: 1.0\n")
+        (about / "entry_points.txt").write_text(f"[zbridge.protocols]\n{name} = {source.stem}:PROTOCOL\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH")))))
 
 
-@pytest.fixture
-def stack() -> Iterator[contextlib.ExitStack]:
-    with contextlib.ExitStack() as started:
-        yield started
+def run(*arguments: str, code: int = 0) -> str:
+    ran = subprocess.run([sys.executable, "-m", *arguments], capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == code, ran.stdout + ran.stderr
+    return ran.stdout + ran.stderr
 
 
-def test_the_demo_shows_a_robot_that_has_no_hq_side_and_says_so() -> None:
-    demo = start("demo", "--seconds", "8")
-    shown = end_of(demo)
-    assert demo.returncode == 0, shown
+def test_the_example_passes_its_tests_and_is_driven_by_tcp_and_on_a_serial_line(tmp_path: Path) -> None:
+    shutil.copytree(EXAMPLE / "tests", tmp_path / "tests")
+    shutil.copy(EXAMPLE / "pyproject.toml", tmp_path)
+    tests = str(tmp_path / "tests")
+    assert "passed" in run("pytest", "-q", "-p", "no:cacheprovider", "--rootdir", str(tmp_path), tests)
+
+
+@pytest.mark.parametrize("protocol", ["khepera", "alf", "tcpudp", "wc2ec"])
+def test_every_protocol_holds_what_the_conformance_kit_asks(protocol: str) -> None:
+    assert run("zbridge.simulation.check", protocol).endswith("hold, 0 do not\n")
+
+
+def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_clear_error(tmp_path: Path) -> None:
+    shown = run("zbridge", "demo", "--seconds", "8")
     assert "  toy1: serves no HQ programs" in shown
     assert "  alf1: zbridge simulate alf --hq tcp://127.0.0.1:" in shown
-    (row,) = [line for line in shown.splitlines() if "toy1" in line and "│" in line][-1:]
+    row = [line for line in shown.splitlines() if "toy1" in line and "│" in line][-1]
     assert "established" in row, row
-
-
-def end_of(process: subprocess.Popen[str]) -> str:
-    """Wait until a process ends by itself; give what it printed."""
-    out, _ = process.communicate(timeout=60)
-    return out
-
-
-def test_a_listener_of_a_protocol_without_an_hq_side_is_a_clear_error(tmp_path: Path) -> None:
     file = tmp_path / "r1.toml"
     file.write_text('[robot]\nname = "r1"\n' + listener("hq", "toy", 4001))
-    process = start("run", str(file))
-    assert "hq[0].protocol = 'toy': serves no HQ programs" in end_of(process)
-    assert process.returncode == 2
+    assert "hq[0].protocol = 'toy': serves no HQ programs" in run("zbridge", "run", str(file), code=2)
 
 
 async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their_listeners_do_not_know(
-    bench: Bench, stack: contextlib.ExitStack
+    bench: Bench,
 ) -> None:
-    robot, tcp, alf, ec = ports(4)
-    bench.simulator(robot, "toy")
+    tcp, alf, ec = ports(3)
     parts = [listener("tcp", "tcpudp", tcp), listener("alf", "alf", alf), listener("ec", "wc2ec", ec)]
-    process = gateway(bench, stack, *parts, device("toy", robot), lease_s=1.2)
+    process = bench.gateway(*parts, device(bench.simulator("toy"), "toy"), "[control]\nlease_s = 1.2\n")
     program, vehicle, controller = TcpHq(), AlfHq(deployed="driving"), FragileController()
     await soon(lambda: process.listens(3), "listeners")
-    await soon(lambda: bench.fleet.state("r1") == "established", "established")
+    await soon(lambda: bench.fleet.state() == "established", "established")
 
     async def moves(who: str) -> None:
         x = bench.fleet.last("r1/pose")["x"]
@@ -83,6 +82,10 @@ async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their
 
     async def free() -> None:
         await soon(lambda: bench.fleet.last("r1/control")["state"] == "free", "free")
+
+    async def turn_wheels(velocity: float) -> None:
+        for wheel in ("left", "right"):
+            await controller.set(wheel, velocity)
 
     async with playing(program.run(HOST, tcp), vehicle.run(HOST, alf), controller.run(HOST, ec)):
         await soon(lambda: program.position, "a position")
@@ -102,18 +105,12 @@ async def test_programs_of_every_protocol_drive_a_robot_of_a_protocol_that_their
         await moves("hq.alf.1")
         vehicle.idle()
         await free()
-        for velocity in (0.0, 5.0):
-            for wheel in ("left", "right"):
-                await controller.set(wheel, velocity)
+        await turn_wheels(0.0)
+        await turn_wheels(5.0)
         await moves("hq.ec.1")
-        for wheel in ("left", "right"):
-            await controller.set(wheel, 0.0)
+        await turn_wheels(0.0)
         await free()
-    process.end()
-    assert "KeyError" not in process.log
-    assert not [
-        text for text in (*program.violations, *vehicle.violations, *controller.violations) if "(this" not in text
-    ]
-    assert program.alive
-    assert vehicle.alive
-    assert controller.alive
+    assert "KeyError" not in process.end()
+    for one in (program, vehicle, controller):
+        assert one.alive
+        assert not charges(one.violations)

@@ -7,41 +7,31 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.e2e.conftest import Bench, free_port, until
+from tests.e2e.conftest import Bench, until
 
 ROOT = Path(__file__).parents[2]
 
 
 def run_program(bench: Bench, page: str) -> list[str]:
-    """Run a page's one Python program against a simulated robot; give the lines that the program printed."""
+    """Run a page's one Python program against a simulated robot, which must drive; give the lines it printed."""
     (program,) = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
-    port = free_port()
-    bench.simulator(port)
-    bench.gateway("tcpudp1", port)
-    until(lambda: bench.fleet.state("tcpudp1") == "established")
-    ran = subprocess.run(
-        [sys.executable, "-c", program.replace("tcp/127.0.0.1:7447", bench.endpoint)],
-        capture_output=True,
-        text=True,
-        timeout=30,
-    )
+    bench.serve(bench.simulator(), robot="tcpudp1")
+    program = program.replace("tcp/127.0.0.1:7447", bench.endpoint)
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30)
     assert ran.returncode == 0, ran.stderr
+    poses = bench.fleet.seen["fleet/tcpudp1/pose"]
+    assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
+    until(lambda: bench.fleet.last("tcpudp1/control")["state"] == "free", what="a robot that was given back")
     return ran.stdout.splitlines()
 
 
 def test_the_readmes_client_drives(bench: Bench) -> None:
     first, last = run_program(bench, "README.md")
     state, x, *shape = first.split()
-    assert state == "established"
-    assert " ".join(shape) == "(100, 100)"
+    assert (state, " ".join(shape)) == ("established", "(100, 100)")
     assert abs(float(x)) < 5
     assert len(last.split()) == 3
-    poses = bench.fleet.seen["fleet/tcpudp1/pose"]
-    assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
-    assert bench.fleet.last("tcpudp1/control")["state"] == "free"
 
 
 def test_the_plain_program_of_the_keys_page_prints_poses_and_drives(bench: Bench) -> None:
-    poses = [eval(line) for line in run_program(bench, "docs/keys.md")]
-    assert len(poses) > 10
-    assert abs(poses[-1]["y"] - poses[0]["y"]) > 0.3
+    assert len([eval(line) for line in run_program(bench, "docs/keys.md")]) > 10

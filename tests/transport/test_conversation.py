@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.protocol.test_session import LIMITS, WELCOME, Toy
+from tests.protocol.test_session import LIMITS, Toy
 from zbridge.errors import NotReady
 from zbridge.metrics import Count
 from zbridge.protocol.session import LINGER_S, State
@@ -15,6 +15,8 @@ from zbridge.transport.conversation import Conversation
 from zbridge.transport.fake import FakeLink
 
 pytestmark = pytest.mark.jumping
+
+WELCOME = b"\x07welcome"
 
 
 class Rig:

@@ -3,6 +3,8 @@
 Nothing here encodes with the code under test.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet
@@ -10,6 +12,7 @@ from gateways.tcpudp.session import HqRole, RobotRole
 from zbridge.protocol.session import Datagram
 
 LISTED = b"1.1,1.2,1.3"
+LISTED_14 = LISTED + b",1.4"
 ALL = "01010101010101"
 """UDP, Cam, Joystick, Chat, Lidar, LidarSim, SLAMMap."""
 NO_UDP = "00010101010101"
@@ -46,6 +49,11 @@ def server_settings(versions: bytes = LISTED, block: str = ALL + SIZE_100_10, cl
 def client_settings(versions: bytes = LISTED, block: str = "01000000000100", sender: int = 5) -> bytes:
     """Packet 3; the flags of deployed 1.3 programs are UDP and LidarSim."""
     return framed(sender, 3, counted(versions) + bytes.fromhex(block))
+
+
+def bearing(frame: bytes, sender: int) -> bytes:
+    """The same frame with another id."""
+    return frame[:4] + bytes([sender]) + frame[5:]
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,12 @@ class Timed:
         messages = self.session.receive_datagram(data, at)
         self._write()
         return messages
+
+    def come(self, *coming: tuple[float, str, bytes]) -> Timed:
+        """Let frames come, each at its time and by its channel."""
+        for at, by, data in coming:
+            (self.stream if by == "tcp" else self.datagram)(data, at)
+        return self
 
     def frames(self, by: str, start: float = -1.0, end: float = 1e9) -> list[bytes]:
         """What left by one channel from ``start`` up to but not at ``end``."""

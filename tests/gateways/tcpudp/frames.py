@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqRole, RobotRole
+from gateways.tcpudp.translate import Options, TcpUdpRobot
+from zbridge.fleet.messages import FleetMessage
+from zbridge.fleet.topics import Topic
 from zbridge.protocol.session import Datagram
 
 LISTED = b"1.1,1.2,1.3"
@@ -68,11 +71,11 @@ class Sent:
 class Timed:
     """A session whose timers fire when they are due, and what left it when and by which channel."""
 
-    def __init__(self, session: HqRole | RobotRole) -> None:
+    def __init__(self, session: HqRole | RobotRole, now: float = 0.0) -> None:
         self.session = session
-        self.now = 0.0
+        self.now = now
         self.sent: list[Sent] = []
-        session.open(0.0)
+        session.open(now)
         self._write()
 
     def until(self, now: float) -> None:
@@ -115,3 +118,49 @@ class Timed:
         while (frame := self.session.outgoing(self.now)) is not None:
             by = "udp" if type(frame) is Datagram else "tcp"
             self.sent.append(Sent(self.now, by, bytes(frame)))
+
+
+class Stage:
+    """A robot seen from its HQ, with a session that was established a second ago, and what leaves it."""
+
+    def __init__(self, settings: bytes, options: Options | None = None) -> None:
+        self.robot = TcpUdpRobot(options or Options())
+        self.timed = self._connected(settings, 0.0)
+
+    def connect(self, settings: bytes) -> None:
+        """Lose the connection and connect again."""
+        self.session.lost("closed by peer")
+        self.timed = self._connected(settings, self.now)
+
+    def _connected(self, settings: bytes, now: float) -> Timed:
+        timed = Timed(self.robot.session("robot", "tcp://robot.test:1"), now)
+        timed.stream(settings, now)
+        timed.until(now + 1.0)
+        return timed
+
+    @property
+    def session(self) -> HqRole:
+        assert isinstance(self.timed.session, HqRole)
+        return self.timed.session
+
+    def command(self, topic: Topic, command: FleetMessage) -> str | None:
+        """Command the robot; give what was left out."""
+        return self.robot.command(topic, command, self.now).left_out
+
+    def after(self, seconds: float) -> list[bytes]:
+        """Let time pass; give what left meanwhile."""
+        before = len(self.timed.sent)
+        self.timed.until(self.timed.now + seconds)
+        return [sent.frame for sent in self.timed.sent[before:]]
+
+    def told(self, *frames: bytes, stamp_ns: int = 7) -> list[tuple[Topic, FleetMessage]]:
+        """What the translation makes of the last of what the robot sends."""
+        telemetry: list[tuple[Topic, FleetMessage]] = []
+        for frame in frames:
+            (message,) = self.session.receive(frame, self.now)
+            telemetry = list(self.robot.telemetry(message, stamp_ns))
+        return telemetry
+
+    @property
+    def now(self) -> float:
+        return self.timed.now

@@ -7,39 +7,27 @@ import asyncio
 import pytest
 
 from gateways.tcpudp.session import HqRole, limits
-from tests.gateways.tcpudp.frames import (
-    ANSWER_FALSE,
-    ANSWER_TRUE,
-    LISTED,
-    POSITION,
-    SIZE_100_10,
-    START,
-    Stage,
-    Timed,
-    counted,
-    framed,
-    server_settings,
-)
+from tests.gateways.tcpudp import frames as f
 from tests.robot.test_device import Rig, serving
 from zbridge.fleet import topics
 
 pytestmark = pytest.mark.jumping
 
-MALFORMED = framed(1, 51, b"\x01")
-TEXT = framed(1, 1, counted(b"hello"))
+MALFORMED = f.framed(1, 51, b"\x01")
+TEXT = f.framed(1, 1, f.counted(b"hello"))
 LATER = "client id 3: another program is connected, or the one usable connection is used up"
 GARBLED = "malformed packets"
 UNANSWERED = "no telemetry and no answer to the probe within 5 s"
 MUTE = "no telemetry within 5 s, unlike on the connection before"
 
 
-def settings(client_id: int = 2, flags: str = "00", versions: bytes = LISTED) -> bytes:
+def settings(client_id: int = 2, flags: str = "00", versions: bytes = f.LISTED) -> bytes:
     flags += "010101010101"
-    blocks = {b"1.1": flags[:10], b"1.2": flags[:12], LISTED: flags + SIZE_100_10}
-    return server_settings(versions, blocks[versions], client_id)
+    blocks = {b"1.1": flags[:10], b"1.2": flags[:12], f.LISTED: flags + f.SIZE_100_10}
+    return f.server_settings(versions, blocks[versions], client_id)
 
 
-def doubts(timed: Timed, until: float) -> tuple[str, ...]:
+def doubts(timed: f.Timed, until: float) -> tuple[str, ...]:
     """The doubts at a time; only a client id above 2 together with another sign is a reason not to drive."""
     timed.until(until)
     named = timed.session.doubts
@@ -49,17 +37,17 @@ def doubts(timed: Timed, until: float) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("client_id", [0, 1, 2, 3, 4, 255])
-@pytest.mark.parametrize("versions", [b"1.1", b"1.2", LISTED])
+@pytest.mark.parametrize("versions", [b"1.1", b"1.2", f.LISTED])
 def test_a_client_id_above_2_is_named_and_alone_no_reason_not_to_drive(client_id: int, versions: bytes) -> None:
     """A robot without datagrams may be silent until it is asked."""
-    timed = Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, versions=versions)))
+    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, versions=versions)))
     timed.until(100.0)
     assert timed.session.doubts == ((LATER.replace("3", str(client_id)),) if client_id > 2 else ())
     assert timed.session.doubtful is None
 
 
-FEW_OF_MANY = [(11.0, "tcp", POSITION * 1000), (12.0, "tcp", MALFORMED * 20)]
-GARBLED_FIRST = (1.0, "tcp", POSITION * 5 + MALFORMED * 3)
+FEW_OF_MANY = [(11.0, "tcp", f.POSITION * 1000), (12.0, "tcp", MALFORMED * 20)]
+GARBLED_FIRST = (1.0, "tcp", f.POSITION * 5 + MALFORMED * 3)
 
 
 @pytest.mark.parametrize(
@@ -68,13 +56,13 @@ GARBLED_FIRST = (1.0, "tcp", POSITION * 5 + MALFORMED * 3)
         pytest.param([(1.0, "tcp", MALFORMED * 2)], 10.0, (LATER,), id="a few malformed packets"),
         pytest.param(FEW_OF_MANY, 12.0, (LATER,), id="a few of many"),
         pytest.param([GARBLED_FIRST], 1.0, (LATER, GARBLED), id="three and more than a twentieth"),
-        pytest.param([GARBLED_FIRST, (2.0, "tcp", POSITION * 100)], 8.0, (LATER,), id="most could be read after all"),
-        pytest.param([(1.0, "udp", POSITION[:-1])] * 3, 1.0, (LATER, GARBLED), id="malformed datagrams"),
-        pytest.param([(0.2, "tcp", START)], 100.0, (LATER,), id="a probe that was never sent, for nobody offered it"),
+        pytest.param([GARBLED_FIRST, (2.0, "tcp", f.POSITION * 100)], 8.0, (LATER,), id="most could be read after all"),
+        pytest.param([(1.0, "udp", f.POSITION[:-1])] * 3, 1.0, (LATER, GARBLED), id="malformed datagrams"),
+        pytest.param([(0.2, "tcp", f.START)], 100.0, (LATER,), id="a probe that was never sent, for nobody offered it"),
     ],
 )
 def test_three_malformed_packets_and_more_than_a_twentieth_are_a_sign(coming, until, expected) -> None:
-    assert doubts(Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(3)), *coming), until) == expected
+    assert doubts(f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(3)), *coming), until) == expected
 
 
 @pytest.mark.parametrize(
@@ -82,11 +70,11 @@ def test_three_malformed_packets_and_more_than_a_twentieth_are_a_sign(coming, un
     [
         pytest.param(3, [], 7.59, (LATER,), id="not yet five seconds"),
         pytest.param(3, [], 7.61, (LATER, UNANSWERED), id="neither within five seconds"),
-        pytest.param(3, [(9.0, "tcp", POSITION)], 10.1, (LATER,), id="it has answered a question"),
+        pytest.param(3, [(9.0, "tcp", f.POSITION)], 10.1, (LATER,), id="it has answered a question"),
         pytest.param(3, [(3.0, "tcp", TEXT * 5)], 8.0, (LATER, UNANSWERED), id="texts, that all get"),
-        pytest.param(3, [(1.0, "tcp", ANSWER_FALSE)], 8.0, (LATER, UNANSWERED), id="a probe that did not arrive"),
-        pytest.param(3, [(4.0, "udp", ANSWER_TRUE)], 8.0, (LATER,), id="an answer that came late"),
-        pytest.param(3, [(0.2, "udp", ANSWER_TRUE)], 100.0, (LATER,), id="silent until it is asked"),
+        pytest.param(3, [(1.0, "tcp", f.ANSWER_FALSE)], 8.0, (LATER, UNANSWERED), id="a probe that did not arrive"),
+        pytest.param(3, [(4.0, "udp", f.ANSWER_TRUE)], 8.0, (LATER,), id="an answer that came late"),
+        pytest.param(3, [(0.2, "udp", f.ANSWER_TRUE)], 100.0, (LATER,), id="silent until it is asked"),
         pytest.param(2, [], 100.0, (UNANSWERED,), id="a first connection, which is driven"),
         pytest.param(2, [(1.0, "tcp", MALFORMED * 10)], 1.0, (GARBLED,), id="malformed packets on a first connection"),
     ],
@@ -94,18 +82,18 @@ def test_three_malformed_packets_and_more_than_a_twentieth_are_a_sign(coming, un
 def test_neither_telemetry_nor_an_answer_to_the_probe_within_five_seconds_is_a_sign(
     client_id: int, coming: list[tuple[float, str, bytes]], until: float, expected: tuple[str, ...]
 ) -> None:
-    timed = Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, "01") + START))  # established at 2.6
+    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, "01") + f.START))  # established at 2.6
     assert doubts(timed.come(*coming), until) == expected
 
 
-def talked(*, asked: bool = False) -> Stage:
+def talked(*, asked: bool = False) -> f.Stage:
     """A robot on its second connection, established a second ago; on the first one it sent telemetry, asked or not."""
-    stage = Stage(settings())
+    stage = f.Stage(settings())
     for _ in range(9):
         if asked:
             stage.robot.ask(topics.POSE)
             stage.after(0.1)
-        stage.told(POSITION)
+        stage.told(f.POSITION)
         stage.after(1.0)
     stage.connect(settings(3))
     return stage
@@ -121,7 +109,7 @@ def test_a_robot_that_sent_telemetry_before_and_sends_none_now_is_named_on_every
         stage.connect(settings(3))
         assert lost.doubts == ()
     stage.after(5.0)
-    stage.told(POSITION)
+    stage.told(f.POSITION)
     assert doubts(stage.timed, stage.now + 1.1) == (LATER,), "it talks after all"
 
 
@@ -129,14 +117,14 @@ def test_answers_and_texts_are_no_telemetry_of_its_own() -> None:
     stage = talked()
     stage.told(TEXT, TEXT)
     stage.robot.ask(topics.POSE)
-    stage.told(POSITION)
+    stage.told(f.POSITION)
     assert doubts(stage.timed, stage.now + 5.0) == (LATER, MUTE)
 
 
 def test_a_robot_that_only_ever_answered_or_falls_silent_later_is_not_named() -> None:
     assert doubts(talked(asked=True).timed, 100.0) == (LATER,)
     stage = talked()
-    stage.told(POSITION)
+    stage.told(f.POSITION)
     for _ in range(40):
         stage.robot.ask(topics.POSE)
         stage.after(1.0)
@@ -154,7 +142,7 @@ async def poor(rig: Rig) -> None:
     """A second connection with two signs in 5 s; the first one had telemetry."""
     await rig.establish(settings(2))
     for _ in range(6):
-        rig.sends(POSITION)
+        rig.sends(f.POSITION)
         await asyncio.sleep(1.0)
     rig.goes()
     await asyncio.sleep(2.0)
@@ -203,7 +191,7 @@ async def test_what_does_not_move_the_robot_goes_out_on_a_poor_connection_and_wh
             await asyncio.sleep(0.05)
             assert packet_id in {frame[5] for frame in rig.written()}
         rig.command("drive", DRIVE_LEFT)
-        rig.sends(POSITION * 2)  # one more than was asked for: the answer to the lidar mode
+        rig.sends(f.POSITION * 2)  # one more than was asked for: the answer to the lidar mode
         await asyncio.sleep(1.1)
         assert rig.last("status")["reason"] == LATER
         rig.command("drive", DRIVE_LEFT)

@@ -44,9 +44,11 @@ def counted(text: bytes) -> bytes:
     return len(text).to_bytes(4, "little") + text
 
 
-def server_settings(versions: bytes = LISTED, block: str = ALL + SIZE_100_10, client_id: int = 5) -> bytes:
-    """Packet 2."""
-    return framed(1, 2, bytes([client_id]) + counted(versions) + bytes.fromhex(block))
+def server_settings(versions: bytes = LISTED, block: str = ALL, client_id: int = 5) -> bytes:
+    """Packet 2; the size of the map follows the seven flags of 1.3 where the block does not go on by itself."""
+    flags = bytes.fromhex(block)
+    size = bytes.fromhex(SIZE_100_10) if len(flags) == 7 else b""
+    return framed(1, 2, bytes([client_id]) + counted(versions) + flags + size)
 
 
 def client_settings(versions: bytes = LISTED, block: str = "01000000000100", sender: int = 5) -> bytes:

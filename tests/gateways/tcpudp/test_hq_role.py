@@ -11,6 +11,7 @@ from gateways.tcpudp.session import HqRole, limits
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.translate import Options, TcpUdpRobot
 from tests.gateways.tcpudp import frames as f
+from tests.gateways.tcpudp.golden import GOLDEN
 from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.session import State
 
@@ -19,16 +20,22 @@ SCAN = m.ClientSimulatedLidarData(np.ones(360, np.float32))
 ANSWER = f.framed(5, 3, f.counted(f.LISTED) + bytes.fromhex("01000000000100"))
 SIX = (0.3, "udp", f.ANSWER_TRUE)
 """An answer to the probe in time; the settings come at 0.1, the 4 at 0.2."""
+THEIRS = {
+    message.spec.id: (message, bytes.fromhex(text))
+    for message, sender, text in GOLDEN
+    if sender in (2, 7) and message.spec.id not in (3, 5, 7)
+}
+"""A command of each kind, by packet id."""
 BY_TCP, BY_UDP = (State.ESTABLISHED, "tcp"), (State.ESTABLISHED, "udp")
 
 
-def hq(listed: bytes = f.LISTED, block: str = f.ALL + f.SIZE_100_10, *, udp: bool = True, force: tuple = ()) -> f.Timed:
+def hq(listed: bytes = f.LISTED, block: str = f.ALL, *, udp: bool = True, force: tuple = ()) -> f.Timed:
     return f.Timed(HqRole(limits(0.01), udp=udp, force=force)).come((0.1, "tcp", f.server_settings(listed, block)))
 
 
 def plain(flags: str = f.NO_UDP, *force: Feature | int) -> f.Timed:
     """An HQ of a robot of 1.3, established without datagrams."""
-    return hq(block=flags + f.SIZE_100_10, udp=False, force=force)
+    return hq(block=flags, udp=False, force=force)
 
 
 def started(*coming: tuple[float, str, bytes]) -> f.Timed:
@@ -71,7 +78,6 @@ def agreed(timed: f.Timed) -> tuple[State, str | None]:
 def test_a_robot_is_answered_with_what_it_understands_and_with_udp_unless_either_switches_it_off(
     listed: bytes, block: str, answer: bytes, answered: str, version: str, features: str
 ) -> None:
-    block += f.SIZE_100_10 if len(block) == 14 else ""
     without = f.framed(5, 3, f.counted(answer) + bytes.fromhex(answered))
     neither, ours_off = hq(listed, block), hq(listed, "01" + block[2:], udp=False)
     for timed, announced in ((neither, features.split()), (ours_off, ["udp", *features.split()])):
@@ -103,17 +109,17 @@ def test_a_version_list_that_cannot_be_answered_does_no_harm() -> None:
 @pytest.mark.parametrize(
     ("announce", "listed", "block", "answered"),
     [
-        ((), f.LISTED, f.ALL + f.SIZE_100_10, "00000000000000"),
-        (("lidar_sim",), f.LISTED, f.ALL + f.SIZE_100_10, "00000000000100"),
-        (tuple(feature.value for feature in Feature), f.LISTED, f.ALL + f.SIZE_100_10, f.ALL),
+        ((), f.LISTED, f.ALL, "00000000000000"),
+        (("lidar_sim",), f.LISTED, f.ALL, "00000000000100"),
+        (tuple(feature.value for feature in Feature), f.LISTED, f.ALL, f.ALL),
         # as far as the block that the robot understands has a flag for it
-        (("cam", "slam_map"), f.LISTED_14, f.ALL + f.SIZE_100_10, "00010000000001"),
+        (("cam", "slam_map"), f.LISTED_14, f.ALL, "00010000000001"),
         (("cam", "lidar_sim", "slam_map"), b"1.2", f.ALL[:12], "000100000001"),
         (("chat", "lidar_sim", "slam_map"), b"1.1", f.ALL[:10], "0000000100"),
         (
             ("udp", "chat"),
             f.LISTED,
-            f.NO_UDP + f.SIZE_100_10,
+            f.NO_UDP,
             "00000001000000",
         ),  # a robot without datagrams: none of ours
     ],
@@ -140,7 +146,7 @@ def test_what_comes_before_the_settings_or_is_none_is_malformed_and_settings_tha
     assert timed.stream(early, 0.05) == []
     assert (timed.session.traffic.malformed, timed.session.state, timed.sent) == (1, State.HANDSHAKING, [])
     assert timed.stream(f.server_settings() + f.POSITION, 0.1) == [POSE]
-    timed.stream(f.server_settings(block="00" * 7 + f.SIZE_100_10, client_id=9), 0.2)
+    timed.stream(f.server_settings(block="00" * 7, client_id=9), 0.2)
     timed.until(1.0)
     assert (timed.session.traffic.malformed, timed.session.sender_id, len(timed.sent)) == (2, 5, 1)
     assert timed.session.features == tuple(feature.value for feature in Feature)
@@ -241,7 +247,7 @@ def test_datagrams_hold_one_packet_each_and_are_taken_from_the_robot_although_th
 @pytest.mark.parametrize(("flags", "udp"), [(f.NO_UDP, True), (f.ALL, False)])
 def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str, udp: bool) -> None:
     """The robot sleeps all the same, and wants its 7."""
-    timed = hq(block=flags + f.SIZE_100_10, udp=udp)
+    timed = hq(block=flags, udp=udp)
     assert timed.session.state is State.ESTABLISHED
     timed.stream(f.START, 0.2)
     assert timed.session.busy == "handshaking"
@@ -284,29 +290,14 @@ def test_an_hq_takes_packets_of_the_servers_id_and_side_only() -> None:
 # What is sent, and by which channel
 
 
-@pytest.mark.parametrize(
-    ("command", "channel", "frame"),
-    [
-        (m.DebugMessage("hi"), "tcp", bytes.fromhex("08000000 05 01 02000000 6869")),
-        (m.ClientControllMode(2), "tcp", bytes.fromhex("06000000 05 0a 02000000")),
-        (m.ClientJoystickMove(0.0, 1.0, 0.5), "udp", f.MOVE),
-        (m.ClientJoystickRotate(-0.75), "udp", f.ROTATE),
-        (m.ClientJoystickStop(), "tcp", f.STOP),
-        (m.ClientMoveAI(b"\x01\x02"), "tcp", bytes.fromhex("04000000 05 15 0102")),
-        (m.ChatMessage(b"\x03"), "tcp", bytes.fromhex("03000000 05 28 03")),
-        (m.ClientLidarMode(1), "tcp", bytes.fromhex("06000000 05 32 01000000")),
-        (m.ClientGetSLAMMap(), "tcp", bytes.fromhex("02000000 05 34")),
-        (m.ClientGetPosition(), "tcp", bytes.fromhex("02000000 05 36")),
-        (SCAN, "udp", bytes.fromhex("a6050000 05 3d 68010000" + "0000803f" * 360)),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_a_command_carries_the_clients_id_and_goes_by_the_channel_of_the_table(command, channel, frame) -> None:
+def test_a_command_carries_the_clients_id_and_goes_by_the_channel_of_the_table() -> None:
     """Before the probe there is only TCP; so there is after one that failed."""
-    for timed, by in ((probed(None), "tcp"), (probed(f.ANSWER_TRUE), channel)):
-        timed.session.send(command)
-        timed.until(3.5)
-        assert [(sent.by, sent.frame) for sent in timed.sent if sent.at >= 3.0] == [(by, frame)]
+    for command, frame in THEIRS.values():
+        by_datagram = "udp" if command.spec.id in (11, 12, 61) else "tcp"
+        for timed, by in ((probed(None), "tcp"), (probed(f.ANSWER_TRUE), by_datagram)):
+            timed.session.send(command)
+            timed.until(3.5)
+            assert [(sent.by, sent.frame) for sent in timed.sent if sent.at >= 3.0] == [(by, f.bearing(frame, 5))]
 
 
 def test_the_gap_is_kept_between_datagrams_and_segments_too() -> None:
@@ -323,18 +314,12 @@ def test_the_gap_is_kept_between_datagrams_and_segments_too() -> None:
 # What is never sent: an unregistered packet crashes a robot
 
 NEEDS = {
-    Feature.JOYSTICK: [
-        m.ClientControllMode(1),
-        m.ClientJoystickMove(0, 0, 0),
-        m.ClientJoystickRotate(0),
-        m.ClientJoystickStop(),
-        m.ClientMoveAI(),
-    ],
-    Feature.CHAT: [m.ChatMessage()],
-    Feature.LIDAR: [m.ClientLidarMode(1)],
-    Feature.SLAM_MAP: [m.ClientGetSLAMMap(), m.ClientGetPosition()],
-    Feature.LIDAR_SIM: [SCAN],
-    Feature.CAM: [],
+    Feature.JOYSTICK: (10, 11, 12, 13, 21),
+    Feature.CHAT: (40,),
+    Feature.LIDAR: (50,),
+    Feature.SLAM_MAP: (52, 54),
+    Feature.LIDAR_SIM: (61,),
+    Feature.CAM: (),
 }
 
 
@@ -343,12 +328,13 @@ def test_a_packet_is_sent_only_to_a_robot_that_announces_its_feature_or_where_it
     announcing = plain("".join("01" if each is feature else "00" for each in Feature))
     forced = plain("00" * 7, feature)
     assert forced.session.features == (), "features shows what the robot announces, not what is forced"
-    for message in NEEDS[feature]:
-        announcing.session.may_send(message)
-        forced.session.may_send(message)
-    for other in NEEDS.keys() - {feature}:
-        for message in NEEDS[other]:
-            with pytest.raises(Refused, match=f"does not announce {other.value}"):
+    for needed, packet_id in [(needed, packet_id) for needed, ids in NEEDS.items() for packet_id in ids]:
+        message, _ = THEIRS[packet_id]
+        if needed is feature:
+            announcing.session.may_send(message)
+            forced.session.may_send(message)
+        else:
+            with pytest.raises(Refused, match=f"does not announce {needed.value}"):
                 announcing.session.may_send(message)
     announcing.session.may_send(m.DebugMessage("hi"))
 
@@ -364,8 +350,8 @@ QUESTIONS = (m.ClientGetSLAMMap(), m.ClientGetPosition())
         (b"1.1", "0001010100", QUESTIONS, "does not announce lidar"),
         (b"1.2", "000000000100", QUESTIONS, None),
         (b"1.2", "000101010001", QUESTIONS, "does not announce lidar"),
-        (f.LISTED_14, "00000000000001" + f.SIZE_100_10, QUESTIONS, None),
-        (f.LISTED_14, "00010101010100" + f.SIZE_100_10, QUESTIONS, "does not announce slam_map"),
+        (f.LISTED_14, "00000000000001", QUESTIONS, None),
+        (f.LISTED_14, "00010101010100", QUESTIONS, "does not announce slam_map"),
         (b"1.1", "0101010101", (SCAN,), r"version 1\.1 has no lidar_sim"),
         (b"1.2", "000101010100", (SCAN,), "does not announce lidar_sim"),
         (b"1.2", "000000000001", (SCAN,), None),

@@ -23,7 +23,7 @@ MUTE = "no telemetry within 5 s, unlike on the connection before"
 
 def settings(client_id: int = 2, flags: str = "00", versions: bytes = f.LISTED) -> bytes:
     flags += "010101010101"
-    blocks = {b"1.1": flags[:10], b"1.2": flags[:12], f.LISTED: flags + f.SIZE_100_10}
+    blocks = {b"1.1": flags[:10], b"1.2": flags[:12], f.LISTED: flags}
     return f.server_settings(versions, blocks[versions], client_id)
 
 

@@ -9,7 +9,7 @@ import re
 import pytest
 
 from gateways.tcpudp.translate import Options
-from tests.gateways.tcpudp.frames import LISTED, LISTED_14, SIZE_100_10, START, Stage, server_settings
+from tests.gateways.tcpudp.frames import LISTED, LISTED_14, START, Stage, server_settings
 from tests.robot.test_device import Program, Rig, established, serving
 from zbridge.errors import Refused
 from zbridge.fleet import topics
@@ -36,10 +36,10 @@ LETTERS = {
 SETTINGS = {
     "1.1": server_settings(b"1.1", "0001010101", 2),
     "1.2": server_settings(b"1.2", "000101010101", 2),
-    "1.3": server_settings(LISTED, "00010101010101" + SIZE_100_10, 2),
-    "1.4": server_settings(LISTED_14, "00010101010101" + SIZE_100_10, 2),
+    "1.3": server_settings(LISTED, "00010101010101", 2),
+    "1.4": server_settings(LISTED_14, "00010101010101", 2),
 }
-NO_JOYSTICK = server_settings(LISTED, "00010001010101" + SIZE_100_10, 2)
+NO_JOYSTICK = server_settings(LISTED, "00010001010101", 2)
 ACTS = {
     "none": (topics.CMD_MODE, Mode("none")),
     "manual": (topics.CMD_MODE, Mode("manual")),
@@ -245,7 +245,7 @@ async def test_whatever_stops_a_robot_in_mode_3_sends_the_pair(cause: str) -> No
 
 # The silence after packet 4
 
-WITH_UDP = server_settings(LISTED, "01010101010101" + SIZE_100_10, 2)
+WITH_UDP = server_settings(LISTED, "01010101010101", 2)
 
 
 @pytest.mark.parametrize("who", ["stop", "nobody"])

@@ -34,6 +34,17 @@ STOP = bytes.fromhex("02000000 05 0d")
 POSITION = bytes.fromhex("0e000000 01 37 0000c03f 000010c0 0000b442")
 
 
+NAMED = {
+    "4": START,
+    "5": PROBE,
+    "6+": ANSWER_TRUE,
+    "6-": ANSWER_FALSE,
+    "7+": STATUS_TRUE,
+    "7-": STATUS_FALSE,
+}
+"""The packets of the handshake in scripts."""
+
+
 def framed(sender: int, packet_id: int, body: bytes = b"") -> bytes:
     """``int32 length | u8 id | u8 packet id | body``."""
     return (2 + len(body)).to_bytes(4, "little") + bytes([sender, packet_id]) + body
@@ -111,6 +122,18 @@ class Timed:
         for at, by, data in coming:
             (self.stream if by == "tcp" else self.datagram)(data, at)
         return self
+
+    def hear(self, script: str) -> Timed:
+        """Let packets of the handshake come: "0.2 t4 0.3 u6+" is a 4 by TCP at 0.2 s, a 6(true) by UDP at 0.3 s."""
+        words = script.split()
+        for at, what in zip(words[::2], words[1::2], strict=True):
+            self.come((float(at), "tcp" if what[0] == "t" else "udp", NAMED[what[1:]]))
+        return self
+
+    def told(self) -> str:
+        """What left, as such a script."""
+        names = {frame: name for name, frame in NAMED.items()}
+        return " ".join(f"{sent.at:.1f} {sent.by[0]}{names.get(sent.frame, sent.frame[5])}" for sent in self.sent)
 
     def frames(self, by: str, start: float = -1.0, end: float = 1e9) -> list[bytes]:
         """What left by one channel from ``start`` up to but not at ``end``."""

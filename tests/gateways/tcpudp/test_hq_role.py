@@ -17,16 +17,12 @@ from zbridge.protocol.session import State
 
 POSE = m.ServerPosition(1.5, -2.25, 90.0)
 SCAN = m.ClientSimulatedLidarData(np.ones(360, np.float32))
-ANSWER = f.framed(5, 3, f.counted(f.LISTED) + bytes.fromhex("01000000000100"))
-SIX = (0.3, "udp", f.ANSWER_TRUE)
-"""An answer to the probe in time; the settings come at 0.1, the 4 at 0.2."""
 THEIRS = {
     message.spec.id: (message, bytes.fromhex(text))
     for message, sender, text in GOLDEN
     if sender in (2, 7) and message.spec.id not in (3, 5, 7)
 }
 """A command of each kind, by packet id."""
-BY_TCP, BY_UDP = (State.ESTABLISHED, "tcp"), (State.ESTABLISHED, "udp")
 
 
 def hq(listed: bytes = f.LISTED, block: str = f.ALL, *, udp: bool = True, force: tuple = ()) -> f.Timed:
@@ -38,19 +34,11 @@ def plain(flags: str = f.NO_UDP, *force: Feature | int) -> f.Timed:
     return hq(block=flags, udp=False, force=force)
 
 
-def started(*coming: tuple[float, str, bytes]) -> f.Timed:
-    return hq().come((0.2, "tcp", f.START), *coming)
-
-
-def probed(answer: bytes | None) -> f.Timed:
-    """An HQ whose probe was answered by UDP, or never; 3 s on."""
-    timed = started() if answer is None else started((0.3, "udp", answer))
+def probed(*answer: str) -> f.Timed:
+    """An HQ whose probe was answered so, or never; 3 s on."""
+    timed = hq().hear(" ".join(["0.2 t4", *answer]))
     timed.until(3.0)
     return timed
-
-
-def agreed(timed: f.Timed) -> tuple[State, str | None]:
-    return timed.session.state, timed.session.transport
 
 
 # What the robot lists, what it understands, what is agreed
@@ -155,93 +143,45 @@ def test_what_comes_before_the_settings_or_is_none_is_malformed_and_settings_tha
 # The probe, and the silence after it
 
 
-def assert_silence(timed: f.Timed, *, start: float = 0.2) -> None:
-    """Nothing by TCP but one 7 in the 2.5 s after the 4, nothing by UDP but one 5."""
-    quiet = timed.frames("tcp", start, start + 2.499)
-    assert quiet in ([], [f.STATUS_TRUE], [f.STATUS_FALSE])
-    assert [frame[5] for frame in timed.frames("tcp")].count(7) == 1
-    assert timed.frames("udp", 0.0, start + 2.499) == [f.PROBE]
-
-
-def test_an_hq_waits_with_its_datagram_until_the_robot_asks_and_is_established_by_tcp_where_it_never_does() -> None:
-    timed = hq()
-    timed.until(2.05)
-    assert (timed.frames("tcp"), timed.session.state) == ([ANSWER], State.HANDSHAKING)
-    timed.until(2.15)
-    assert agreed(timed) == BY_TCP
-    assert len(timed.sent) == 1
-
-
-def test_an_hq_probes_once_and_answers_success_at_once_and_is_silent_for_two_and_a_half_seconds() -> None:
-    timed = started()
-    assert [(sent.at, sent.by, sent.frame) for sent in timed.sent[1:]] == [(0.2, "udp", f.PROBE)]
-    assert timed.stream(f.POSITION, 0.25) == [POSE], "what the robot sends meanwhile is delivered"
-    timed.datagram(f.ANSWER_TRUE, 0.3)
-    assert [(sent.at, sent.by, sent.frame) for sent in timed.sent[2:]] == [(0.3, "tcp", f.STATUS_TRUE)]
-    assert timed.datagram(f.POSITION, 0.4) == timed.stream(f.POSITION, 0.5) == [POSE]
-    timed.until(2.69)
-    assert timed.session.state is State.HANDSHAKING
-    timed.until(2.71)
-    assert agreed(timed) == BY_UDP
-    assert timed.session.traffic.malformed == 0
-
-
 @pytest.mark.parametrize(
-    ("coming", "status", "at", "outcome"),
+    ("heard", "said", "established_at", "transport"),
     [
-        pytest.param([], f.STATUS_FALSE, 2.2, BY_TCP, id="no answer within two seconds"),
-        pytest.param([SIX], f.STATUS_TRUE, 0.3, BY_UDP, id="success"),
-        pytest.param([(2.22, "udp", f.ANSWER_TRUE)], f.STATUS_FALSE, 2.2, BY_TCP, id="an answer after the report"),
-        pytest.param([(2.22, "tcp", f.ANSWER_FALSE)], f.STATUS_FALSE, 2.2, BY_TCP, id="a refusal after the report"),
+        pytest.param("", "0.1 t3", 2.1, "tcp", id="no 4 within two seconds"),
+        pytest.param("0.2 t4 0.3 u6+", "0.1 t3 0.2 u5 0.3 t7+", 2.7, "udp", id="success"),
+        pytest.param("0.2 t4", "0.1 t3 0.2 u5 2.2 t7-", 2.7, "tcp", id="no answer within two seconds"),
+        pytest.param("0.2 t4 2.22 u6+", "0.1 t3 0.2 u5 2.2 t7-", 2.7, "tcp", id="an answer after the report"),
+        pytest.param("0.2 t4 2.22 t6-", "0.1 t3 0.2 u5 2.2 t7-", 2.7, "tcp", id="a refusal after the report"),
         # an answer by TCP says that the datagram did not arrive
-        pytest.param([(2.0, "tcp", f.ANSWER_FALSE)], f.STATUS_FALSE, 2.0, BY_TCP, id="a refusal by TCP"),
-        pytest.param([(2.0, "tcp", f.ANSWER_TRUE)], f.STATUS_FALSE, 2.0, BY_TCP, id="an answer by TCP"),
-        pytest.param([(0.3, "udp", f.ANSWER_FALSE)], f.STATUS_FALSE, 0.3, BY_TCP, id="a datagram that says no"),
-        pytest.param(
-            [SIX, (0.4, *SIX[1:]), (0.5, "tcp", f.ANSWER_FALSE)], f.STATUS_TRUE, 0.3, BY_UDP, id="more answers"
-        ),
-        pytest.param(
-            [(0.25, "tcp", f.START), SIX, (0.35, "tcp", f.START)], f.STATUS_TRUE, 0.3, BY_UDP, id="more starts"
-        ),
+        pytest.param("0.2 t4 2.0 t6-", "0.1 t3 0.2 u5 2.0 t7-", 2.7, "tcp", id="a refusal by TCP"),
+        pytest.param("0.2 t4 2.0 t6+", "0.1 t3 0.2 u5 2.0 t7-", 2.7, "tcp", id="an answer by TCP"),
+        pytest.param("0.2 t4 0.3 u6-", "0.1 t3 0.2 u5 0.3 t7-", 2.7, "tcp", id="a datagram that says no"),
+        pytest.param("0.2 t4 0.3 u6+ 0.4 u6+ 0.5 t6-", "0.1 t3 0.2 u5 0.3 t7+", 2.7, "udp", id="more answers"),
+        pytest.param("0.2 t4 0.25 t4 0.3 u6+ 0.35 t4", "0.1 t3 0.2 u5 0.3 t7+", 2.7, "udp", id="more starts"),
+        pytest.param("0.1 t4 0.3 u6+", "0.1 t3 0.1 u5 0.3 t7+", 2.6, "udp", id="a 4 with the settings"),
     ],
 )
-def test_an_hq_reports_the_answer_to_its_probe_once_and_is_silent_whatever_follows(coming, status, at, outcome) -> None:
-    timed = started(*coming)
-    timed.until(5.0)
-    (report,) = [sent for sent in timed.sent if sent.frame[5] == 7]
-    assert (report.by, report.frame) == ("tcp", status)
-    assert report.at == pytest.approx(at, abs=0.011)
-    assert agreed(timed) == outcome
-    assert_silence(timed)
+def test_an_hq_probes_once_when_asked_reports_once_and_says_nothing_else_for_two_and_a_half_seconds(
+    heard: str, said: str, established_at: float, transport: str
+) -> None:
+    timed = hq().hear(heard)
+    timed.until(established_at - 0.01)
+    assert timed.session.state is State.HANDSHAKING
+    assert timed.datagram(f.POSITION, timed.now) == timed.stream(f.POSITION, timed.now) == [POSE], "is delivered"
+    timed.until(established_at + 0.01)
+    assert (timed.session.state, timed.session.transport) == (State.ESTABLISHED, transport)
+    timed.until(9.0)
+    assert timed.told() == said
 
 
-@pytest.mark.parametrize(
-    "datagram",
-    [
-        b"",
-        b"\x03",
-        f.ANSWER_TRUE[:-1],
-        f.ANSWER_TRUE + b"\x00",
-        *(f.bearing(f.ANSWER_TRUE, sender) for sender in (0, 5)),
-        f.PROBE,
-    ]
-    + [bytes.fromhex(length) + f.ANSWER_TRUE[4:] for length in ("04000000", "02000000", "ffffffff")],
-)
-def test_an_answer_that_is_none_is_counted_and_waited_past(datagram: bytes) -> None:
-    timed = started()
-    assert timed.datagram(datagram, 0.3) == []
-    assert timed.session.traffic.malformed == 1
-    assert timed.frames("tcp", 0.2) == []
-    timed.datagram(f.ANSWER_TRUE, 0.4)
-    assert timed.frames("tcp", 0.2) == [f.STATUS_TRUE]
-
-
-def test_datagrams_hold_one_packet_each_and_are_taken_from_the_robot_although_the_probe_failed() -> None:
-    """What an HQ announces never limits what a robot may send it."""
-    for timed in (probed(f.ANSWER_TRUE), probed(None)):
-        assert timed.datagram(f.POSITION + f.POSITION[:3], 3.1) == []
-        assert timed.datagram(f.POSITION, 3.2) == [POSE]
-        assert not timed.session.claims(f.ANSWER_TRUE, 11000), "its source is known"
+def test_a_start_that_comes_late_is_followed_by_the_same_silence() -> None:
+    timed = hq().hear("3.0 t4")
+    assert (timed.session.state, timed.session.busy) == (State.ESTABLISHED, "handshaking")
+    timed.session.send(m.ClientControllMode(2))
+    timed.hear("3.1 u6+").until(5.49)
+    assert timed.session.busy == "handshaking"
+    timed.until(9.0)
+    assert (timed.session.busy, timed.session.transport) == (None, "udp")
+    assert timed.told() == "0.1 t3 3.0 u5 3.1 t7+ 5.5 t10"
 
 
 @pytest.mark.parametrize(("flags", "udp"), [(f.NO_UDP, True), (f.ALL, False)])
@@ -249,28 +189,31 @@ def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str, udp
     """The robot sleeps all the same, and wants its 7."""
     timed = hq(block=flags, udp=udp)
     assert timed.session.state is State.ESTABLISHED
-    timed.stream(f.START, 0.2)
+    timed.hear("0.2 t4")
     assert timed.session.busy == "handshaking"
     timed.until(6.0)
-    assert timed.frames("udp") == []
-    assert timed.frames("tcp")[1:] == [f.STATUS_FALSE]
+    assert timed.told() == "0.1 t3 2.2 t7-"
     assert (timed.session.state, timed.session.busy) == (State.ESTABLISHED, None)
 
 
-def test_a_start_in_the_read_of_the_settings_finds_them_answered_first() -> None:
-    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", f.server_settings() + f.START))
-    timed.until(5.0)
-    assert (timed.sent[0].at, timed.sent[0].frame) == (0.1, ANSWER)
-    assert_silence(timed, start=0.1 + 1e-9)
+NO_ANSWERS = [b"", b"\x03", f.ANSWER_TRUE[:-1], f.ANSWER_TRUE + b"\x00", f.PROBE]
+NO_ANSWERS += [bytes.fromhex(length) + f.ANSWER_TRUE[4:] for length in ("04000000", "02000000", "ffffffff")]
 
 
-def test_a_start_that_comes_late_is_followed_by_the_same_silence() -> None:
-    timed = hq().come((3.0, "tcp", f.START))
-    timed.session.send(m.ClientControllMode(2))
-    timed.datagram(f.ANSWER_TRUE, 3.1)
-    timed.until(8.0)
-    assert_silence(timed, start=3.0)
-    assert (timed.session.state, timed.session.busy) == (State.ESTABLISHED, None)
+@pytest.mark.parametrize("datagram", [*NO_ANSWERS, *(f.bearing(f.ANSWER_TRUE, sender) for sender in (0, 5))])
+def test_an_answer_that_is_none_is_counted_and_waited_past(datagram: bytes) -> None:
+    timed = hq().hear("0.2 t4")
+    assert timed.datagram(datagram, 0.3) == []
+    assert timed.session.traffic.malformed == 1
+    assert timed.hear("0.4 u6+").told() == "0.1 t3 0.2 u5 0.4 t7+"
+
+
+def test_datagrams_hold_one_packet_each_and_are_taken_from_the_robot_although_the_probe_failed() -> None:
+    """What an HQ announces never limits what a robot may send it."""
+    for timed in (probed("0.3 u6+"), probed()):
+        assert timed.datagram(f.POSITION + f.POSITION[:3], 3.1) == []
+        assert timed.datagram(f.POSITION, 3.2) == [POSE]
+        assert not timed.session.claims(f.ANSWER_TRUE, 11000), "its source is known"
 
 
 # What is taken, and what ends the session
@@ -294,14 +237,14 @@ def test_a_command_carries_the_clients_id_and_goes_by_the_channel_of_the_table()
     """Before the probe there is only TCP; so there is after one that failed."""
     for command, frame in THEIRS.values():
         by_datagram = "udp" if command.spec.id in (11, 12, 61) else "tcp"
-        for timed, by in ((probed(None), "tcp"), (probed(f.ANSWER_TRUE), by_datagram)):
+        for timed, by in ((probed(), "tcp"), (probed("0.3 u6+"), by_datagram)):
             timed.session.send(command)
             timed.until(3.5)
             assert [(sent.by, sent.frame) for sent in timed.sent if sent.at >= 3.0] == [(by, f.bearing(frame, 5))]
 
 
 def test_the_gap_is_kept_between_datagrams_and_segments_too() -> None:
-    timed = probed(f.ANSWER_TRUE)
+    timed = probed("0.3 u6+")
     for _ in range(5):
         timed.session.send(m.ClientJoystickRotate(-0.75))
         timed.session.send(m.ClientJoystickStop())
@@ -401,7 +344,7 @@ def test_what_a_robot_cannot_take_is_never_sent(message: m.Packet, error: type[E
 
 def test_a_closing_session_asks_for_no_timer_that_does_nothing() -> None:
     """A link that takes nothing keeps it closing for a while; a timer in the past would fire without end."""
-    timed = started()
+    timed = hq().hear("0.2 t4")
     timed.session.send(m.DebugMessage("last words"))
     timed.session.close("enough", 2.0)
     timed.session.expire(2.4)

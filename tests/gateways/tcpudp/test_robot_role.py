@@ -17,9 +17,7 @@ MOVES, ROTATES = m.ClientJoystickMove(0.0, 1.0, 0.5), m.ClientJoystickRotate(-0.
 PORT = 11000
 """What deployed HQ programs bind."""
 RIVAL = "another source of datagrams claims to be this client"
-FIVE, SEVEN = (0.2, "udp", f.PROBE), (0.3, "tcp", f.STATUS_TRUE)
-"""What comes in time. Our settings leave at 0.0, those of the HQ come at 0.1 and our 4 leaves."""
-BY_TCP, BY_UDP = (State.ESTABLISHED, "tcp"), (State.ESTABLISHED, "udp")
+BY_TCP = (State.ESTABLISHED, "tcp")
 SIZED = {"slam_map": True, "slam_map_size": 1000, "slam_map_interval": 10}
 ANNOUNCED = RobotSettings13(udp=True, lidar_sim=True, joystick=True, **SIZED)
 
@@ -28,18 +26,18 @@ def robot(announced: RobotSettings13 = ANNOUNCED, *, client_port: int = PORT, ga
     return f.Timed(RobotRole(limits(gap_s), announced, 5, client_port=client_port))
 
 
-def waiting(*coming: tuple[float, str, bytes]) -> f.Timed:
-    return robot().come((0.1, "tcp", f.client_settings()), *coming)
+def waiting(heard: str = "") -> f.Timed:
+    return robot().come((0.1, "tcp", f.client_settings())).hear(heard)
 
 
 def served() -> f.Timed:
     """A robot whose probe succeeded."""
-    return waiting(FIVE, SEVEN)
+    return waiting("0.2 u5 0.3 t7+")
 
 
 def unheard(*, client_port: int = PORT) -> f.Timed:
     """A robot whose HQ's 5 was lost, and which has reported."""
-    timed = robot(client_port=client_port).come((0.1, "tcp", f.client_settings()), (2.2, "tcp", f.STATUS_TRUE))
+    timed = robot(client_port=client_port).come((0.1, "tcp", f.client_settings())).hear("2.2 t7+")
     assert agreed(timed) == BY_TCP
     return timed
 
@@ -142,10 +140,7 @@ def test_a_robot_takes_packets_of_the_other_side_with_whatever_id() -> None:
     """Recorded HQ programs write 1, others 0 until they have read the settings: the connection identifies them."""
     timed = served()
     for sender in (0, 1, 2, 4, 5, 6, 255):
-        assert timed.stream(f.framed(sender, 13) + f.framed(sender, 54), 0.4) == [
-            m.ClientJoystickStop(),
-            m.ClientGetPosition(),
-        ]
+        assert timed.stream(f.framed(sender, 13), 0.4) == [m.ClientJoystickStop()]
     assert timed.session.traffic.malformed == 0
     for packet_id in (2, 4, 6, 31, 51, 53, 55, 60):
         assert timed.stream(f.framed(5, packet_id), 0.5) == []
@@ -158,17 +153,6 @@ def test_a_robot_takes_packets_of_the_other_side_with_whatever_id() -> None:
 # The probe
 
 
-def test_a_robot_asks_for_the_datagram_and_answers_it_by_udp() -> None:
-    timed = waiting()
-    assert timed.frames("tcp", 0.1) == [f.START]
-    assert timed.session.claims(f.PROBE, PORT)
-    timed.datagram(f.PROBE, 0.2)
-    assert timed.frames("udp") == [f.ANSWER_TRUE]
-    assert timed.session.state is State.HANDSHAKING
-    timed.stream(f.STATUS_TRUE, 0.3)
-    assert agreed(timed) == BY_UDP
-
-
 @pytest.mark.parametrize(("announced", "flags"), [(RobotSettings13(), "01"), (ANNOUNCED, "00")])
 def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once(announced, flags) -> None:
     timed = robot(announced).come((0.1, "tcp", f.client_settings(block=flags + "000000000100")))
@@ -179,46 +163,44 @@ def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once(announ
 
 
 @pytest.mark.parametrize(
-    ("coming", "answered", "outcome", "malformed"),
+    ("heard", "answered", "transport", "malformed"),
     [
         # Without the datagram no 6 at all: any, false too, makes programs of 1.1 and 1.2 believe in datagrams; without
         # one they fall back to TCP. A status that says true is not believed then.
-        pytest.param([(2.2, "tcp", f.STATUS_FALSE)], False, BY_TCP, 0, id="no 5, false"),
-        pytest.param([(2.2, "tcp", f.STATUS_TRUE)], False, BY_TCP, 0, id="no 5, true"),
+        pytest.param("2.2 t7-", "", "tcp", 0, id="no 5, false"),
+        pytest.param("2.2 t7+", "", "tcp", 0, id="no 5, true"),
         # A 5 counts between our 4 and its 7 only: who has reported sent its own before that.
-        pytest.param([(1.9, "tcp", f.STATUS_FALSE)], False, BY_TCP, 0, id="no 5, false before it could come"),
-        pytest.param([(1.9, "tcp", f.STATUS_TRUE)], False, BY_TCP, 0, id="no 5, true before it could come"),
-        pytest.param([], False, BY_TCP, 0, id="nothing"),
-        pytest.param([FIVE, SEVEN], True, BY_UDP, 0, id="success"),
+        pytest.param("1.9 t7-", "", "tcp", 0, id="no 5, false before it could come"),
+        pytest.param("1.9 t7+", "", "tcp", 0, id="no 5, true before it could come"),
+        pytest.param("", "", "tcp", 0, id="nothing"),
+        pytest.param("0.2 u5 0.3 t7+", " 0.2 u6+", "udp", 0, id="success"),
         # The 6 was lost, and the HQ would not hear what is sent it by UDP. It says so 2 s after its 5.
-        pytest.param([FIVE, (2.15, "tcp", f.STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6"),
-        pytest.param([FIVE, (2.35, "tcp", f.STATUS_FALSE)], True, BY_TCP, 0, id="a lost 6, told late"),
-        pytest.param([FIVE], True, BY_TCP, 0, id="no report"),
-        pytest.param([FIVE, (0.25, "udp", f.PROBE), SEVEN, (0.35, "udp", f.PROBE)], True, BY_UDP, 2, id="more 5"),
-        pytest.param([(0.2, "tcp", f.PROBE)], False, BY_TCP, 1, id="a 5 by TCP"),
-        pytest.param([FIVE, SEVEN, (0.5, "tcp", f.STATUS_FALSE)], True, BY_UDP, 1, id="a report that was not due"),
+        pytest.param("0.2 u5 2.15 t7-", " 0.2 u6+", "tcp", 0, id="a lost 6"),
+        pytest.param("0.2 u5 2.35 t7-", " 0.2 u6+", "tcp", 0, id="a lost 6, told late"),
+        pytest.param("0.2 u5", " 0.2 u6+", "tcp", 0, id="no report"),
+        pytest.param("0.2 u5 0.25 u5 0.3 t7+ 0.35 u5", " 0.2 u6+", "udp", 2, id="more 5"),
+        pytest.param("0.2 t5", "", "tcp", 1, id="a 5 by TCP"),
+        pytest.param("0.2 u5 0.3 t7+ 0.5 t7-", " 0.2 u6+", "udp", 1, id="a report that was not due"),
     ],
 )
 def test_a_robot_answers_the_datagram_once_and_believes_the_report_if_it_came(
-    coming: list[tuple[float, str, bytes]], answered: bool, outcome: tuple[State, str], malformed: int
+    heard: str, answered: str, transport: str, malformed: int
 ) -> None:
     timed = waiting()
-    for at, *_ in coming[:1]:
-        timed.until(at)
-        assert timed.session.state is State.HANDSHAKING
-    timed.come(*coming)
-    if any(data in (f.STATUS_FALSE, f.STATUS_TRUE) for _, _, data in coming):
-        assert agreed(timed) == outcome, "at once"
+    timed.until(float(heard[:3] or 0.1))
+    assert timed.session.state is State.HANDSHAKING
+    timed.hear(heard)
+    if "7" in heard:
+        assert agreed(timed) == (State.ESTABLISHED, transport), "at once"
         assert not timed.session.claims(f.PROBE, PORT + 1)
     timed.until(10.0)
-    assert agreed(timed) == outcome
-    assert timed.session.drops_source is (answered and outcome == BY_TCP), "who got no 6 may not have sent that 5"
-    assert timed.frames("tcp", 0.1) == [f.START]
-    assert timed.frames("udp") == [f.ANSWER_TRUE] * answered
+    assert agreed(timed) == (State.ESTABLISHED, transport)
+    lost = bool(answered) and transport == "tcp"
+    assert timed.session.drops_source is lost, "who got no 6 may not have sent that 5"
     assert timed.session.traffic.malformed == malformed
     timed.session.send(POSE)
     timed.until(11.0)
-    assert timed.frames(outcome[1], 10.0) == [f.POSITION]
+    assert timed.told() == f"0.0 t2 0.1 t4{answered} 10.0 {transport[0]}55"
 
 
 def test_a_datagram_that_comes_late_is_not_answered() -> None:
@@ -226,24 +208,19 @@ def test_a_datagram_that_comes_late_is_not_answered() -> None:
     timed.until(2.15)
     assert not timed.session.claims(f.PROBE, PORT)
     assert not timed.session.claims(f.MOVE, PORT), "nothing is bound by port before the handshake is over"
-    timed.stream(f.STATUS_TRUE, 2.3)
-    timed.until(10.0)
-    assert (timed.frames("udp"), timed.frames("tcp", 0.1)) == ([], [f.START])
 
 
-@pytest.mark.parametrize(
-    "datagram",
-    [b"", f.PROBE[:-1], f.PROBE + b"\x00", f.bearing(f.PROBE, 6), f.bearing(f.PROBE, 255), f.MOVE, f.STOP]
-    + [bytes.fromhex(length) + f.PROBE[4:] for length in ("01000000", "00000000", "03000000", "ffffffff", "00000080")],
-)
+NO_PROBES = [b"", f.PROBE[:-1], f.PROBE + b"\x00", f.bearing(f.PROBE, 6), f.bearing(f.PROBE, 255), f.MOVE, f.STOP]
+LENGTHS = ("01000000", "00000000", "03000000", "ffffffff", "00000080")
+
+
+@pytest.mark.parametrize("datagram", [*NO_PROBES, *(bytes.fromhex(length) + f.PROBE[4:] for length in LENGTHS)])
 def test_a_datagram_that_is_no_probe_is_not_claimed_but_counted_and_waited_past(datagram: bytes) -> None:
     timed = waiting()
     assert not timed.session.claims(datagram, PORT)
     timed.datagram(datagram, 0.2)
     assert timed.session.traffic.malformed == 1
-    assert timed.frames("udp") == []
-    timed.datagram(f.PROBE, 0.3)
-    assert timed.frames("udp") == [f.ANSWER_TRUE]
+    assert timed.hear("0.3 u5").told() == "0.0 t2 0.1 t4 0.3 u6+"
 
 
 @pytest.mark.parametrize("sender", [5, 0, 1])
@@ -261,7 +238,7 @@ def test_a_probe_is_claimed_with_the_id_that_was_given_or_one_that_nobody_has(se
 
 def test_motion_is_taken_by_either_channel_after_the_report_and_before_it_by_tcp_only() -> None:
     """Whose source it is only the 7 tells: until then nobody drives by it, in whoever's name."""
-    timed = waiting(FIVE)
+    timed = waiting("0.2 u5")
     assert timed.datagram(f.MOVE, 0.25) == timed.datagram(f.STOP, 0.26) == []
     assert timed.session.traffic.malformed == 2
     assert timed.stream(f.MOVE, 0.27) == [MOVES]
@@ -313,7 +290,7 @@ def test_a_stray_datagram_is_told_to_who_has_a_source_too_but_only_with_the_id_a
 )
 def test_telemetry_goes_by_the_channel_of_the_table(message: m.Packet, frame: str) -> None:
     by_datagram = "udp" if message.spec.id in (53, 55) else "tcp"
-    for timed, by in ((waiting((2.2, "tcp", f.STATUS_FALSE)), "tcp"), (served(), by_datagram)):
+    for timed, by in ((waiting("2.2 t7-"), "tcp"), (served(), by_datagram)):
         now = timed.now
         timed.session.send(message)
         timed.until(now + 1.0)
@@ -345,7 +322,7 @@ def test_of_two_sources_that_came_before_the_6_neither_is_heard_and_no_6_is_sent
 
 
 def test_an_hq_that_was_told_that_its_datagram_came_is_let_go_when_a_second_source_claims_to_be_it() -> None:
-    timed = waiting(FIVE)
+    timed = waiting("0.2 u5")
     assert timed.session.claims(f.PROBE, PORT + 1), "so it is seen that there are two of them"
     timed = rivalled(f.PROBE)
     assert timed.frames("udp") == [f.ANSWER_TRUE]
@@ -358,7 +335,7 @@ def test_a_packet_from_the_port_of_deployed_programs_shows_that_the_source_may_b
     """A 5 of 1.3 was lost, somebody else's was answered, and the 7 is true whatever happened."""
     timed = waiting()
     assert timed.session.claims(f.PROBE, PORT + 1)
-    timed.come(FIVE, SEVEN)
+    timed.hear("0.2 u5 0.3 t7+")
     assert not timed.session.claims(f.MOVE, PORT + 2), "of no port but that one"
     assert timed.session.claims(f.MOVE, PORT)
     timed.session.rivalled(0.4)

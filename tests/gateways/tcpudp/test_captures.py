@@ -7,7 +7,7 @@ from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
 from tests.conformance.side import plain
-from tests.gateways.tcpudp.frames import START, Timed
+from tests.gateways.tcpudp.frames import Timed
 from tests.gateways.tcpudp.golden import TCP_SESSION_MESSAGES, UDP_SESSION_MESSAGES
 from zbridge.protocol.session import State
 
@@ -16,11 +16,6 @@ MESSAGES = {OLD: TCP_SESSION_MESSAGES, NEW: UDP_SESSION_MESSAGES}
 ROBOT = 11001
 SETTINGS_13 = RobotSettings13(udp=True, lidar_sim=True, slam_map=True, slam_map_size=2048, slam_map_interval=1)
 SETTINGS = {OLD: Settings(), NEW: SETTINGS_13}
-
-
-def first(name: str, **of: int) -> bytes:
-    """What one side of a capture sent first."""
-    return payloads(name, **of)[0].payload  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("name", [OLD, NEW])
@@ -33,44 +28,35 @@ def test_a_recorded_packet_is_its_message_and_the_message_its_packet(name: str) 
         assert encode_packet(decoded, record.payload[4]) == written
 
 
+HQ_OLD, HQ_NEW = HqRole(limits(0.01)), HqRole(limits(0.01))
+ROBOT_OLD, ROBOT_NEW = RobotRole(limits(0.0), Settings(), 1, ("1.1",)), RobotRole(limits(0.0), SETTINGS_13, 1)
+ANSWER_11 = bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")
+"""Ours; the captured HQ announces datagrams and sends none."""
+
+
 @pytest.mark.parametrize(
-    ("session", "name", "by_tcp", "by_udp", "outcome"),
+    ("session", "name", "first", "said", "outcome"),
     [
-        pytest.param(  # the captured HQ announces datagrams and sends none
-            HqRole(limits(0.01)),
-            OLD,
-            [bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")],
-            [],
-            ("1.1", "tcp", ()),
-            id="hq of a robot of 1.1",
-        ),
-        pytest.param(
-            RobotRole(limits(0.0), Settings(), 1, ("1.1",)),
-            OLD,
-            [first(OLD, source=ROBOT)],
-            [],
-            ("1.1", "tcp", ("udp",)),
-            id="robot of 1.1",
-        ),
-        pytest.param(
-            HqRole(limits(0.01)),
+        (HQ_OLD, OLD, ANSWER_11, ["tcp 3"], ("1.1", "tcp", ())),
+        (ROBOT_OLD, OLD, payloads(OLD, source=ROBOT)[0].payload, ["tcp 2"], ("1.1", "tcp", ("udp",))),
+        (
+            HQ_NEW,
             NEW,
-            [first(NEW, destination=ROBOT), bytes.fromhex("03000000 01 07 01")],
-            [bytes.fromhex("02000000 01 05")],
+            payloads(NEW, destination=ROBOT)[0].payload,
+            ["tcp 3", "udp 5", "tcp 7"],
             ("1.3", "udp", ("udp", "lidar_sim", "slam_map")),
-            id="hq of a robot of 1.3",
         ),
-        pytest.param(
-            RobotRole(limits(0.0), SETTINGS_13, 1),
+        (
+            ROBOT_NEW,
             NEW,
-            [first(NEW, source=ROBOT), START],
-            [bytes.fromhex("03000000 01 06 01")],
+            payloads(NEW, source=ROBOT)[0].payload,
+            ["tcp 2", "tcp 4", "udp 6"],
             ("1.3", "udp", ("udp", "lidar_sim")),
-            id="robot of 1.3",
         ),
     ],
+    ids=["hq of a robot of 1.1", "robot of 1.1", "hq of a robot of 1.3", "robot of 1.3"],
 )
-def test_the_gateway_in_either_role_understands_the_recorded_peer(session, name, by_tcp, by_udp, outcome) -> None:
+def test_the_gateway_in_either_role_understands_the_recorded_peer(session, name, first, said, outcome) -> None:
     timed = Timed(session)
     for record, message in zip(payloads(name), MESSAGES[name], strict=True):
         if isinstance(session, HqRole) != (record.source == ROBOT):
@@ -80,7 +66,8 @@ def test_the_gateway_in_either_role_understands_the_recorded_peer(session, name,
         receive = timed.stream if record.transport == "TCP" else timed.datagram
         handshake = record.payload[5] in range(2, 8)
         assert [plain(got) for got in receive(record.payload, record.seconds)] == [plain(message)] * (not handshake)
-    assert (timed.frames("tcp"), timed.frames("udp")) == (by_tcp, by_udp)
+    assert timed.sent[0].frame == first
+    assert [f"{sent.by} {sent.frame[5]}" for sent in timed.sent] == said
     assert (session.version, session.transport, session.features) == outcome
     assert (session.state, session.traffic.malformed) == (State.ESTABLISHED, 0)
     assert session.settings == SETTINGS[name]

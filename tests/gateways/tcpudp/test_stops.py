@@ -20,19 +20,6 @@ pytestmark = pytest.mark.jumping
 NONE, AUTONOMOUS = bytes.fromhex("06000000 02 0a 01000000"), bytes.fromhex("06000000 02 0a 03000000")
 STOP = bytes.fromhex("02000000 02 0d")
 PAIR = [NONE, STOP]
-MOVE_LEFT = bytes.fromhex("0e000000 02 0b 000080bf 00000000 0000803f")
-LETTERS = {
-    NONE: "N",
-    bytes.fromhex("06000000 02 0a 02000000"): "M",
-    AUTONOMOUS: "A",
-    STOP: "S",
-    MOVE_LEFT: "L",
-    bytes.fromhex("0e000000 02 0b 0000803f 00000000 0000803f"): "R",
-    bytes.fromhex("06000000 02 0c 000000bf"): "T",
-    bytes.fromhex("06000000 02 32 01000000"): "I",
-    bytes.fromhex("06000000 02 32 02000000"): "O",
-    bytes.fromhex("08000000 02 01 02000000 6869"): "H",
-}
 SETTINGS = {
     "1.1": server_settings(b"1.1", "0001010101", 2),
     "1.2": server_settings(b"1.2", "000101010101", 2),
@@ -48,19 +35,33 @@ ACTS = {
     "right": (topics.CMD_DRIVE, Drive(left=-1.0)),
     "left_and_turn": (topics.CMD_DRIVE, Drive(left=1.0, turn=0.5)),
     "neutral": (topics.CMD_DRIVE, Drive()),
-    "lidar_on": (topics.CMD_LIDAR, Switch(True)),
-    "lidar_off": (topics.CMD_LIDAR, Switch(False)),
+    "on": (topics.CMD_LIDAR, Switch(True)),
+    "off": (topics.CMD_LIDAR, Switch(False)),
     "hi": (topics.CMD_TEXT, Text("hi")),
 }
+LETTERS = {
+    "N": "06000000 02 0a 01000000",
+    "M": "06000000 02 0a 02000000",
+    "A": "06000000 02 0a 03000000",
+    "S": "02000000 02 0d",
+    "L": "0e000000 02 0b 000080bf 00000000 0000803f",
+    "R": "0e000000 02 0b 0000803f 00000000 0000803f",
+    "T": "06000000 02 0c 000000bf",
+    "I": "06000000 02 32 01000000",
+    "O": "06000000 02 32 02000000",
+    "H": "08000000 02 01 02000000 6869",
+}
+"""Mode none, manual, autonomous; stop; left, right; turn; lidar in, out of use; "hi"."""
 
 
 def left(version: str, script: str, **options: object) -> str:
     """What leaves a robot, a letter for each packet; ``script``: acts, and seconds to wait ("+0.1") after them."""
     stage, letters = Stage(SETTINGS[version], Options(**options)), ""  # type: ignore[arg-type]
+    names = {bytes.fromhex(frame): letter for letter, frame in LETTERS.items()}
     for word in script.split():
         if word.startswith("+"):
-            letters += "".join(LETTERS[frame] for frame in stage.after(float(word)))
-        elif word in ("stop", "routine"):  # a routine stop is sent once
+            letters += "".join(names[frame] for frame in stage.after(float(word)))
+        elif word in ("stop", "once"):  # a routine stop is sent once
             stage.robot.stop(stage.now, stage.now + (word == "stop"))
         elif word == "reconnect":
             stage.connect(SETTINGS[version])
@@ -71,90 +72,60 @@ def left(version: str, script: str, **options: object) -> str:
 
 ALL, WELL, BADLY = tuple(SETTINGS), ("1.3", "1.4"), ("1.1", "1.2")
 """Robots of 1.1 and 1.2 misread a tenth: what is sent once and matters is sent to them again after 0.3 s."""
-PAIRS, STOPS = "(NS){9,11}", "S{9,11}"
-"""A second of stops."""
 
 ROWS = {
-    # N, M, A: mode 1, 2, 3. S: 13. L, R: move. T: turn. I, O: lidar on, off. H: text.
     "motion is repeated every quarter of a second without end": (ALL, "left +2", "L{9}"),
     "neutral is 13 repeated for a second": (ALL, "left +0.01 neutral +4", "LS{5}"),
     "a stop goes before what waits and ends motion": (ALL, "left hi stop +3", "SHS{9,10}"),
     "a stop leaves before newer motion": (ALL, "left +0.001 stop +0.001 neutral +0.001 right +0.02", "LSR"),
-    "a routine stop is sent exactly once and ends motion": (ALL, "left +0.1 routine +3 routine +3", "LSS"),
+    "a routine stop is sent exactly once and ends motion": (ALL, "left +0.1 once +3 once +3", "LSS"),
     # mode 3: every stop is the pair, until another mode is commanded
-    "never in mode 3, never a 1": (ALL, "stop +1.5 neutral +2 manual +2 stop +2 left +2 stop +2", "[SML]*"),
-    "the 1 of a stop is no other mode": (
-        ALL,
-        "auto +1 stop +3 stop +0.35 stop +3 routine +1 routine +1",
-        f"A+{PAIRS}(NS){{4}}{PAIRS}NSNS",
-    ),
-    "after mode 2": (WELL, "auto +0.1 stop +2 manual +0.1 stop +2 auto +0.1 stop +2", f"A{PAIRS}M{STOPS}A{PAIRS}"),
-    "after mode 1": (
-        WELL,
-        "auto +0.1 stop +2 none +0.1 stop +2 auto +0.1 none +0.1 stop +2",
-        f"A{PAIRS}N{STOPS}AN{STOPS}",
-    ),
-    "after a reconnection it is the pair and never a 3": (
-        ALL,
-        "auto +0.1 reconnect stop +3 reconnect stop +3",
-        f"A({PAIRS}){{2}}",
-    ),
-    "another mode did not leave before the connection ended": (ALL, "auto +0.1 none reconnect stop +3", f"A{PAIRS}"),
-    "a 3 that still waits when the stop comes never leaves and no 1 either": (ALL, "hi +0 auto stop +3", f"H{STOPS}"),
-    "another mode that still waits when the stop comes leaves behind the pair": (
-        WELL,
-        "auto +0 manual stop +0.05",
-        "ANSM",
-    ),
-    "the next holder's mode is not undone": (WELL, "auto +0.1 stop +0.05 manual +3", "ANS(MS|SM)S{7,9}"),
-    "a stop ends where the next holder lets the robot move by itself": (WELL, "auto +0.1 stop +0.05 auto +3", "ANSA"),
-    "the mode of a holder who drives does not end its drive": (
-        WELL,
-        "stop +0.05 left +0.05 manual +1 auto +1",
-        "SLML{4}AL{4}",
-    ),
-    "neutral in mode 3 is a stop": (WELL, "auto +0.1 neutral +0.02 +3 neutral left +0.05", "ANS(NS){3,4}NSL"),
-    "neutral after another mode that waits": (WELL, "auto +0 manual neutral +0.1 stop +2", f"A(MS|SM){STOPS}"),
+    "never in mode 3, never a 1": (ALL, "stop +2 neutral +2 manual +2 stop +2 left +2 stop +2", "[SML]*"),
+    "the 1 of a stop is no other mode": (ALL, "auto +1 stop +3 stop +0.35 stop +3", "A+ pairs (NS){4} pairs"),
+    "a routine stop is one pair": (ALL, "auto +1 once +1 once +1", "A+ NSNS"),
+    "after mode 2": (WELL, "auto +0.1 stop +2 manual +0.1 stop +2 auto +0.1 stop +2", "A pairs M stops A pairs"),
+    "after mode 1": (WELL, "auto +0.1 stop +2 none +1 stop +2 auto +0.1 none +1 stop +2", "A pairs N stops AN stops"),
+    "never a 3 after a reconnection": (ALL, "auto +0.1 reconnect stop +3 reconnect stop +3", "A pairs pairs"),
+    "another mode did not leave before the connection ended": (ALL, "auto +0.1 none reconnect stop +3", "A pairs"),
+    "a 3 that still waits never leaves and no 1 either": (ALL, "hi +0 auto stop +3", "H stops"),
+    "another mode that still waits leaves behind the pair": (WELL, "auto +0 manual stop +0.05", "ANSM"),
+    "the next holder's mode is not undone": (WELL, "auto +0.1 stop +0.05 manual +3", "A NS (MS|SM) S{7,9}"),
+    "a stop ends where the next holder lets the robot be": (WELL, "auto +0.1 stop +0.05 auto +3", "ANSA"),
+    "the mode of a holder does not end its drive": (WELL, "stop +0.05 left +0.05 manual +1 auto +1", "SL ML{4} AL{4}"),
+    "neutral in mode 3 is a stop": (WELL, "auto +0.1 neutral +0.02 +3 neutral left +0.05", "A NS (NS){3,4} NSL"),
+    "neutral after another mode that waits": (WELL, "auto +0 manual neutral +0.1 stop +2", "A(MS|SM) stops"),
     # what is sent again to robots that misread
-    "robots that read well are sent it once": (WELL, "manual lidar_on +5", "MI"),
-    "a newer one replaces the repetition": (BADLY, "auto lidar_on +0.2 manual lidar_off +5", "AIMOMO"),
-    "a stop drops what was to be sent again": (BADLY, "manual lidar_on +0.2 stop +5", f"MI{STOPS}"),
-    "a stop drops a 3 that was to be sent again": (BADLY, "auto lidar_on +0.2 stop +5", f"AI{PAIRS}"),
+    "robots that read well are sent it once": (WELL, "manual on +5", "MI"),
+    "a newer one replaces the repetition": (BADLY, "auto on +0.2 manual off +5", "AI MO MO"),
+    "a stop drops what was to be sent again": (BADLY, "manual on +0.2 stop +5", "MI stops"),
+    "a stop drops a 3 that was to be sent again": (BADLY, "auto on +0.2 stop +5", "AI pairs"),
     # else one in three would be lost to the stop that comes once a second
-    "a routine stop drops no repetition but that of a 3": (
-        BADLY,
-        "manual lidar_on +0.2 routine +0.5 auto +0.2 routine +5",
-        "MISMIANS",
-    ),
-    "neutral lets a mode be sent again but never a 3": (
-        BADLY,
-        "manual +0.2 neutral +2 auto +0.2 neutral +5",
-        "MSMS{4}A(NS){4,5}",
-    ),
-    "who may have misread another mode gets the pair": (
+    "a routine stop drops the repetition of a 3": (BADLY, "manual on +0.2 once +0.5 auto +0.2 once +5", "MI S MI A NS"),
+    "neutral lets no 3 be sent again": (BADLY, "manual +0.2 neutral +2 auto +0.2 neutral +5", "MS MS{4} A(NS){4,5}"),
+    "the pair where a mode may be misread": (
         BADLY,
         "auto +1 manual +0.2 stop +2 manual +1 stop +2",
-        f"AAM{PAIRS}MM{STOPS}",
+        "AAM pairs MM stops",
     ),
-    "a lidar mode that still waits when the stop comes is sent": (BADLY, "hi +0 lidar_on stop +5", "HS?IS{9,10}"),
-    "nothing is sent again on the next connection": (BADLY, "manual lidar_on +0.1 reconnect +5", "MI"),
+    "a lidar mode that still waits is sent": (BADLY, "hi +0 on stop +5", "H S?I S{9,10}"),
+    "nothing is sent again on the next connection": (BADLY, "manual on +0.1 reconnect +5", "MI"),
 }
 
 
 @pytest.mark.parametrize(("versions", "script", "expected"), ROWS.values(), ids=ROWS)
 def test_what_leaves_a_robot(versions: tuple[str, ...], script: str, expected: str) -> None:
+    a_second = {"pairs": "(NS){9,11}", "stops": "S{9,11}", " ": ""}
+    for name, pattern in a_second.items():
+        expected = expected.replace(name, pattern)
     for version in versions:
         assert re.fullmatch(expected, sent := left(version, script)), (version, sent)
 
 
 @pytest.mark.parametrize("version", BADLY)
 def test_mode_and_lidar_are_sent_again_after_three_tenths_of_a_second(version: str) -> None:
-    for word, letter in {"none": "N", "manual": "M", "auto": "A", "lidar_on": "I", "lidar_off": "O"}.items():
-        assert [left(version, f"{word} {wait}") for wait in ("+0.29", "+0.31", "+5")] == [
-            letter,
-            letter * 2,
-            letter * 2,
-        ]
+    for word, letter in {"none": "N", "manual": "M", "auto": "A", "on": "I", "off": "O"}.items():
+        assert left(version, f"{word} +0.29") == letter
+        assert left(version, f"{word} +0.31") == left(version, f"{word} +5") == letter * 2
 
 
 def test_both_sends_translation_and_turn_in_turns_although_every_command_replaces_the_one_before() -> None:
@@ -212,9 +183,7 @@ async def stop_by(cause: str, rig: Rig) -> None:
             rig.driver.put("stop", {}, None)
         case "deadman":
             rig.command("drive", {"left": 1.0})
-            await asyncio.sleep(1.9)
-            assert set(rig.written()) == {MOVE_LEFT}
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(2.0)
         case "neutral":
             rig.command("drive", {})
         case "release":
@@ -260,17 +229,10 @@ async def test_a_stop_in_the_silence_is_the_first_packet_after_it_and_commands_a
             rig.driver.put("stop", {}, None)
             rig.hold()
         await asyncio.sleep(1.39)
-        for name, fields in (
-            ("drive", {"left": 1.0}),
-            ("drive", {}),
-            ("mode", {"mode": "manual"}),
-            ("lidar", {"on": True}),
-        ):
+        for name, fields in {"drive": {"left": 1.0}, "mode": {"mode": "manual"}, "lidar": {"on": True}}.items():
             rig.command(name, fields)
-        assert {(reason, count) for _, reason, count in await rig.refusals()} == {
-            ("handshaking", 2),
-            ("handshaking", 1),
-        }
+        rig.command("drive", {})
+        assert [reason for _, reason, _ in await rig.refusals()] == ["handshaking"] * 3
         assert {refusal["code"] for refusal in rig.last("control")["refusals"]} == {"not_ready"}
         assert rig.last("status")["state"] == "handshaking"
         assert [str(reply.error) for reply in rig.ask("pose").replies] == ["handshaking"]

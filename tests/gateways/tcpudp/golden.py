@@ -33,7 +33,6 @@ def lidar(*ranges: float) -> m.ClientSimulatedLidarData:
 GOLDEN: list[tuple[Any, int, str]] = [
     # 1 debugMessage
     (m.DebugMessage("hi"), 1, "08000000 01 01 02000000 6869"),
-    (m.DebugMessage("hi"), 7, "08000000 07 01 02000000 6869"),
     (m.DebugMessage(""), 1, "06000000 01 01 00000000"),
     # 2 serverSettings: 1.1, 1.2, 1.3
     (server_settings(2, "1.1", True, False, True, False, True), 1, "0f000000 01 02 02 03000000 312e31 0100010001"),
@@ -63,24 +62,18 @@ GOLDEN: list[tuple[Any, int, str]] = [
     (m.ClientUDPConnectionStatus(True), 2, "03000000 02 07 01"),
     (m.ClientUDPConnectionStatus(False), 2, "03000000 02 07 00"),
     # 10-13, 21 movement
-    (m.ClientControllMode(1), 2, "06000000 02 0a 01000000"),
     (m.ClientControllMode(2), 2, "06000000 02 0a 02000000"),
-    (m.ClientControllMode(3), 2, "06000000 02 0a 03000000"),
     (m.ClientJoystickMove(0.5, -0.25, 2.0), 2, "0e000000 02 0b 0000003f 000080be 00000040"),
     (m.ClientJoystickRotate(-0.75), 2, "06000000 02 0c 000040bf"),
     (m.ClientJoystickStop(), 2, "02000000 02 0d"),
-    (m.ClientMoveAI(b""), 2, "02000000 02 15"),
     (m.ClientMoveAI(b"\xde\xad"), 2, "04000000 02 15 dead"),
     # 31 camera, 40 chat
     (m.ServerCamMode(1), 1, "06000000 01 1f 01000000"),
-    (m.ServerCamMode(2), 1, "06000000 01 1f 02000000"),
     (m.ChatMessage(b""), 1, "02000000 01 28"),
     (m.ChatMessage(b"\x00\xff"), 2, "04000000 02 28 00ff"),
     # 50-55 lidar, map, position; 56 has its own tests below
     (m.ClientLidarMode(1), 2, "06000000 02 32 01000000"),
-    (m.ClientLidarMode(2), 2, "06000000 02 32 02000000"),
     (m.ServerLidarStatus(1), 1, "06000000 01 33 01000000"),
-    (m.ServerLidarStatus(2), 1, "06000000 01 33 02000000"),
     (m.ClientGetSLAMMap(), 2, "02000000 02 34"),
     (m.ServerSLAMMap(), 1, "06000000 01 35 00000000"),
     (m.ServerSLAMMap(b"\x00\x01\x02\x01\x00"), 1, "0b000000 01 35 05000000 0001020100"),
@@ -89,7 +82,6 @@ GOLDEN: list[tuple[Any, int, str]] = [
     # 60, 61 simulated lidar
     (m.ServerGetSimulatedLidarData(), 1, "02000000 01 3c"),
     (lidar(10.0, 0.0, 0.5), 2, "12000000 02 3d 03000000 00002041 00000000 0000003f"),
-    (lidar(), 2, "06000000 02 3d 00000000"),
 ]
 
 # id: (name, sender, carrier). Packet 6 goes by UDP when it says true and by TCP when it says false.
@@ -175,4 +167,4 @@ def _side(sender_id: int) -> Side:
     )
 
 
-SIDES = [_side(sender_id) for sender_id in (0, 1, 2, 7)]
+SIDES = [_side(sender_id) for sender_id in (0, 1, 2)]

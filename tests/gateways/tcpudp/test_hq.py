@@ -200,21 +200,6 @@ def test_a_robot_is_announced_as_it_announced_itself_when_the_client_connects(vi
     assert greeting(listener)[-15:-8] == bytes.fromhex("01010000000000")
 
 
-@pytest.mark.parametrize(
-    ("version", "options", "left_out"),
-    [
-        ("1.1", {}, {"feature lidar_sim": 1, "feature slam_map": 1}),
-        ("1.1", {"versions": ("1.1",)}, {"feature lidar_sim": 1, "feature slam_map": 1}),
-        ("1.2", {}, {"feature slam_map": 1}),
-        ("1.3", {}, {}),
-    ],
-)
-def test_a_feature_that_the_version_agreed_has_no_flag_for_is_counted_as_left_out(version, options, left_out) -> None:
-    client = joined(version, robot("1.3", "joystick", "lidar_sim", "slam_map"), **options)
-    client.begun()
-    assert client.session.left_out == left_out
-
-
 def test_clients_have_ids_of_their_own_a_deadman_and_no_right_to_drive_at_first_and_a_map_has_cells() -> None:
     listener = side(quiet_s=7.0)
     numbers = listener.numbers(10)
@@ -250,15 +235,26 @@ def test_positions_are_scaled_and_turned_as_configured_and_of_those_that_wait_on
     assert client.left() == [f.POSITION]
 
 
+def absurd(cell: float) -> Map:
+    return Map(1, 1, cell, (0.0, 0.0), np.array([[2]], np.uint8))
+
+
 @pytest.mark.parametrize(
-    "pose", [Pose(math.nan, 0.0, 0.0), Pose(0.0, math.inf, 0.0), Pose(0.0, 0.0, -math.inf), Pose(1e300, 0.0, 0.0)]
+    ("grid", "pose", "shown"),
+    [
+        *((absurd(cell), POSE, 55) for cell in (0.0, -0.1, math.nan, math.inf, 1e-300, 1e9, 1e300)),
+        *((CORNER, Pose(x, 0.0, 0.0), 53) for x in (math.nan, math.inf, 1e300)),
+        (CORNER, Pose(0.0, math.nan, 0.0), 53),
+        (CORNER, Pose(0.0, 0.0, -math.inf), 53),
+    ],
 )
-def test_a_position_that_is_no_number_is_not_shown(pose: Pose) -> None:
-    client = joined(view=knowing(CORNER, pose))
+def test_what_has_no_packet_keeps_no_client_from_connecting_and_the_other_is_shown(grid, pose, shown: int) -> None:
+    client = joined(view=knowing(grid, pose))
+    assert announced(client.listener) == ((1000, 10) if shown == 55 else (30, 10))
+    assert ids(client.begun()) == [shown]
+    assert client.session.left_out == {"map" if shown == 55 else "pose": 1}
     with pytest.raises(EncodeError):
-        client.listener.show(topics.POSE, pose)
-    assert ids(client.begun()) == [53]
-    assert client.session.left_out == {"pose": 1}
+        client.shown(*((topics.MAP, grid) if shown == 55 else (topics.POSE, pose)))
 
 
 def test_packets_are_never_written_together_and_no_text_replaces_another_until_too_many_wait() -> None:
@@ -299,9 +295,22 @@ def test_news_go_by_tcp_to_clients_that_know_their_packet_or_are_said_to_and_the
     client = joined(version, udp=True)
     assert {frame[5] for topic, message, _ in NEWS for frame in client.shown(topic, message)} == {1, 51}
     assert client.session.left_out == {"serverCamMode (31)": 1, "chatMessage (40)": 1, "packet 70": 1}
+    missing = {"1.1": ("lidar_sim", "slam_map"), "1.2": ("slam_map",), "1.3": ()}[version]
+    seen = joined(version, robot("1.3", "joystick", "lidar_sim", "slam_map"))
+    seen.begun()
+    assert seen.session.left_out == {f"feature {name}": 1 for name in missing}, "its version has no flag for it"
 
 
-def test_raw_packets_are_none_that_a_fleet_message_holds_none_beyond_a_byte_and_none_that_clients_lose() -> None:
+@pytest.mark.parametrize(("version", "flags"), [("1.1", "01010101"), ("1.2", "0101010100"), ("1.3", "010101010001")])
+def test_simulated_lidar_data_is_asked_of_those_who_announced_it(version: str, flags: str) -> None:
+    client = joined(version, block=flags)
+    assert client.shown(topics.TEXT, REQUEST) == []
+    assert client.session.left_out == {"serverGetSimulatedLidarData (60)": 1}
+    if version != "1.1":
+        assert joined(version).shown(topics.TEXT, REQUEST) == [bytes.fromhex("02000000 01 3c")]
+
+
+def test_raw_packets_are_none_that_a_fleet_message_holds_and_nothing_is_longer_than_clients_take() -> None:
     client = joined(known=(2, 13, 40, 55))
     for held in (1, 2, 13, 53, 55):
         assert client.listener.show(RAW, Raw(held, b"")) is None
@@ -309,33 +318,13 @@ def test_raw_packets_are_none_that_a_fleet_message_holds_none_beyond_a_byte_and_
     for unfit in (Raw(256), Raw(-1), Raw(40, bytes(2194))):  # they lose packets of 2.2 kB
         with pytest.raises(EncodeError):
             client.listener.show(RAW, unfit)
+    for text in ("a" * 100_000, "ü" * 5000):  # cut, so that they do not lose it
+        (shown,) = client.shown(topics.TEXT, Text(text))
+        client.listener.tell(client.session, text, client.now)
+        assert client.left() == [shown]
+        assert 500 < len(shown) < 2200
     assert side().show(topics.TEXT, Text("")) is None
     assert side().show(topics.SCAN, Scan(0.0, 0.1, 0.0, 1.0, np.ones(3, np.float32))) is None
-
-
-@pytest.mark.parametrize(
-    ("version", "flags", "asked"),
-    [
-        ("1.2", "0000000001", True),
-        ("1.3", "000000000101", True),
-        ("1.3", "010101010001", False),
-        ("1.2", "0101010100", False),
-        ("1.1", "01010101", False),
-    ],
-)
-def test_simulated_lidar_data_is_asked_of_those_who_announced_it(version: str, flags: str, asked: bool) -> None:
-    client = joined(version, block=flags)
-    assert client.shown(topics.TEXT, REQUEST) == [bytes.fromhex("02000000 01 3c")] * asked
-    assert client.session.left_out == ({} if asked else {"serverGetSimulatedLidarData (60)": 1})
-
-
-@pytest.mark.parametrize("text", ["a" * 100_000, "ü" * 5000])
-def test_a_long_text_is_cut_so_that_clients_do_not_lose_it(text: str) -> None:
-    client = joined()
-    (shown,) = client.shown(topics.TEXT, Text(text))
-    client.listener.tell(client.session, text, client.now)
-    assert client.left() == [shown]
-    assert 500 < len(shown) < 2200
 
 
 # Maps
@@ -360,17 +349,6 @@ def wall(side_cells: int) -> Map:
 )
 def test_the_map_is_announced_in_its_own_cells_or_as_configured(view, options, expected) -> None:
     assert announced(side(view, **options)) == expected
-
-
-@pytest.mark.parametrize("cell", [0.0, -0.1, math.nan, math.inf, 1e-300, 1e9, 1e300])
-def test_a_map_with_absurd_cells_keeps_no_client_from_connecting(cell: float) -> None:
-    absurd = Map(1, 1, cell, (0.0, 0.0), np.array([[2]], np.uint8))
-    client = joined(view=knowing(absurd, POSE))
-    assert announced(client.listener) == (1000, 10)
-    assert client.begun() == [f.POSITION]
-    assert client.session.left_out == {"map": 1}
-    with pytest.raises(EncodeError):
-        client.shown(topics.MAP, absurd)
 
 
 @each_version

@@ -1,5 +1,6 @@
 """The gateway as HQ of one robot: what it answers, which bytes leave when and by which channel, what it never sends."""
 
+import contextlib
 import itertools
 
 import msgspec
@@ -196,15 +197,13 @@ def test_a_start_that_nobody_offered_is_obeyed_without_datagrams(flags: str, udp
     assert (timed.session.state, timed.session.busy) == (State.ESTABLISHED, None)
 
 
-NO_ANSWERS = [b"", b"\x03", f.ANSWER_TRUE[:-1], f.ANSWER_TRUE + b"\x00", f.PROBE]
-NO_ANSWERS += [bytes.fromhex(length) + f.ANSWER_TRUE[4:] for length in ("04000000", "02000000", "ffffffff")]
-
-
-@pytest.mark.parametrize("datagram", [*NO_ANSWERS, *(f.bearing(f.ANSWER_TRUE, sender) for sender in (0, 5))])
-def test_an_answer_that_is_none_is_counted_and_waited_past(datagram: bytes) -> None:
+def test_an_answer_that_is_none_is_counted_and_waited_past() -> None:
+    answer = f.ANSWER_TRUE
+    lengths = [bytes.fromhex(length) + answer[4:] for length in ("04000000", "02000000", "ffffffff")]
+    wrong = [b"", b"\x03", answer[:-1], answer + b"\x00", f.PROBE, f.bearing(answer, 0), f.bearing(answer, 5), *lengths]
     timed = hq().hear("0.2 t4")
-    assert timed.datagram(datagram, 0.3) == []
-    assert timed.session.traffic.malformed == 1
+    assert [timed.datagram(datagram, 0.3) for datagram in wrong] == [[]] * len(wrong)
+    assert timed.session.traffic.malformed == len(wrong)
     assert timed.hear("0.4 u6+").told() == "0.1 t3 0.2 u5 0.4 t7+"
 
 
@@ -282,34 +281,24 @@ def test_a_packet_is_sent_only_to_a_robot_that_announces_its_feature_or_where_it
     announcing.session.may_send(m.DebugMessage("hi"))
 
 
-QUESTIONS = (m.ClientGetSLAMMap(), m.ClientGetPosition())
-
-
 @pytest.mark.parametrize(
-    ("listed", "block", "messages", "reason"),
+    ("listed", "block", "ids", "reason"),
     [
         # questions by SLAMMap where the version has the flag, else by Lidar; simulated lidar data, which 1.1 has not
-        (b"1.1", "0000000001", QUESTIONS, None),
-        (b"1.1", "0001010100", QUESTIONS, "does not announce lidar"),
-        (b"1.2", "000000000100", QUESTIONS, None),
-        (b"1.2", "000101010001", QUESTIONS, "does not announce lidar"),
-        (f.LISTED_14, "00000000000001", QUESTIONS, None),
-        (f.LISTED_14, "00010101010100", QUESTIONS, "does not announce slam_map"),
-        (b"1.1", "0101010101", (SCAN,), r"version 1\.1 has no lidar_sim"),
-        (b"1.2", "000101010100", (SCAN,), "does not announce lidar_sim"),
-        (b"1.2", "000000000001", (SCAN,), None),
+        (b"1.1", "0000000001", (52, 54), None),
+        (b"1.1", "0001010100", (52, 54), "does not announce lidar"),
+        (b"1.2", "000000000100", (52, 54), None),
+        (b"1.2", "000101010001", (52, 54), "does not announce lidar"),
+        (b"1.1", "0101010101", (61,), r"version 1\.1 has no lidar_sim"),
+        (b"1.2", "000101010100", (61,), "does not announce lidar_sim"),
+        (b"1.2", "000000000001", (61,), None),
     ],
 )
-def test_questions_and_simulated_lidar_data_go_to_robots_that_know_them(listed, block, messages, reason) -> None:
-    for message in messages:
+def test_questions_and_simulated_lidar_data_go_to_robots_that_know_them(listed, block, ids, reason) -> None:
+    for message, _ in [THEIRS[packet_id] for packet_id in ids]:
         timed = hq(listed, block, udp=False)
-        if reason is None:
+        with contextlib.nullcontext() if reason is None else pytest.raises(Refused, match=reason):
             timed.session.send(message)
-        else:
-            with pytest.raises(Refused, match=reason):
-                timed.session.send(message)
-        timed.until(1.0)
-        assert [frame[5] for frame in timed.frames("tcp")] == [3, message.spec.id][: 1 + (reason is None)]
 
 
 def test_a_forced_packet_is_sent_alone_and_one_that_the_table_does_not_know_only_if_forced() -> None:

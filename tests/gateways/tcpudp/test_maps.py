@@ -83,21 +83,6 @@ def test_a_square_fits_keeps_every_obstacle_and_holds_unchanged_what_fits(grid: 
 # Cells of another size
 
 
-@pytest.mark.parametrize(
-    ("grid", "side", "cell_m", "expected"),
-    [
-        (drawn("1000", "0000", "0012", "0010"), 2, 0.2, ("10", "02")),  # twice the size holds four
-        (drawn("12", "01", cell=0.2), 4, 0.1, ("1100", "1100", "2211", "2211")),  # half the size repeats one
-        # what lies beyond the square is cut and what lies beyond the map is unknown
-        (drawn("12", "21"), 3, 0.1, ("120", "210", "000")),
-        (drawn("112", "112", "222"), 2, 0.1, ("11", "11")),
-        (Map(0, 0, 0.1, (0.0, 0.0), np.zeros((0, 0), np.uint8)), 2, 0.1, ("00", "00")),
-    ],
-)
-def test_a_map_is_shown_in_cells_of_another_size(grid, side: int, cell_m: float, expected: tuple[str, ...]) -> None:
-    assert columns(resampled(grid, side, cell_m)) == expected
-
-
 def test_a_step_that_is_no_binary_fraction_moves_no_cell() -> None:
     grid = Map(300, 300, 0.1, (0.0, 0.0), np.arange(90_000, dtype=np.uint32).reshape(300, 300).astype(np.uint8) % 3)
     assert resampled(grid, 300, 10 * 0.01) == grid.cells.T.tobytes()

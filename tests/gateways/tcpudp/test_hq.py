@@ -149,6 +149,13 @@ def ids(frames: list[bytes]) -> list[int]:
     return [frame[5] for frame in frames]
 
 
+def wall(side_cells: int) -> Map:
+    """A free square with one obstacle in its far corner."""
+    cells = np.ones((side_cells, side_cells), np.uint8)
+    cells[-1, -1] = 2
+    return Map(side_cells, side_cells, 0.1, (0.0, 0.0), cells)
+
+
 # The settings, which the robot sends first
 
 SEEN = robot("1.3", "joystick", "lidar_sim")
@@ -164,11 +171,16 @@ ALL = "01010101010101"
         ({"versions": ("1.3",)}, None, b"1.3", ALL),
         ({"versions": ("1.1", "1.2", "1.3", "1.4")}, None, f.LISTED_14, ALL),
         ({"versions": ("1.1",)}, SEEN, b"1.1", "0100010000"),
+        # the size of the map: its own; not known yet: as configured, but no larger than fits
+        ({}, knowing(wall(50)), f.LISTED, ALL + "f4010000 0a000000"),
+        ({"slam_map_size": 300, "slam_map_interval": 3}, None, f.LISTED, ALL + "2c010000 03000000"),
+        ({"slam_map_size": 1000, "slam_map_interval": 1}, None, f.LISTED, ALL + "f4000000 01000000"),
+        ({"slam_map_interval": 1, "udp": False}, None, f.LISTED, "00" + ALL[2:] + "2e000000 01000000"),
         # the byte that some HQ programs skip is left out where the listener says so
         ({"skip_map_flag": True}, SEEN, f.LISTED, "010001000001 e8030000 0a000000"),
         ({"skip_map_flag": True, "versions": ("1.2",)}, SEEN, b"1.2", "010001000001"),
     ],
-)  # fmt: skip
+)
 def test_a_client_is_greeted_with_its_id_the_versions_verbatim_and_the_settings_of_the_newest(
     options: dict[str, Any], view: RobotView | None, listed: bytes, block: str
 ) -> None:
@@ -330,27 +342,6 @@ def test_raw_packets_are_none_that_a_fleet_message_holds_and_nothing_is_longer_t
 # Maps
 
 
-def wall(side_cells: int) -> Map:
-    """A free square with one obstacle in its far corner."""
-    cells = np.ones((side_cells, side_cells), np.uint8)
-    cells[-1, -1] = 2
-    return Map(side_cells, side_cells, 0.1, (0.0, 0.0), cells)
-
-
-@pytest.mark.parametrize(
-    ("view", "options", "expected"),
-    [
-        (knowing(wall(50)), {}, (500, 10)),  # in its own cells
-        # not known yet: as configured, but no larger than fits
-        (RobotView(), {"slam_map_size": 300, "slam_map_interval": 3}, (300, 3)),
-        (RobotView(), {"slam_map_size": 1000, "slam_map_interval": 1}, (244, 1)),
-        (RobotView(), {"slam_map_size": 1000, "slam_map_interval": 1, "udp": False}, (46, 1)),
-    ],
-)
-def test_the_map_is_announced_in_its_own_cells_or_as_configured(view, options, expected) -> None:
-    assert announced(side(view, **options)) == expected
-
-
 @each_version
 @pytest.mark.parametrize(("udp", "limit"), [(False, 2199), (True, 60_000)])
 @pytest.mark.parametrize("side_cells", [20, 46, 47, 244, 245, 2048])
@@ -375,57 +366,54 @@ def test_a_map_of_any_size_fits_and_keeps_its_obstacle(version: str, udp: bool, 
             assert cells[-1] == 2
 
 
-def drawn(rows: int, columns: int, cell_m: float, origin: tuple[float, float], **cells: tuple[int, int]) -> Map:
-    """A map whose cells are unknown but for one that is free and those that are obstacles: (row, column) of each."""
-    values = np.zeros((rows, columns), np.uint8)
-    for name, place in cells.items():
-        values[place] = 1 if name == "free" else 2
-    return Map(rows, columns, cell_m, origin, values)
+def drawn(side_cells: int, cell_m: float, x: float, y: float, *cells: tuple[int, int, int]) -> Map:
+    """A square map that begins at x, y and whose cells are unknown but for these: row, column, value."""
+    values = np.zeros((side_cells, side_cells), np.uint8)
+    for row, column, value in cells:
+        values[row, column] = value
+    return Map(side_cells, side_cells, cell_m, (x, y), values)
+
+
+OTHER = robot(None, protocol="alf")
+OFF_CENTRE = drawn(20, 0.1, -1.0, -1.5, (5, 9, 2))  # x -0.1 to 0, y -1 to -0.9
 
 
 @pytest.mark.parametrize(
-    ("grid", "shown", "left_out"),
+    ("view", "options", "grid", "cells", "left_out"),
     [
-        # The obstacle at x 5 to 10 cm, y 0 to 5 cm: in the cell (0, 0). Free at x 10 to 15, y 25 to 30: in x 1, y 2.
-        (drawn(6, 6, 0.05, (0.0, 0.0), obstacle=(0, 1), free=(5, 2)), "020000000001000000", {}),
+        # in the cells that it was announced: x 5 to 10 cm, y 0 to 5 cm is in the first one
+        (knowing(CORNER), {}, drawn(6, 0.05, 0, 0, (0, 1, 2), (5, 2, 1)), {(0, 0): 2, (1, 2): 1}, {}),
         # larger than the client was told: shown whole in larger cells
         (
-            drawn(6, 6, 0.1, (0.0, 0.0), obstacle=(0, 0), another=(5, 5), free=(3, 4)),
-            "020000000000000102",
+            knowing(CORNER),
+            {},
+            drawn(6, 0.1, 0, 0, (0, 0, 2), (5, 5, 2), (3, 4, 1)),
+            {(0, 0): 2, (2, 2): 2, (2, 1): 1},
             {"map to scale": 1},
         ),
+        # the zero of a robot of the same protocol stays where its programs see it
+        (robot("1.3", "joystick"), {}, drawn(40, 0.1, -2.0, -2.0, (20, 20, 2)), {(50, 50): 2}, {}),
+        (robot("1.3", "joystick"), {}, drawn(40, 0.1, 0.0, 0.0, (20, 20, 2)), {(20, 20): 2}, {}),
+        # a map of another robot is centred on zero or placed as the option says
+        (OTHER, {}, OFF_CENTRE, {(49, 40): 2}, {}),
+        (OTHER, {"map_origin": (-2.0, -3.0)}, OFF_CENTRE, {(19, 20): 2}, {}),
     ],
 )
-def test_a_client_of_1_3_gets_every_later_map_in_the_cells_it_was_announced(grid, shown, left_out) -> None:
-    view = RobotView()
-    early = joined(view=view, udp=True, slam_map_size=20, slam_map_interval=10)
-    knowing(CORNER, view=view)
-    client = joined(listener=early.listener, udp=True, number=3)
-    assert [cells_of(frame).hex() for frame in early.shown(topics.MAP, CORNER)] == ["01000202"]
-    assert [cells_of(frame).hex() for frame in client.shown(topics.MAP, CORNER)] == [CORNER_CELLS]
-    assert [cells_of(frame).hex() for frame in client.shown(topics.MAP, grid)] == [shown]
+def test_a_map_is_shown_in_the_announced_cells_where_the_programs_see_it(view, options, grid, cells, left_out) -> None:
+    client = joined(view=view, udp=True, **options)
+    (frame,) = client.shown(topics.MAP, grid)
+    side_cells = math.isqrt(len(cells_of(frame)))
+    shown = np.frombuffer(cells_of(frame), np.uint8).reshape(side_cells, side_cells)
+    assert {(x, y): shown[x, y] for x, y in np.argwhere(shown).tolist()} == cells
     assert client.session.left_out == left_out
 
 
-CENTRED = {"rows": 40, "columns": 40, "cell_m": 0.1, "obstacle": (20, 20)}
-OFF_CENTRE = drawn(20, 10, 0.1, (-1.0, -1.5), obstacle=(5, 9))  # x -0.1 to 0, y -1 to -0.9
-
-
-@pytest.mark.parametrize(
-    ("view", "options", "grid", "cell"),
-    [
-        # the zero of a robot of the same protocol stays where its programs see it
-        (robot("1.3", "joystick"), {}, drawn(**CENTRED, origin=(-2.0, -2.0)), (50, 50)),  # type: ignore[arg-type]
-        (robot("1.3", "joystick"), {}, drawn(**CENTRED, origin=(0.0, 0.0)), (20, 20)),  # type: ignore[arg-type]
-        # a map of another robot is centred on zero or placed as the option says
-        (robot(None, protocol="alf"), {}, OFF_CENTRE, (49, 40)),
-        (robot(None, protocol="alf"), {"map_origin": (-2.0, -3.0)}, OFF_CENTRE, (19, 20)),
-    ],
-)
-def test_a_map_lies_where_the_programs_of_its_robot_see_it(view, options, grid, cell) -> None:
-    (frame,) = joined(view=view, udp=True, **options).shown(topics.MAP, grid)
-    shown = np.frombuffer(cells_of(frame), np.uint8).reshape(100, 100)
-    assert [tuple(at) for at in np.argwhere(shown == 2).tolist()] == [cell]
+def test_clients_that_came_at_different_times_each_get_what_they_were_announced() -> None:
+    early = joined(view=(view := RobotView()), udp=True, slam_map_size=20, slam_map_interval=10)
+    knowing(CORNER, view=view)
+    late = joined(listener=early.listener, udp=True, number=3)
+    assert [cells_of(frame).hex() for frame in early.shown(topics.MAP, CORNER)] == ["01000202"]
+    assert [cells_of(frame).hex() for frame in late.shown(topics.MAP, CORNER)] == [CORNER_CELLS]
 
 
 # The first programs of 1.1 have no handlers for 53 and 55: who asks (52, 54) has

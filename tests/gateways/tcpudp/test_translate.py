@@ -129,6 +129,8 @@ def test_a_robot_is_ready_while_its_session_is_established_and_refuses_all_befor
     with pytest.raises(Refused, match="offline"):
         robot.command(topics.CMD_DRIVE, Drive(), 0.0)
     with pytest.raises(Refused, match="offline"):
+        robot.ask(topics.MAP)
+    with pytest.raises(Refused, match="offline"):
         robot.stop(0.0, 1.0)
     connected = stage()
     assert connected.robot.ready

@@ -5,7 +5,7 @@ Nothing here encodes with the code under test.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqRole, RobotRole
@@ -72,8 +72,7 @@ def bearing(frame: bytes, sender: int) -> bytes:
     return frame[:4] + bytes([sender]) + frame[5:]
 
 
-@dataclass(frozen=True)
-class Sent:
+class Sent(NamedTuple):
     """One frame that left a session."""
 
     at: float

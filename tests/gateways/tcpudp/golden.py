@@ -111,18 +111,13 @@ TABLE = {
     61: ("clientSimulatedLidarData", m.Sender.HQ, m.Carrier.UDP_IF_AGREED),
 }
 
-# What the captures say, read off the hex: 9a99193f is the float32 next to 0.6, cdcc4c3f the one next to 0.8.
+# What the captures say after the handshake, read off the hex: 9a99193f is the float32 next to 0.6, cdcc4c3f that next
+# to 0.8.
 HI_THERE = m.DebugMessage("hi there")
 MOVE = m.ClientJoystickMove(0.6000000238418579, 0.800000011920929, 1.5)
 POSE = m.ServerPosition(1.5, -2.25, 90.0)
 MAP = m.ServerSLAMMap(bytes([0, 1, 2] * 133 + [0]))
 UDP_SESSION_MESSAGES = [
-    server_settings(1, "1.1,1.2,1.3", True, False, False, False, False, True, True, 2048, 1),
-    client_settings("1.1,1.2,1.3", True, False, False, False, False, True, False),
-    m.ServerStartUDP(),
-    m.ClientUDPConnection(),
-    m.ServerUDPConnection(True),
-    m.ClientUDPConnectionStatus(True),
     HI_THERE,
     m.ClientControllMode(2),
     MOVE,
@@ -139,8 +134,6 @@ UDP_SESSION_MESSAGES = [
     m.DebugMessage("bye"),
 ]
 TCP_SESSION_MESSAGES = [
-    server_settings(1, "1.1", False, False, False, False, False),
-    client_settings("1.1", True, False, False, False, False),
     HI_THERE,
     m.ClientControllMode(2),
     MOVE,

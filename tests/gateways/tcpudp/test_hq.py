@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq, display
 from gateways.tcpudp.hq import client as client_module
 from gateways.tcpudp.messages import Packet, encode_packet
-from tests.captures import payloads
 from tests.gateways.tcpudp import frames as f
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet import payload as codec
@@ -597,15 +596,3 @@ def test_whatever_a_client_sends_gives_commands_the_bus_takes_or_counts_as_malfo
         for topic, command in commands:
             assert type(command) is topic.message
             codec.decode(topic.message, codec.encode(command))
-
-
-@pytest.mark.parametrize(("version", "name"), [("1.1", "tcpudp-1.1-tcp.hex"), ("1.3", "tcpudp-1.3-udp.hex")])
-def test_a_captured_hq_commands_what_is_documented(version: str, name: str) -> None:
-    client = joined(version, udp=version == "1.3")
-    said: list[tuple[Topic, FleetMessage]] = []
-    for record in payloads(name, destination=11001):
-        if record.payload[5] not in range(2, 8):  # the handshake
-            said += client.said(record.payload, datagram=record.transport == "UDP")
-    expected = [topics.CMD_TEXT, topics.CMD_MODE, *[topics.CMD_DRIVE] * 3, topics.RPC_POSE, topics.RPC_MAP]
-    assert [topic for topic, _ in said] == expected + [topics.CMD_SCAN] * (version == "1.3")
-    assert client.session.traffic.malformed == 0

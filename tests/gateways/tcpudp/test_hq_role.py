@@ -329,13 +329,3 @@ def test_what_a_robot_cannot_take_is_never_sent(message: m.Packet, error: type[E
     timed.session.send(m.DebugMessage("x" * (4096 - 6 - 4)))
     timed.until(1.0)
     assert [len(frame) for frame in timed.frames("tcp")[1:]] == [4096]
-
-
-def test_a_closing_session_asks_for_no_timer_that_does_nothing() -> None:
-    """A link that takes nothing keeps it closing for a while; a timer in the past would fire without end."""
-    timed = hq().hear("0.2 t4")
-    timed.session.send(m.DebugMessage("last words"))
-    timed.session.close("enough", 2.0)
-    timed.session.expire(2.4)
-    assert timed.session.state is State.CLOSING
-    assert timed.session.deadline(writing=False) == 2.5

@@ -1,19 +1,15 @@
-"""What is peculiar to packets of TCP/UDP. What holds of every message of every protocol is in tests/conformance.
+"""What is peculiar to packets of TCP/UDP. What holds of every message is in tests/conformance and tests/wire.
 
 Every expected byte is written out by hand from the protocol page, never computed by the code under test.
 """
 
-import math
-import struct
 from typing import Any
 
-import numpy as np
 import pytest
 
 from gateways.tcpudp import messages as m
-from tests.conformance.side import plain
 from tests.gateways.tcpudp.frames import framed
-from tests.gateways.tcpudp.golden import GOLDEN, TABLE, server_settings
+from tests.gateways.tcpudp.golden import GOLDEN, TABLE
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.wire import FrameBuffer
 
@@ -56,43 +52,7 @@ def test_the_largest_map_fits_a_frame_and_two_packets_in_one_datagram_are_refuse
         m.decode_packet(bytes.fromhex("02000000 02 0d 02000000 02 0d"))
 
 
-# Bodies too short, too long, lying
-
-
-@pytest.mark.parametrize(("message", "sender_id", "text"), GOLDEN, ids=lambda value: type(value).__name__)
-def test_a_body_of_another_length_is_refused_unless_it_is_opaque_or_follows_settings(message, sender_id, text) -> None:
-    body, packet_id = bytes.fromhex(text)[6:], bytes.fromhex(text)[5]
-    for other in [body[:size] for size in range(len(body))] + [body + extra for extra in (b"\0", b"\1", b"\xff\0")]:
-        frame = framed(sender_id, packet_id, other)
-        settings = isinstance(message, m.ServerSettings | m.ClientSettings)
-        if packet_id == 53 and other == b"":
-            assert m.decode_packet(frame) == m.ServerSLAMMap()
-        elif packet_id in (21, 40):  # opaque
-            assert m.encode_packet(m.decode_packet(frame), sender_id) == frame
-        elif settings and len(other) >= body.index(message.versions.encode()) + len(message.versions):
-            assert type(m.decode_packet(frame)) is type(message)
-        else:
-            with pytest.raises(ProtocolError):
-                m.decode_packet(frame)
-
-
-INT32 = (-(2**31), -1, 2**31 - 1)
-
-
-@pytest.mark.parametrize(
-    ("packet_id", "before", "counts", "after"),
-    [
-        pytest.param(1, b"", (*INT32, 1, 3, 4), b"hi", id="text"),
-        pytest.param(2, b"\x02", (*INT32, 9), b"1.1" + bytes(5), id="versions of a robot"),
-        pytest.param(3, b"", (*INT32, 9), b"1.1" + bytes(5), id="versions of an HQ"),
-        pytest.param(53, b"", (*INT32, 0, 4, 6, 2**30), bytes(5), id="map"),
-        pytest.param(61, b"", (*INT32, 0, 1, 3, 2**30, 2**30 + 2), bytes(8), id="simulated lidar data"),
-    ],
-)
-def test_a_count_that_is_not_its_length_is_refused(packet_id, before, counts, after) -> None:
-    for count in counts:
-        with pytest.raises(ProtocolError):
-            m.decode_packet(framed(1, packet_id, before + struct.pack("<i", count) + after))
+# Bodies that are not simply their fields
 
 
 @pytest.mark.parametrize(
@@ -158,38 +118,7 @@ def test_odd_packets_of_deployed_programs_are_read(frame: str, message: Any) -> 
         assert m.decode_packet(bytes.fromhex(frame)) == message
 
 
-# Values
-
-
-@pytest.mark.parametrize(
-    "frame",
-    [
-        "0e000000 01 37 0000c07f 0000807f 000080ff",
-        "0e000000 02 0b 0000c07f 0000807f 000080ff",
-        "12000000 02 3d 03000000 0000c07f 0000807f 000080ff",
-    ],
-)
-def test_floats_may_be_infinite_or_no_number(frame: str) -> None:
-    message = m.decode_packet(bytes.fromhex(frame))
-    np.testing.assert_array_equal(np.array(plain(message)[1:]).ravel(), [math.nan, math.inf, -math.inf])
-    assert bytes(m.encode_packet(message, bytes.fromhex(frame)[4])) == bytes.fromhex(frame)
-
-
-@pytest.mark.parametrize(
-    ("message", "sender_id"),
-    [
-        (server_settings(256, "1.1", True, True, True, True, True), 1),
-        (server_settings(-1, "1.1", True, True, True, True, True), 1),
-        (m.ClientControllMode(2**31), 1),
-        (m.ClientControllMode(-(2**31) - 1), 1),
-        (m.ClientJoystickMove(1e39, 0.0, 0.0), 1),
-        (m.ClientJoystickRotate(-1e300), 1),
-        (m.DebugMessage("h\xfc"), 1),
-        (m.ClientJoystickStop(), -1),
-        (m.ClientJoystickStop(), 256),
-    ],
-    ids=repr,
-)
-def test_a_value_that_does_not_fit_its_field_is_not_sent(message: Any, sender_id: int) -> None:
+@pytest.mark.parametrize("sender_id", [-1, 256])
+def test_an_id_that_is_no_byte_is_not_sent(sender_id: int) -> None:
     with pytest.raises(EncodeError):
-        m.encode_packet(message, sender_id)
+        m.encode_packet(m.ClientJoystickStop(), sender_id)

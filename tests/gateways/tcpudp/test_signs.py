@@ -27,6 +27,9 @@ def settings(client_id: int = 2, flags: str = "00", versions: bytes = f.LISTED) 
     return f.server_settings(versions, blocks[versions], client_id)
 
 
+PROBED = settings(3, "01") + f.START
+
+
 def doubts(timed: f.Timed, until: float) -> tuple[str, ...]:
     """The doubts at a time; only a client id above 2 together with another sign is a reason not to drive."""
     timed.until(until)
@@ -36,14 +39,14 @@ def doubts(timed: f.Timed, until: float) -> tuple[str, ...]:
     return named
 
 
-@pytest.mark.parametrize("client_id", [0, 1, 2, 3, 4, 255])
 @pytest.mark.parametrize("versions", [b"1.1", b"1.2", f.LISTED])
-def test_a_client_id_above_2_is_named_and_alone_no_reason_not_to_drive(client_id: int, versions: bytes) -> None:
+def test_a_client_id_above_2_is_named_and_alone_no_reason_not_to_drive(versions: bytes) -> None:
     """A robot without datagrams may be silent until it is asked."""
-    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, versions=versions)))
-    timed.until(100.0)
-    assert timed.session.doubts == ((LATER.replace("3", str(client_id)),) if client_id > 2 else ())
-    assert timed.session.doubtful is None
+    for client_id in (0, 1, 2, 3, 4, 255):
+        timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, versions=versions)))
+        timed.until(100.0)
+        assert timed.session.doubts == ((LATER.replace("3", str(client_id)),) if client_id > 2 else ())
+        assert timed.session.doubtful is None
 
 
 FEW_OF_MANY = [(11.0, "tcp", f.POSITION * 1000), (12.0, "tcp", MALFORMED * 20)]
@@ -51,39 +54,30 @@ GARBLED_FIRST = (1.0, "tcp", f.POSITION * 5 + MALFORMED * 3)
 
 
 @pytest.mark.parametrize(
-    ("coming", "until", "expected"),
+    ("greeting", "coming", "until", "expected"),
     [
-        pytest.param([(1.0, "tcp", MALFORMED * 2)], 10.0, (LATER,), id="a few malformed packets"),
-        pytest.param(FEW_OF_MANY, 12.0, (LATER,), id="a few of many"),
-        pytest.param([GARBLED_FIRST], 1.0, (LATER, GARBLED), id="three and more than a twentieth"),
-        pytest.param([GARBLED_FIRST, (2.0, "tcp", f.POSITION * 100)], 8.0, (LATER,), id="most could be read after all"),
-        pytest.param([(1.0, "udp", f.POSITION[:-1])] * 3, 1.0, (LATER, GARBLED), id="malformed datagrams"),
-        pytest.param([(0.2, "tcp", f.START)], 100.0, (LATER,), id="a probe that was never sent, for nobody offered it"),
+        # three malformed packets and more than a twentieth
+        pytest.param(settings(3), [(1.0, "tcp", MALFORMED * 2)], 10.0, (LATER,), id="a few malformed packets"),
+        pytest.param(settings(3), FEW_OF_MANY, 12.0, (LATER,), id="a few of many"),
+        pytest.param(settings(3), [GARBLED_FIRST], 1.0, (LATER, GARBLED), id="many"),
+        pytest.param(settings(3), [GARBLED_FIRST, (2.0, "tcp", f.POSITION * 100)], 8.0, (LATER,), id="read after all"),
+        pytest.param(settings(3), [(1.0, "udp", f.POSITION[:-1])] * 3, 1.0, (LATER, GARBLED), id="malformed datagrams"),
+        pytest.param(settings(2), [(1.0, "tcp", MALFORMED * 10)], 1.0, (GARBLED,), id="many on a first connection"),
+        # neither telemetry nor an answer to the probe within five seconds from 2.6 on
+        pytest.param(PROBED, [], 7.59, (LATER,), id="not yet five seconds"),
+        pytest.param(PROBED, [], 7.61, (LATER, UNANSWERED), id="neither within five seconds"),
+        pytest.param(PROBED, [(9.0, "tcp", f.POSITION)], 10.1, (LATER,), id="it has answered a question"),
+        pytest.param(PROBED, [(3.0, "tcp", TEXT * 5)], 8.0, (LATER, UNANSWERED), id="texts, that all get"),
+        pytest.param(PROBED, [(1.0, "tcp", f.ANSWER_FALSE)], 8.0, (LATER, UNANSWERED), id="a probe that was lost"),
+        pytest.param(PROBED, [(4.0, "udp", f.ANSWER_TRUE)], 8.0, (LATER,), id="an answer that came late"),
+        pytest.param(PROBED, [(0.2, "udp", f.ANSWER_TRUE)], 100.0, (LATER,), id="silent until it is asked"),
+        pytest.param(settings(2, "01") + f.START, [], 100.0, (UNANSWERED,), id="a first connection, which is driven"),
+        pytest.param(settings(3) + f.START, [], 100.0, (LATER,), id="no probe was sent, for nobody offered it"),
     ],
 )
-def test_three_malformed_packets_and_more_than_a_twentieth_are_a_sign(coming, until, expected) -> None:
-    assert doubts(f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(3)), *coming), until) == expected
-
-
-@pytest.mark.parametrize(
-    ("client_id", "coming", "until", "expected"),
-    [
-        pytest.param(3, [], 7.59, (LATER,), id="not yet five seconds"),
-        pytest.param(3, [], 7.61, (LATER, UNANSWERED), id="neither within five seconds"),
-        pytest.param(3, [(9.0, "tcp", f.POSITION)], 10.1, (LATER,), id="it has answered a question"),
-        pytest.param(3, [(3.0, "tcp", TEXT * 5)], 8.0, (LATER, UNANSWERED), id="texts, that all get"),
-        pytest.param(3, [(1.0, "tcp", f.ANSWER_FALSE)], 8.0, (LATER, UNANSWERED), id="a probe that did not arrive"),
-        pytest.param(3, [(4.0, "udp", f.ANSWER_TRUE)], 8.0, (LATER,), id="an answer that came late"),
-        pytest.param(3, [(0.2, "udp", f.ANSWER_TRUE)], 100.0, (LATER,), id="silent until it is asked"),
-        pytest.param(2, [], 100.0, (UNANSWERED,), id="a first connection, which is driven"),
-        pytest.param(2, [(1.0, "tcp", MALFORMED * 10)], 1.0, (GARBLED,), id="malformed packets on a first connection"),
-    ],
-)
-def test_neither_telemetry_nor_an_answer_to_the_probe_within_five_seconds_is_a_sign(
-    client_id: int, coming: list[tuple[float, str, bytes]], until: float, expected: tuple[str, ...]
-) -> None:
-    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", settings(client_id, "01") + f.START))  # established at 2.6
-    assert doubts(timed.come(*coming), until) == expected
+def test_a_connection_is_doubted_for_what_comes_and_for_what_does_not(greeting, coming, until: float, expected) -> None:
+    timed = f.Timed(HqRole(limits(0.01))).come((0.1, "tcp", greeting), *coming)
+    assert doubts(timed, until) == expected
 
 
 def talked(*, asked: bool = False) -> f.Stage:

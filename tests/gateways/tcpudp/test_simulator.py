@@ -93,11 +93,10 @@ def test_it_stops_by_itself_after_a_second_of_silence_which_only_motion_breaks()
     assert moved.moving
 
 
-@pytest.mark.parametrize("speed", [1.0, 3e38])
 @pytest.mark.parametrize("heading", [0.0, 0.8, math.pi / 2, 2.4, 3.1, -0.8, -1.6, -2.4])
-def test_walls_and_boxes_stop_it_however_fast_it_is_told_to_go(heading: float, speed: float) -> None:
+def test_walls_and_boxes_stop_it_however_fast_it_is_told_to_go(heading: float) -> None:
     moved = vehicle(heading=heading)
-    live(moved, 30.0, m.ClientJoystickMove(0.0, 1.0, speed))
+    live(moved, 30.0, m.ClientJoystickMove(0.0, 1.0, 3e38))
     assert moved.body.blocked
     assert max(abs(moved.body.x), abs(moved.body.y)) <= HALF_SIDE_M - moved.body.radius + 1e-9
     assert not any(box.near(moved.body.x, moved.body.y, moved.body.radius) for box in BOXES)
@@ -140,13 +139,6 @@ def test_simulated_lidar_data_are_entered_into_the_map() -> None:
     assert told.take(m.ClientSimulatedLidarData(ranges)) == ()
     (occupied,) = np.argwhere(drawn(told) == 2)
     assert (occupied + 0.5) * 0.1 - 5.0 == pytest.approx((-2.0, 0.0), abs=0.11)
-
-
-@pytest.mark.parametrize(
-    "ranges", [*([100.0] * count for count in (0, 1, 359, 361)), [math.nan, math.inf, -math.inf, -1.0, 3e38] * 72]
-)
-def test_simulated_lidar_data_of_another_length_or_that_are_no_numbers_are_ignored(ranges: list[float]) -> None:
-    told = vehicle()
-    told.take(m.ClientSimulatedLidarData(np.array(ranges, np.float32)))
-    assert 2 not in told.grid.cells
-    assert len(ranges) == 360 or not told.grid.cells.any()
+    for bad in (ranges[:359], np.append(ranges, 1.0), np.array([math.nan, math.inf, -1.0, 3e38] * 90)):
+        told.take(m.ClientSimulatedLidarData(bad.astype(np.float32)))
+    assert len(np.argwhere(drawn(told) == 2)) == 1, "what is no scan of numbers enters nothing"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import re
 
 import pytest
@@ -130,18 +129,6 @@ def test_mode_and_lidar_are_sent_again_after_three_tenths_of_a_second(version: s
 
 def test_both_sends_translation_and_turn_in_turns_although_every_command_replaces_the_one_before() -> None:
     assert left("1.3", "left_and_turn +0.015625 " * 20, combine="both", gap_s=1 / 64) == "LT" * 10 + "L"
-
-
-def test_a_stop_leaves_at_once_and_keeps_the_gap() -> None:
-    stage = Stage(SETTINGS["1.3"])
-    stage.command(*ACTS["auto"])
-    stage.after(0.1)
-    start = stage.now
-    stage.robot.stop(start, start + 1.0)
-    stage.after(2.0)
-    times = [sent.at for sent in stage.timed.sent if sent.at >= start]
-    assert times[:2] == [start, pytest.approx(start + 0.01)]
-    assert all(later - earlier >= 0.00999 for earlier, later in itertools.pairwise(times))
 
 
 @pytest.mark.parametrize(

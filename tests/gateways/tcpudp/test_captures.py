@@ -19,6 +19,7 @@ SETTINGS = {OLD: Settings(), NEW: SETTINGS_13}
 
 HQ_OLD, HQ_NEW = HqRole(limits(0.01)), HqRole(limits(0.01))
 ROBOT_OLD, ROBOT_NEW = RobotRole(limits(0.0), Settings(), 1, ("1.1",)), RobotRole(limits(0.0), SETTINGS_13, 1)
+FROM_HQ, FROM_ROBOT = payloads(NEW, destination=ROBOT), payloads(NEW, source=ROBOT)
 ANSWER_11 = bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")
 """Ours; the captured HQ announces datagrams and sends none."""
 
@@ -31,17 +32,11 @@ ANSWER_11 = bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")
         (
             HQ_NEW,
             NEW,
-            payloads(NEW, destination=ROBOT)[0].payload,
+            FROM_HQ[0].payload,
             ["tcp 3", "udp 5", "tcp 7"],
             ("1.3", "udp", ("udp", "lidar_sim", "slam_map")),
         ),
-        (
-            ROBOT_NEW,
-            NEW,
-            payloads(NEW, source=ROBOT)[0].payload,
-            ["tcp 2", "tcp 4", "udp 6"],
-            ("1.3", "udp", ("udp", "lidar_sim")),
-        ),
+        (ROBOT_NEW, NEW, FROM_ROBOT[0].payload, ["tcp 2", "tcp 4", "udp 6"], ("1.3", "udp", ("udp", "lidar_sim"))),
     ],
     ids=["hq of a robot of 1.1", "robot of 1.1", "hq of a robot of 1.3", "robot of 1.3"],
 )

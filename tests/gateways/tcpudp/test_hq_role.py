@@ -54,9 +54,7 @@ def probed(*answer: str) -> f.Timed:
         pytest.param(
             f.LISTED, "00000100000001", f.LISTED, "00000000000100", "1.3", "joystick slam_map", id="robot 1.3"
         ),
-        pytest.param(
-            f.LISTED_14, "00000000010001", f.LISTED, "00000000000100", "1.4", "lidar slam_map", id="robot 1.4"
-        ),
+        pytest.param(f.LISTED_14, "00000000010001", f.LISTED, "00000000000100", "1.4", "lidar slam_map", id="1.4"),
         # Odd lists: robots of 1.1 and 1.2 understand nothing but their own list, those of 1.3 and "1.4" the safe one.
         pytest.param(b"1.2,1.1", "000000000001", b"1.2,1.1", "000000000001", "1.2", "lidar_sim", id="1.2 and 1.1"),
         pytest.param(b"1.4", "00000000000001", f.LISTED, "00000000000100", "1.4", "slam_map", id="1.4 alone"),
@@ -105,12 +103,8 @@ def test_a_version_list_that_cannot_be_answered_does_no_harm() -> None:
         (("cam", "slam_map"), f.LISTED_14, f.ALL, "00010000000001"),
         (("cam", "lidar_sim", "slam_map"), b"1.2", f.ALL[:12], "000100000001"),
         (("chat", "lidar_sim", "slam_map"), b"1.1", f.ALL[:10], "0000000100"),
-        (
-            ("udp", "chat"),
-            f.LISTED,
-            f.NO_UDP,
-            "00000001000000",
-        ),  # a robot without datagrams: none of ours
+        # a robot without datagrams: none of ours
+        (("udp", "chat"), f.LISTED, f.NO_UDP, "00000001000000"),
     ],
 )
 def test_the_gateway_announces_what_it_is_told(announce, listed, block, answered) -> None:

@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gateways.tcpudp.maps import TCP_BYTES, UDP_BYTES, Geometry, announceable, most_side, resampled, squared
+from gateways.tcpudp.maps import Geometry, announceable, resampled, squared
 from zbridge.errors import EncodeError
 from zbridge.fleet.messages import Map
 
@@ -164,10 +164,3 @@ def test_cells_of_no_size_are_refused_and_so_is_a_map_that_no_int32_measures(cel
         announceable(grid, UNIT_M, 100)
     with pytest.raises(EncodeError):
         announceable(drawn("1", cell=1e6), 1e-4, 244)
-
-
-def test_the_side_of_the_largest_map_fits_its_packet_and_one_more_does_not() -> None:
-    assert (most_side(TCP_BYTES), most_side(UDP_BYTES)) == (46, 244)
-    header_and_count = 10
-    assert 46 * 46 + header_and_count < 2200 <= 47 * 47 + header_and_count
-    assert 244 * 244 + header_and_count <= 60_000 < 245 * 245 + header_and_count

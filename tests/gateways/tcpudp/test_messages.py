@@ -32,13 +32,6 @@ def test_the_table_has_the_rows_of_the_page_and_packets_of_other_ids_keep_their_
 # Framing
 
 
-def test_a_frame_ends_four_bytes_and_its_length_after_its_start_and_behind_the_data_while_bytes_are_missing() -> None:
-    data = bytes.fromhex("ffff 06000000 02 0c 000040bf 02000000 02 0d")
-    assert (m.frame_end(data, 2), m.frame_end(data, 12)) == (12, 18)
-    assert m.frame_end(bytes.fromhex("03020100 02 0d"), 0) == 0x00010203 + 4
-    assert all(have < m.frame_end(data[:have], 2) <= 12 for have in range(2, 12))
-
-
 @pytest.mark.parametrize("length", ["00000000", "01000000", "ffffffff", "00000080", "020000ff", "ffffff7f", "00000040"])
 def test_a_length_below_two_or_above_the_largest_map_is_refused_without_waiting_for_its_bytes(length: str) -> None:
     with pytest.raises(ProtocolError):

@@ -15,16 +15,14 @@ from gateways.tcpudp.settings import (
 from zbridge.errors import ProtocolError
 
 
-@pytest.mark.parametrize(
-    ("position", "name"), [*enumerate(["udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map"])]
-)
-def test_each_flag_has_its_own_place_and_any_byte_but_zero_sets_it(position: int, name: str) -> None:
-    flags = bytes((number == position) * 0x80 for number in range(7))
-    robot = read_settings("1.1,1.2,1.3", flags + bytes.fromhex("1400000005000000"), ROBOT_BLOCKS)
-    hq = read_settings("1.1,1.2,1.3", flags, HQ_BLOCKS)
-    assert robot.features == hq.features == (Feature(name),)
-    assert isinstance(robot, RobotSettings13)
-    assert (robot.slam_map_size, robot.slam_map_interval) == (20, 5)
+def test_each_flag_has_its_own_place_and_any_byte_but_zero_sets_it() -> None:
+    for position, name in enumerate(("udp", "cam", "joystick", "chat", "lidar", "lidar_sim", "slam_map")):
+        flags = bytes((number == position) * 0x80 for number in range(7))
+        robot = read_settings("1.1,1.2,1.3", flags + bytes.fromhex("1400000005000000"), ROBOT_BLOCKS)
+        hq = read_settings("1.1,1.2,1.3", flags, HQ_BLOCKS)
+        assert robot.features == hq.features == (Feature(name),)
+        assert isinstance(robot, RobotSettings13)
+        assert (robot.slam_map_size, robot.slam_map_interval) == (20, 5)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +49,6 @@ def test_a_block_follows_the_newest_version_listed_and_its_tail_is_ignored(versi
             read_settings(versions, bytes(short), blocks)
 
 
-@pytest.mark.parametrize("versions", ["", "0.9", "x", "1.,1.1.", "-1.3"])
-def test_versions_nobody_knows_have_no_features(versions: str) -> None:
-    assert read_settings(versions, b"\x01" * 20, ROBOT_BLOCKS).features == ()
+def test_versions_nobody_knows_have_no_features() -> None:
+    for versions in ("", "0.9", "x", "1.,1.1.", "-1.3"):
+        assert read_settings(versions, b"\x01" * 20, ROBOT_BLOCKS).features == ()

@@ -175,17 +175,12 @@ def test_a_scan_becomes_360_ranges_a_degree_apart(ranges, begin, step, expected)
     assert {degree: values[degree] for degree in expected} == expected
 
 
-@pytest.mark.parametrize("invalid", [math.nan, math.inf, -math.inf, -1.0, 0.0, 0.05, 8.5])
-def test_points_that_are_invalid_or_out_of_range_are_zero(invalid: float) -> None:
-    assert polar([2.0] * 10 + [invalid] + [2.0] * 349)[9:12] == [200.0, 0.0, 200.0]
-
-
-@pytest.mark.parametrize(
-    ("begin", "step"),
-    [(0.4, 1.0), (-0.4, -1.0), (90 - 1e-7, -1.0), (0.2, 0.5), (-180.0, 1.0), (359.6, 1.0), (1.0, 2.0)],
-)
-def test_a_full_circle_has_no_hole_wherever_it_begins(begin: float, step: float) -> None:
-    assert set(polar([2.0] * round(360 / abs(step)), begin, step)) == {200.0}
+def test_points_that_are_invalid_or_out_of_range_are_zero_and_a_full_circle_has_no_hole_wherever_it_begins() -> None:
+    for invalid in (math.nan, math.inf, -math.inf, -1.0, 0.0, 0.05, 8.5):
+        assert polar([2.0] * 10 + [invalid] + [2.0] * 349)[9:12] == [200.0, 0.0, 200.0]
+    full = [(0.4, 1.0), (-0.4, -1.0), (90 - 1e-7, -1.0), (0.2, 0.5), (-180.0, 1.0), (359.6, 1.0), (1.0, 2.0)]
+    for begin, step in full:
+        assert set(polar([2.0] * round(360 / abs(step)), begin, step)) == {200.0}
 
 
 def test_a_scan_without_points_increment_or_limits_and_lengths_the_packet_cannot_carry_are_zero() -> None:

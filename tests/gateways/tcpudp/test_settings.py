@@ -32,8 +32,6 @@ def test_each_flag_has_its_own_place_and_any_byte_but_zero_sets_it() -> None:
         ("1.2", HQ_BLOCKS, Settings12, "000100010001"),
         ("1.1,1.2,1.3", HQ_BLOCKS, Settings13, "00010001000101"),
         ("1.3,1.1", HQ_BLOCKS, Settings13, "00010001000101"),
-        ("1.1", ROBOT_BLOCKS, Settings, "0001000100"),
-        ("1.2", ROBOT_BLOCKS, Settings12, "000100010001"),
         ("1.3", ROBOT_BLOCKS, RobotSettings13, "010000010000010008000001000000"),
         ("1.1,1.2,1.3,1.4", ROBOT_BLOCKS, RobotSettings13, "010000010000010008000001000000"),
     ],

@@ -49,8 +49,9 @@ LETTERS = {
     "I": "06000000 02 32 01000000",
     "O": "06000000 02 32 02000000",
     "H": "08000000 02 01 02000000 6869",
+    "7": "03000000 02 07 00",
 }
-"""Mode none, manual, autonomous; stop; left, right; turn; lidar in, out of use; "hi"."""
+"""Mode none, manual, autonomous; stop; left, right; turn; lidar on, off; "hi"; the 7 after a 4."""
 
 
 def left(version: str, script: str, **options: object) -> str:
@@ -62,6 +63,8 @@ def left(version: str, script: str, **options: object) -> str:
             letters += "".join(names[frame] for frame in stage.after(float(word)))
         elif word in ("stop", "once"):  # a routine stop is sent once
             stage.robot.stop(stage.now, stage.now + (word == "stop"))
+        elif word == "start":
+            stage.timed.stream(START, stage.now)
         elif word == "reconnect":
             stage.connect(SETTINGS[version])
         else:
@@ -78,6 +81,8 @@ ROWS = {
     "a stop goes before what waits and ends motion": (ALL, "left hi stop +3", "SHS{9,10}"),
     "a stop leaves before newer motion": (ALL, "left +0.001 stop +0.001 neutral +0.001 right +0.02", "LSR"),
     "a routine stop is sent exactly once and ends motion": (ALL, "left +0.1 once +3 once +3", "LSS"),
+    "a late 4 is followed by silence": (("1.3",), "start +0.1 stop +2.39", "7"),
+    "a stop in that silence is kept": (("1.3",), "start +0.1 stop +4", "7S+"),
     # mode 3: every stop is the pair, until another mode is commanded
     "never in mode 3, never a 1": (ALL, "stop +2 neutral +2 manual +2 stop +2 left +2 stop +2", "[SML]*"),
     "the 1 of a stop is no other mode": (ALL, "auto +1 stop +3 stop +0.35 stop +3", "A+ pairs (NS){4} pairs"),
@@ -243,15 +248,3 @@ async def test_after_a_reconnection_in_mode_3_the_pair_comes_first_after_the_sil
         await asyncio.sleep(2.0)
         assert [frame[5] for frame in rig.link.written[:2]] == [3, 7]
         assert pairs(rig.link.written[2:]) >= 4
-
-
-def test_a_stop_in_a_silence_that_comes_late_is_kept_too() -> None:
-    stage = Stage(SETTINGS["1.3"])
-    start = stage.now
-    stage.timed.stream(START, start)
-    assert stage.session.busy == "handshaking"
-    stage.after(0.1)
-    stage.robot.stop(stage.now, stage.now + 1.0)
-    stage.after(4.0)
-    late, first = [(sent.at >= start + 2.5, sent.frame[5]) for sent in stage.timed.sent][1:3]
-    assert (late, first) == ((False, 7), (True, 13))

@@ -99,8 +99,8 @@ class Scene:
             while not condition():  # noqa: ASYNC110
                 await asyncio.sleep(0.002)
 
-    async def counted(self, name: str, total: int) -> None:
-        await self.until(lambda: self.metrics.total(name) == total)
+    async def rivals(self, count: int) -> None:
+        await self.until(lambda: self.metrics.total("hq_rival_sources") == count)
 
     async def taken_in(self) -> None:
         """Let all that was sent be read: a datagram of nobody's that is sent now is counted after it."""
@@ -277,7 +277,7 @@ async def test_of_two_clients_of_one_host_a_packet_from_the_port_binds_the_one_w
 async def test_a_5_that_two_waiting_clients_could_have_sent_is_neithers(scene: Scene) -> None:
     first, second = await Program(scene, "1.1", 0).greet(), await Program(scene, "1.1", 0).greet()
     first.send_udp(5, sender=0)
-    await scene.counted("hq_rival_sources", 2)
+    await scene.rivals(2)
     second.send_udp(5)
     await scene.taken_in()
     for client in (first, second):
@@ -320,7 +320,7 @@ async def test_an_attacker_whose_5_was_answered_instead_of_the_lost_one_moves_no
     await client.report(heard=False)
     if version == "1.3":
         client.send_udp(11, AHEAD)
-        await scene.counted("hq_rival_sources", 1)
+        await scene.rivals(1)
     await client.take_stick()
     await scene.attack(attacker, client.number)
     if version == "1.3":

@@ -107,15 +107,12 @@ def test_a_robot_that_sent_telemetry_before_and_sends_none_now_is_named_on_every
     assert doubts(stage.timed, stage.now + 1.1) == (LATER,), "it talks after all"
 
 
-def test_answers_and_texts_are_no_telemetry_of_its_own() -> None:
+def test_answers_and_texts_are_no_telemetry_of_its_own_and_who_only_ever_answered_or_is_silent_later_is_fine() -> None:
     stage = talked()
     stage.told(TEXT, TEXT)
     stage.robot.ask(topics.POSE)
     stage.told(f.POSITION)
     assert doubts(stage.timed, stage.now + 5.0) == (LATER, MUTE)
-
-
-def test_a_robot_that_only_ever_answered_or_falls_silent_later_is_not_named() -> None:
     assert doubts(talked(asked=True).timed, 100.0) == (LATER,)
     stage = talked()
     stage.told(f.POSITION)

@@ -36,11 +36,7 @@ GOLDEN: list[tuple[Any, int, str]] = [
     (m.DebugMessage(""), 1, "06000000 01 01 00000000"),
     # 2 serverSettings: 1.1, 1.2, 1.3
     (server_settings(2, "1.1", True, False, True, False, True), 1, "0f000000 01 02 02 03000000 312e31 0100010001"),
-    (
-        server_settings(3, "1.2", False, True, False, True, False, True),
-        1,
-        "10000000 01 02 03 03000000 312e32 000100010001",
-    ),
+    (server_settings(3, "1.2", *[False, True] * 3), 1, "10000000 01 02 03 03000000 312e32 000100010001"),
     (
         server_settings(255, "1.1,1.2,1.3", True, True, False, False, True, False, True, 1000, 25),
         1,

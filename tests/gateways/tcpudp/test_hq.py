@@ -180,9 +180,7 @@ ALL = "01010101010101"
         ({"skip_map_flag": True, "versions": ("1.2",)}, SEEN, b"1.2", "010001000001"),
     ],
 )
-def test_a_client_is_greeted_with_its_id_the_versions_verbatim_and_the_settings_of_the_newest(
-    options: dict[str, Any], view: RobotView | None, listed: bytes, block: str
-) -> None:
+def test_a_client_is_greeted_with_the_versions_verbatim_and_the_newest_settings(options, view, listed, block) -> None:
     assert greeting(side(view, **options), 255) == f.server_settings(listed, block, 255)
 
 

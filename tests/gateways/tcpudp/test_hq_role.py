@@ -61,9 +61,8 @@ def probed(*answer: str) -> f.Timed:
         pytest.param(b" 1.1 ,, 1.1", "0000000001", b" 1.1 ,, 1.1", "0000000000", "1.1", "lidar", id="spaces"),
     ],
 )
-def test_a_robot_is_answered_with_what_it_understands_and_with_udp_unless_either_switches_it_off(
-    listed: bytes, block: str, answer: bytes, answered: str, version: str, features: str
-) -> None:
+def test_a_robot_is_answered_with_what_it_understands(listed, block, answer, answered, version, features) -> None:
+    """With UDP unless either side switches it off."""
     without = f.framed(5, 3, f.counted(answer) + bytes.fromhex(answered))
     neither, ours_off = hq(listed, block), hq(listed, "01" + block[2:], udp=False)
     for timed, announced in ((neither, features.split()), (ours_off, ["udp", *features.split()])):
@@ -121,9 +120,7 @@ def test_the_gateway_announces_what_it_is_told(announce, listed, block, answered
     "early",
     [f.POSITION, f.START, f.ANSWER_FALSE, f.server_settings(b"1.1", "00000000"), f.server_settings(block="00" * 14)],
 )
-def test_what_comes_before_the_settings_or_is_none_is_malformed_and_settings_that_come_again_change_nothing(
-    early: bytes,
-) -> None:
+def test_what_comes_before_the_settings_is_malformed_and_settings_come_once(early: bytes) -> None:
     timed = f.Timed(HqRole(limits(0.01), udp=False))
     assert timed.stream(early, 0.05) == []
     assert (timed.session.traffic.malformed, timed.session.state, timed.sent) == (1, State.HANDSHAKING, [])
@@ -154,9 +151,7 @@ def test_what_comes_before_the_settings_or_is_none_is_malformed_and_settings_tha
         pytest.param("0.1 t4 0.3 u6+", "0.1 t3 0.1 u5 0.3 t7+", 2.6, "udp", id="a 4 with the settings"),
     ],
 )
-def test_an_hq_probes_once_when_asked_reports_once_and_says_nothing_else_for_two_and_a_half_seconds(
-    heard: str, said: str, established_at: float, transport: str
-) -> None:
+def test_an_hq_probes_and_reports_once_and_is_silent_for_2_5_s(heard: str, said, established_at, transport) -> None:
     timed = hq().hear(heard)
     timed.until(established_at - 0.01)
     assert timed.session.state is State.HANDSHAKING

@@ -175,8 +175,8 @@ def test_a_robot_without_udp_and_an_hq_without_it_are_established_at_once(announ
         pytest.param("0.2 u5 0.3 t7+ 0.5 t7-", " 0.2 u6+", "udp", 1, id="a report that was not due"),
     ],
 )
-def test_a_robot_answers_the_datagram_once_and_believes_the_report_if_it_came(
-    heard: str, answered: str, transport: str, malformed: int
+def test_a_robot_answers_the_datagram_once_and_believes_a_report(
+    heard: str, answered: str, transport, malformed
 ) -> None:
     timed = waiting()
     timed.until(float((heard or "2.1")[:3]))

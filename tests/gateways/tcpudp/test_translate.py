@@ -51,9 +51,7 @@ FULL_SCALE = {"speed_full": 3.0, "turn_full": 0.5}
         ({}, {}, (), None),
     ],
 )
-def test_a_drive_becomes_a_move_or_a_rotation_and_what_is_left_out_is_reported(
-    options: dict[str, object], command: dict[str, float], motion: tuple[float, ...], left_out: str | None
-) -> None:
+def test_a_drive_becomes_a_move_or_a_rotation_and_the_rest_is_reported(options, command, motion, left_out) -> None:
     robot = stage(**options)
     reported = robot.command(topics.CMD_DRIVE, Drive(**command))  # type: ignore[arg-type]
     assert reported is None if left_out is None else str(reported).startswith(left_out)

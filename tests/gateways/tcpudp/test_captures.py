@@ -2,7 +2,6 @@
 
 import pytest
 
-from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqRole, RobotRole, limits
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from tests.captures import payloads
@@ -15,81 +14,45 @@ OLD, NEW = "tcpudp-1.1-tcp.hex", "tcpudp-1.3-udp.hex"
 MESSAGES = {OLD: TCP_SESSION_MESSAGES, NEW: UDP_SESSION_MESSAGES}
 ROBOT = 11001
 SETTINGS_13 = RobotSettings13(udp=True, lidar_sim=True, slam_map=True, slam_map_size=2048, slam_map_interval=1)
+SETTINGS = {OLD: Settings(), NEW: SETTINGS_13}
+
+
+HQ_OLD, HQ_NEW = HqRole(limits(0.01)), HqRole(limits(0.01))
+ROBOT_OLD, ROBOT_NEW = RobotRole(limits(0.0), Settings(), 1, ("1.1",)), RobotRole(limits(0.0), SETTINGS_13, 1)
+FROM_HQ, FROM_ROBOT = payloads(NEW, destination=ROBOT), payloads(NEW, source=ROBOT)
 ANSWER_11 = bytes.fromhex("0e000000 01 03 03000000 312e31 0000000000")
-"""What the gateway answers a robot of 1.1; the captured HQ announces datagrams and sends none."""
-
-
-def recorded(name: str, index: int, *, from_robot: bool) -> bytes:
-    """The payload of one record of a side."""
-    return (payloads(name, source=ROBOT) if from_robot else payloads(name, destination=ROBOT))[index].payload
+"""Ours; the captured HQ announces datagrams and sends none."""
 
 
 @pytest.mark.parametrize(
-    ("session", "name", "by_tcp", "by_udp", "outcome", "times"),
+    ("session", "name", "first", "said", "outcome"),
     [
-        pytest.param(
-            HqRole(limits(0.01)),
-            OLD,
-            [ANSWER_11],
-            [],
-            ("1.1", "tcp", ()),
-            [6.4158, 6.7163, 7.0166],
-            id="hq of a robot of 1.1",
-        ),
-        pytest.param(
-            RobotRole(limits(0.0), Settings(), 1, ("1.1",)),
-            OLD,
-            [recorded(OLD, 0, from_robot=True)],
-            [],
-            ("1.1", "tcp", ("udp",)),
-            [4.1193, 4.4285, 4.7242, 5.0322, 5.3240, 5.6314, 5.9225],
-            id="robot of 1.1",
-        ),
-        pytest.param(
-            HqRole(limits(0.01)),
+        (HQ_OLD, OLD, ANSWER_11, ["tcp 3"], ("1.1", "tcp", ())),
+        (ROBOT_OLD, OLD, payloads(OLD, source=ROBOT)[0].payload, ["tcp 2"], ("1.1", "tcp", ("udp",))),
+        (
+            HQ_NEW,
             NEW,
-            [recorded(NEW, 0, from_robot=False), bytes.fromhex("03000000 01 07 01")],
-            [bytes.fromhex("02000000 01 05")],
+            FROM_HQ[0].payload,
+            ["tcp 3", "udp 5", "tcp 7"],
             ("1.3", "udp", ("udp", "lidar_sim", "slam_map")),
-            [5.6253, 5.9346, 6.1171, 6.4174, 6.7181, 7.0182],
-            id="hq of a robot of 1.3",
         ),
-        pytest.param(
-            RobotRole(limits(0.0), SETTINGS_13, 1),
-            NEW,
-            [recorded(NEW, 0, from_robot=True), bytes.fromhex("02000000 01 04")],
-            [bytes.fromhex("03000000 01 06 01")],
-            ("1.3", "udp", ("udp", "lidar_sim")),
-            [4.1288, 4.4204, 4.7293, 5.0221, 5.3328, 5.6252, 5.9344, 6.1298],
-            id="robot of 1.3",
-        ),
+        (ROBOT_NEW, NEW, FROM_ROBOT[0].payload, ["tcp 2", "tcp 4", "udp 6"], ("1.3", "udp", ("udp", "lidar_sim"))),
     ],
+    ids=["hq of a robot of 1.1", "robot of 1.1", "hq of a robot of 1.3", "robot of 1.3"],
 )
-def test_the_gateway_in_either_role_understands_the_recorded_peer(
-    session: HqRole | RobotRole,
-    name: str,
-    by_tcp: list[bytes],
-    by_udp: list[bytes],
-    outcome: tuple[str, str, tuple[str, ...]],
-    times: list[float],
-) -> None:
-    from_robot = isinstance(session, HqRole)
+def test_the_gateway_in_either_role_understands_the_recorded_peer(session, name, first, said, outcome) -> None:
     timed = Timed(session)
-    delivered: list[tuple[float, Packet]] = []
-    expected = []
-    for record, message in zip(payloads(name), MESSAGES[name], strict=True):
-        if from_robot != (record.source == ROBOT):
+    messages = iter(MESSAGES[name])
+    for record in payloads(name):
+        expected = [] if record.payload[5] in range(2, 8) else [plain(next(messages))]  # the handshake
+        if isinstance(session, HqRole) != (record.source == ROBOT):
             continue
         if record.transport == "UDP" and record.payload[5] == 5:
             assert session.claims(record.payload, record.source)
         receive = timed.stream if record.transport == "TCP" else timed.datagram
-        delivered += [(record.seconds, message) for message in receive(record.payload, record.seconds)]
-        if record.payload[5] not in range(2, 8):  # the handshake
-            expected.append(plain(message))
-    assert [plain(message) for _, message in delivered] == expected
-    assert [at for at, _ in delivered] == times
-    assert timed.frames("tcp") == by_tcp
-    assert timed.frames("udp") == by_udp
-    assert session.state is State.ESTABLISHED
+        assert [plain(message) for message in receive(record.payload, record.seconds)] == expected
+    assert timed.sent[0].frame == first
+    assert [f"{sent.by} {sent.frame[5]}" for sent in timed.sent] == said
     assert (session.version, session.transport, session.features) == outcome
-    assert session.traffic.malformed == 0
+    assert (session.state, session.traffic.malformed) == (State.ESTABLISHED, 0)
+    assert session.settings == SETTINGS[name]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +27,3 @@ def rendered(table: Mapping[Any, Mapping[Any, tuple[Any, Any]]]) -> str:
 @pytest.mark.parametrize("module", [hq_handshake, robot_role])
 def test_the_page_shows_the_table_that_is_executed(module: Any) -> None:
     assert rendered(module.TABLE) in PAGE, rendered(module.TABLE)
-
-
-@pytest.mark.parametrize("module", [hq_handshake, robot_role])
-def test_every_step_has_a_row_and_can_be_reached(module: Any) -> None:
-    first: Enum = next(iter(module.TABLE))
-    reached = {first} | {following for row in module.TABLE.values() for _, following in row.values()}
-    assert set(module.TABLE) == set(module.Step) == reached
-    assert set(module.Event) == {event for row in module.TABLE.values() for event in row}

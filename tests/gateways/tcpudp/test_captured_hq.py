@@ -1,4 +1,4 @@
-"""The HQ programs of both captures before a listener: they are greeted, understood and shown what their robot showed."""
+"""The HQ programs of both captures at a listener: they are greeted, understood and shown what their robot showed."""
 
 import math
 

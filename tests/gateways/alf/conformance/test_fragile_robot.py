@@ -368,8 +368,8 @@ async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.Log
         await until(lambda: len(caplog.records) == 1, "one violation")
         await hq.play(["cancel", "kind 255"])
         await eye.kind("255")
-    eye.close_all()
-    hq.close_all()
+    await eye.aclose()
+    await hq.aclose()
     assert caplog.records[0].getMessage().startswith("violation, laser: id 3, of which")
 
 

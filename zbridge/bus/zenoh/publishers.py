@@ -59,7 +59,7 @@ class Publishers:
 
     def put_all(self, batch: Batch) -> bool:
         """Publish stream messages, those of a key in order; False asks to pause the source."""
-        return self._streams.put(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
+        return self._streams.put_at_once(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
 
 
 class PlainPublisher(Declared):

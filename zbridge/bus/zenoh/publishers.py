@@ -16,7 +16,7 @@ import zenoh.ext
 
 from zbridge.bus.interface import Batch, Publisher
 from zbridge.bus.writer import Writer
-from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
 
@@ -143,7 +143,7 @@ class _StatePublisher(Declared):
             publisher_detection=True,
             **options,
         )
-        super().__init__(session.declare_queryable(key, self._reply), self._publisher)
+        super().__init__(session.declare_queryable(key, threadless(self._reply)), self._publisher)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last = payload

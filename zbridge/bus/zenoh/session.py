@@ -16,7 +16,7 @@ import zenoh.ext
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort, Tls
 from zbridge.bus.writer import Writer
-from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
     ZenohQuery,
@@ -253,7 +253,7 @@ class ZenohBus:
         def changed(status: zenoh.MatchingStatus) -> None:
             loop.call_soon_threadsafe(listened, status.matching)
 
-        self._keep(Declared(plain.declare_matching_listener(changed)))
+        self._keep(Declared(plain.declare_matching_listener(threadless(changed))))
         return self._keep(PlainPublisher(key, plain, None))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
@@ -267,7 +267,7 @@ class ZenohBus:
         def changed(_: zenoh.TransportEvent) -> None:
             loop.call_soon_threadsafe(lambda: handler(bool(info.transports())))
 
-        return self._keep(Declared(info.declare_transport_events_listener(changed, history=True)))
+        return self._keep(Declared(info.declare_transport_events_listener(threadless(changed), history=True)))
 
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""

@@ -6,12 +6,15 @@ Source: "Packets" (map bytes) and "The gateway as robot" of the protocol page.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 
 from zbridge.fleet.messages import Cells, Map
 from zbridge.protocol import EncodeError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 TCP_BYTES = 2199
 """Bytes of the longest packet that HQ programs read by TCP: they lose packets of 2.2 kB and more."""
@@ -109,6 +112,8 @@ def resampled(grid: Map, side: int, cell_m: float, begin: tuple[float, float] = 
     free if any is, else unknown; cells outside the map are unknown. A cell across a border counts where it ends.
     Raises EncodeError as :func:`check`.
     """
+    import numpy as np
+
     cells: Cells = np.zeros((side, side), np.uint8)
     if grid.cells.size:
         check(grid)
@@ -139,6 +144,8 @@ def _starts(
     count: cells of the map. side: cells of the grid, each ``ratio`` map cells wide. begin: start of the grid, in map
     cells.
     """
+    import numpy as np
+
     edges = np.round(begin + np.arange(side + 1) * ratio, 6)
     starts = np.floor(edges[:-1]).astype(np.intp)
     inside = (edges[1:] > 0) & (starts < count)

@@ -12,12 +12,10 @@ from functools import partial
 from typing import Annotated, ClassVar, TypeVar
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from zbridge.protocol import Codec, ProtocolError
-from zbridge.wire import F64, U8, BinaryCodec, Message
-from zbridge.wire.fields import CountedBytes, Filling
+from zbridge.wire import F64, U8, BinaryCodec, F64Fill, Message
+from zbridge.wire.fields import CountedBytes
 from zbridge.wire.frames import FrameEnd
 
 FROM_CONTROLLER = range(128)
@@ -51,7 +49,6 @@ class Wc2EcMessage(Message, frozen=True):
 
 W = TypeVar("W", bound=Wc2EcMessage)
 Name = Annotated[bytes, CountedBytes("B")]
-F64Fill = Annotated[npt.NDArray[np.float64], Filling("<f8")]
 
 
 class Spec(msgspec.Struct, frozen=True, eq=False):

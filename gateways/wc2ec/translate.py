@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from gateways.wc2ec.devices import (
     LIGHT,
@@ -57,6 +56,14 @@ NAME = "wc2ec"
 STOP_REPEAT_S = 0.1
 
 
+def _interpolation(table: tuple[tuple[float, float], ...]) -> Callable[[float], float]:
+    """Give the function that a table of pairs means: linear between them, constant beyond."""
+    import numpy as np
+
+    measured, meant = np.array(table).T
+    return lambda value: float(np.interp(value, measured, meant))
+
+
 class Wc2EcRobot(Robot):
     """One Webots robot, seen from its external controller."""
 
@@ -71,7 +78,7 @@ class Wc2EcRobot(Robot):
         self._table = Table()
         self._listened: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
-        self._tables = {name: np.array(table).T for name, table in options.tables.items()}
+        self._tables = {name: _interpolation(table) for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
         self._unregistered = metrics.count("sensor_unregistered")
         self._motor_types = {ROTATIONAL: options.motor_types.rotational, LINEAR: options.motor_types.linear}
@@ -154,7 +161,7 @@ class Wc2EcRobot(Robot):
         self._faults.value += fault
         table = self._tables.get(name)
         if table is not None and not fault:
-            value = float(np.interp(value, table[0], table[1]))
+            value = table(value)
         reading = Reading(value, device.kind, device.number, fault, stamp_ns=stamp_ns)
         if self._ring is None:
             return ((topics.SENSOR(device.name), reading),)
@@ -256,6 +263,8 @@ class Wc2EcRobot(Robot):
         if setting.values is not None:
             if len(setting.values) != self.options.values:
                 raise Malformed(f"{len(setting.values)} values: expected {self.options.values}")
+            import numpy as np
+
             messages.append(SetSensor(*header, np.array(setting.values)))
         if not messages:
             raise Malformed("a setting without any field")

@@ -3,13 +3,15 @@
 Theory of operation. :meth:`Writer.put` queues a call, in order and bounded by :data:`BACKLOG`; :meth:`Writer.replace`
 keeps one call for each key, the newest. The thread makes all calls by key, then one queued call, and begins anew. Where
 calls come faster than the thread makes them, a lossy writer drops the oldest and counts it; a ``lossless`` writer keeps
-all, and tells its callers to pause until half of the backlog is free.
+all, and tells its callers to pause until half of the backlog is free. Waking a thread costs a message that comes alone
+more than the call itself: :meth:`Writer.put_at_once` makes a small call on the caller's thread while the bus takes all.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -20,6 +22,13 @@ log = logging.getLogger("zbridge.bus")
 
 BACKLOG = 4096
 """Bound of what waits: a message counts one, a state one more for every 256 bytes."""
+
+AT_ONCE = 4
+"""Most messages of a call that is made on the caller's thread."""
+SLOW_S = 0.002
+"""A call that takes longer met a bus that is full."""
+WARY_S = 1.0
+"""Seconds after a slow call for which none is made on the caller's thread."""
 
 Call = Callable[[], object]
 
@@ -40,6 +49,7 @@ class Writer:
         self._full = False
         self._stopping = False
         self._ended = False
+        self._wary_until = 0.0
         self._lock = threading.Lock()
         self._bell: SimpleQueue[None] = SimpleQueue()
         self._rung = False
@@ -62,6 +72,21 @@ class Writer:
                 self._forget_oldest()
             self._ring()
             return not self._full
+
+    def put_at_once(self, call: Call, size: int) -> bool:
+        """Make a lossy call now if it is small, nothing waits and the bus is not full; else queue it as :meth:`put`.
+
+        To be called on one thread only. The call blocks at most as long as Zenoh waits for room, and then not again for
+        :data:`WARY_S`.
+        """
+        if self._lossless or self._backlog or size > AT_ONCE or self._stopping or time.monotonic() < self._wary_until:
+            return self.put(call, size)
+        begun = time.monotonic()
+        self._carry_out(call, size)
+        ended = time.monotonic()
+        if ended - begun > SLOW_S:
+            self._wary_until = ended + WARY_S
+        return True
 
     def replace(self, key: str, call: Call, size: int = 1) -> bool:
         """Queue a call in place of an older one of the same key; a lossless writer makes every call."""

@@ -6,11 +6,9 @@ Speeds and drive commands are fractions of full scale, -1 to 1.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 Fraction = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
@@ -20,8 +18,14 @@ Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
 Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 TOLD = 16
 """Most different refusals in one report of a listener."""
-Floats = npt.NDArray[np.float32]
-Cells = npt.NDArray[np.uint8]
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    Floats = npt.NDArray[np.float32]
+    Cells = npt.NDArray[np.uint8]
+else:  # on the wire; numpy is loaded when the first array comes
+    Floats = Cells = bytes
 
 
 class FleetMessage(msgspec.Struct, frozen=True, gc=False, kw_only=True):

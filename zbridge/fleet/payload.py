@@ -11,10 +11,9 @@ from typing import Any, TypeVar
 
 import msgpack
 import msgspec
-import numpy as np
 
 from zbridge.errors import PayloadError
-from zbridge.fleet.messages import FleetMessage, Floats, Map
+from zbridge.fleet.messages import FleetMessage, Map, Scan
 
 F = TypeVar("F", bound=FleetMessage)
 
@@ -28,9 +27,11 @@ def schema(message: type[FleetMessage]) -> str:
 
 def _array_bytes(value: Any) -> memoryview:
     """Return the bytes of an array: uint8 unchanged, any other dtype as little-endian float32."""
+    import numpy as np
+
     if not isinstance(value, np.ndarray):
         raise TypeError(f"{type(value).__name__} has no place in a payload")
-    if value.dtype == _F4 and value.ndim == 1 and value.flags.c_contiguous:
+    if value.dtype == "<f4" and value.ndim == 1 and value.flags.c_contiguous:
         return value.data
     dtype = "|u1" if value.dtype == np.uint8 else "<f4"
     return np.ascontiguousarray(value, dtype).reshape(-1).view(np.uint8).data
@@ -49,7 +50,9 @@ def decode(message: type[F], payload: bytes) -> F:
     try:
         decoded: F = _decoder(message).decode(payload or _EMPTY)
         if isinstance(decoded, Map):
-            decoded = _shaped(decoded)
+            decoded = _with_cells(decoded)
+        elif isinstance(decoded, Scan):
+            decoded = _with_ranges(decoded)
     except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
         raise PayloadError(f"{message.__name__}: {error}") from error
     return decoded
@@ -74,26 +77,26 @@ def unpack(payload: bytes) -> dict[str, Any]:
     return values
 
 
-_F4 = np.dtype("<f4")
 _EMPTY = b"\x80"
 
 
 @cache
 def _decoder(message: type[FleetMessage]) -> msgspec.msgpack.Decoder[Any]:
-    return msgspec.msgpack.Decoder(message, dec_hook=_array)
+    return msgspec.msgpack.Decoder(message)
 
 
-def _array(kind: Any, value: Any) -> Any:
-    """Read an array of the declared type."""
-    dtype = np.dtype("<f4") if kind == Floats else np.dtype("|u1")
-    if not isinstance(value, bytes) or len(value) % dtype.itemsize:
-        raise ValueError(f"bin of {dtype.name} was expected")
-    return np.frombuffer(value, dtype)
+def _with_ranges(scan: Scan) -> Any:
+    """Read the bytes of the ranges as an array; raise ValueError where the last one is incomplete."""
+    import numpy as np
+
+    return msgspec.structs.replace(scan, ranges=np.frombuffer(scan.ranges, "<f4"))
 
 
-def _shaped(message: Map) -> Any:
-    """Shape the cells to rows x columns; raise ValueError where their number differs."""
-    rows, columns, cells = message.rows, message.columns, message.cells
+def _with_cells(grid: Map) -> Any:
+    """Read the bytes of the cells as rows x columns; raise ValueError where their number differs."""
+    import numpy as np
+
+    rows, columns, cells = grid.rows, grid.columns, np.frombuffer(grid.cells, np.uint8)
     if rows < 0 or columns < 0 or rows * columns != cells.size:
         raise ValueError(f"{cells.size} cells do not fill {rows} rows x {columns} columns")
-    return msgspec.structs.replace(message, cells=cells.reshape(rows, columns))
+    return msgspec.structs.replace(grid, cells=cells.reshape(rows, columns))

@@ -268,3 +268,21 @@ def split_key(key: str) -> tuple[str, str, str] | None:
     realm, _, rest = key.partition("/")
     robot, _, path = rest.partition("/")
     return (realm, robot, path) if path else None
+
+
+def gateways_of(key_expr: str) -> str:
+    """Write the key expression of the liveliness tokens of the gateways whose keys an expression may match."""
+    realm, robot, *_ = (*key_expr.split("/"), "**")
+    if "**" in (realm, robot):
+        realm, robot = "*" if realm == "**" else realm, "*"
+    return f"{realm}/{robot}/@alive/gateway"
+
+
+def of_robot(key_expr: str, realm: str, robot: str) -> str:
+    """Narrow a key expression to the keys of one robot, where ``**`` does not stand for a part of realm or robot."""
+    chunks = key_expr.split("/")
+    if chunks[1:] == ["**"] and chunks[0] != "**":
+        return f"{realm}/{robot}/**"
+    if "**" in chunks[:2]:
+        return key_expr
+    return "/".join((realm, robot, *chunks[2:]))

@@ -8,9 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-
-import numpy as np
-import numpy.typing as npt
+from typing import TYPE_CHECKING
 
 from zbridge.fleet.messages import Scan, Scanner
 
@@ -19,7 +17,11 @@ MOST_POINTS = 100_000
 _MOST_RAD = 1e6
 """A geometry with angles beyond this is absurd, and covers no sector."""
 
-_Indices = npt.NDArray[np.intp]
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    _Indices = npt.NDArray[np.intp]
 
 
 class BearingScan:
@@ -30,6 +32,8 @@ class BearingScan:
     """
 
     def __init__(self, bearings_deg: Mapping[str, float], range_m: tuple[float, float]) -> None:
+        import numpy as np
+
         bearings = sorted(bearings_deg.values())
         steps = {round(high - low, 6) for low, high in pairwise(bearings)}
         step_deg = steps.pop() if len(steps) == 1 and min(steps) > 0 else 1.0
@@ -52,7 +56,7 @@ class BearingScan:
         if place is None:
             return None
         low, high = self._range_m
-        self._ranges_m[place] = range_m if low <= range_m <= high else np.nan
+        self._ranges_m[place] = range_m if low <= range_m <= high else math.nan
         self._fresh.add(name)
         if len(self._fresh) < len(self._places):
             return None
@@ -84,6 +88,8 @@ class Sectors:
         The sectors of the last scan are kept: asking again for the same object costs nothing.
         """
         if self._scan is not scan:
+            import numpy as np
+
             measured = np.where(scan.ranges >= 0, scan.ranges, np.float32(np.nan))
             self._nearest_m = {
                 sector: float(np.nanmin(measured[points], initial=scan.range_max))
@@ -99,6 +105,8 @@ class Sectors:
         if not abs(scan.angle_min) + abs(scan.angle_increment) * count < _MOST_RAD:
             return {}
         if self._geometry != geometry:
+            import numpy as np
+
             angles = scan.angle_min + scan.angle_increment * np.arange(count)
             width = 2 * math.pi / self._count
             sectors = np.floor_divide(angles + width / 2, width).astype(np.int64) % self._count

@@ -9,8 +9,6 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.wire.fields import (
     CountedArray,
@@ -185,33 +183,46 @@ def _counted_text(wire: CountedText) -> tuple[Decode, Encode]:
 
 
 def _counted_array(wire: CountedArray) -> tuple[Decode, Encode]:
-    dtype = np.dtype(wire.dtype)
-    span, count = _counted(wire.count_code, dtype.itemsize)
+    dtype, item_size = wire.dtype, _item_size(wire.dtype)
+    span, count = _counted(wire.count_code, item_size)
 
     def decode(data: bytes, position: int) -> tuple[Any, int]:
+        import numpy as np
+
         first, end = span(data, position)
-        return np.frombuffer(data, dtype, (end - first) // dtype.itemsize, first), end
+        return np.frombuffer(data, dtype, (end - first) // item_size, first), end
 
     def encode(value: Any) -> bytes:
+        import numpy as np
+
         return count.pack(len(value)) + np.ascontiguousarray(value, dtype).tobytes()
 
     return decode, encode
 
 
 def _filling(wire: Filling, behind: int) -> tuple[Decode, Encode]:
-    dtype = np.dtype(wire.dtype)
+    dtype, item_size = wire.dtype, _item_size(wire.dtype)
 
     def decode(data: bytes, position: int) -> tuple[Any, int]:
-        count, rest = divmod(len(data) - behind - position, dtype.itemsize)
+        import numpy as np
+
+        count, rest = divmod(len(data) - behind - position, item_size)
         if count < 0 or rest:
-            raise ValueError(f"{len(data) - position} bytes, expected {behind} and a multiple of {dtype.itemsize}")
-        return np.frombuffer(data, dtype, count, position), position + count * dtype.itemsize
+            raise ValueError(f"{len(data) - position} bytes, expected {behind} and a multiple of {item_size}")
+        return np.frombuffer(data, dtype, count, position), position + count * item_size
 
     def encode(value: Any) -> bytes:
+        import numpy as np
+
         with np.errstate(invalid="raise"):
             return np.ascontiguousarray(value, dtype).tobytes()
 
     return decode, encode
+
+
+def _item_size(dtype: str) -> int:
+    """Return the bytes of one item: the number at the end of ``<f4``."""
+    return int(dtype[-1])
 
 
 def _remainder(wire: Remainder) -> tuple[Decode, Encode]:

@@ -12,11 +12,9 @@ both: ``Annotated[float, Scalar("h"), Decimal()]``. Sans-IO; a codec makes the b
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_args, get_type_hints
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):
@@ -80,6 +78,16 @@ class Decimal(msgspec.Struct, frozen=True):
     """In text: a number with six decimals, never an exponent."""
 
 
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    Floats = npt.NDArray[np.float32]
+    Doubles = npt.NDArray[np.float64]
+    Ints = npt.NDArray[np.int64]
+else:  # numpy is loaded when the first array comes
+    Floats = Doubles = Ints = Any
+
 WireType = Scalar | CountedText | CountedBytes | CountedArray | Remainder | Filling
 TextType = Whole | Decimal
 
@@ -94,9 +102,10 @@ F64 = Annotated[float, Scalar("d")]
 Bool = Annotated[bool, Scalar("?")]
 Text = Annotated[str, CountedText("i")]
 Blob = Annotated[bytes, CountedBytes("i")]
-F32Array = Annotated[npt.NDArray[np.float32], CountedArray("i", "<f4")]
 Rest = Annotated[bytes, Remainder()]
-I64Fill = Annotated[npt.NDArray[np.int64], Filling("<i8")]
+F32Array = Annotated[Floats, CountedArray("i", "<f4")]
+I64Fill = Annotated[Ints, Filling("<i8")]
+F64Fill = Annotated[Doubles, Filling("<f8")]
 
 
 class Field(msgspec.Struct, frozen=True):

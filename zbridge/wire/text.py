@@ -12,14 +12,10 @@ import struct
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
 from zbridge.errors import EncodeError, ProtocolError
-from zbridge.wire.fields import Decimal, Field, Filling, Message, Scalar, Whole, declared_fields
+from zbridge.wire.fields import Decimal, Field, Filling, Ints, Message, Scalar, Whole, declared_fields
 
 M = TypeVar("M", bound=Message)
-Ints = npt.NDArray[np.int64]
 
 _NUMBER = re.compile(rb"-?[0-9]*\.?[0-9]+")
 _QUOTED = 24
@@ -161,6 +157,8 @@ def _write_decimal(value: float) -> bytes:
 
 
 def _write_array(values: Any) -> bytes:
+    import numpy as np
+
     with np.errstate(invalid="raise"):
         numbers = np.asarray(values, np.int64)
     if numbers.size and numbers.max() > _MOST:
@@ -170,6 +168,8 @@ def _write_array(values: Any) -> bytes:
 
 def _integers(body: bytes) -> Ints:
     """Read a row of integers by numpy; number by number where numpy would read something else."""
+    import numpy as np
+
     bars = body.translate(None, _DIGITS)
     if bars != b"|" * len(bars):
         return _integers_one_by_one(body)
@@ -181,6 +181,8 @@ def _integers(body: bytes) -> Ints:
 
 
 def _integers_one_by_one(body: bytes) -> Ints:
+    import numpy as np
+
     numbers = _NUMBER.findall(body)
     try:
         return np.array([int(number) for number in numbers], np.int64)

@@ -9,8 +9,6 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from gateways.tcpudp.hq.client import HqClient
 from gateways.tcpudp.hq.options import HqOptions
 from gateways.tcpudp.messages import (
@@ -78,15 +76,17 @@ def _text(client: HqClient, packet: DebugMessage, options: HqOptions) -> Command
     return ((topics.CMD_TEXT, Text(packet.text, sender=client.name)),) if packet.text else ()
 
 
-@np.errstate(all="ignore")  # ranges that overflow are points the scan does not have
 def _scan(client: HqClient, packet: ClientSimulatedLidarData, options: HqOptions) -> Commands:
     """Translate simulated lidar data: one turn of ranges counter-clockwise from straight ahead, 0 = no measurement."""
     count = len(packet.ranges)
     if not count:
         raise ProtocolError("simulated lidar data without a range")
-    ranges_m = np.asarray(packet.ranges, np.float32) * np.float32(options.length_unit_m)
-    ranges_m[~(np.isfinite(ranges_m) & (ranges_m > 0))] = np.nan
-    most_m = float(np.nanmax(ranges_m, initial=0.0))
+    import numpy as np
+
+    with np.errstate(all="ignore"):  # ranges that overflow are points the scan does not have
+        ranges_m = np.asarray(packet.ranges, np.float32) * np.float32(options.length_unit_m)
+        ranges_m[~(np.isfinite(ranges_m) & (ranges_m > 0))] = np.nan
+        most_m = float(np.nanmax(ranges_m, initial=0.0))
     return ((topics.CMD_SCAN, Scan(0.0, 2 * math.pi / count, 0.0, most_m, ranges_m)),)
 
 

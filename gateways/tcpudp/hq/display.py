@@ -8,9 +8,8 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from functools import cache
 from typing import Any
-
-import numpy as np
 
 from gateways.tcpudp.hq.client import HqClient, each_once, newest_of
 from gateways.tcpudp.hq.options import HqOptions
@@ -48,10 +47,17 @@ from zbridge.protocol import Datagram, EncodeError, Send
 
 TEXT_CHARACTERS = 1000
 MOST_SIDE = most_side(UDP_BYTES)
-NO_MAP = Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
 _NEARLY = 1 + 1e-9
 _SIZES = ("1.3", "1.4")
 """Versions whose clients are announced the size of the map."""
+
+
+@cache
+def no_map() -> Map:
+    """Give the map of a robot that has none."""
+    import numpy as np
+
+    return Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
 
 
 class Display:

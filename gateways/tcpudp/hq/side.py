@@ -11,7 +11,7 @@ import msgspec
 
 from gateways.tcpudp.hq.client import HqClient
 from gateways.tcpudp.hq.commands import commands
-from gateways.tcpudp.hq.display import NO_MAP, Display, ascii_text
+from gateways.tcpudp.hq.display import Display, ascii_text, no_map
 from gateways.tcpudp.hq.options import HqOptions
 from gateways.tcpudp.maps import Geometry
 from gateways.tcpudp.messages import DebugMessage, Packet
@@ -96,7 +96,7 @@ class TcpUdpHq(HqSide):
 
     def answer(self, session: HqClient, topic: Topic, message: FleetMessage | None, now: float) -> None:
         if topic is topics.RPC_MAP:
-            send = self.show(topics.MAP, message or self.view.map or NO_MAP)
+            send = self.show(topics.MAP, message or self.view.map or no_map())
         else:
             known = message or self.view.pose
             send = self.show(topics.POSE, known) if known is not None else None

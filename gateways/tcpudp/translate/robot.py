@@ -44,6 +44,7 @@ from zbridge.protocol import (
     Outcome,
     Refused,
     Robot,
+    Telemetry,
     Translate,
     Unsupported,
 )
@@ -111,6 +112,13 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
+
+    def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
+        """Load numpy for a robot that has maps or takes scans: now, and not when the first one comes while it moves."""
+        session = self._session
+        if session is not None and {Feature.SLAM_MAP.value, Feature.LIDAR_SIM.value} & set(session.features):
+            import numpy  # noqa: F401
+        return ()
 
     def known(self, topic: Topic) -> FleetMessage | None:
         return self._telemetry.known_map() if topic is topics.MAP else None

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from gateways.tcpudp.messages import (
     DebugMessage,
     OpaquePacket,
@@ -96,6 +94,8 @@ class TelemetryTranslator:
 
     def _map(self, message: ServerSLAMMap, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Turn x-major cells (index = x * side + y) into rows of y; cells other than 0, 1, 2 become unknown."""
+        import numpy as np
+
         self._map_awaited = False
         settings = self._session.settings if self._session is not None else None
         values = message.cells
@@ -168,6 +168,8 @@ def _side(cells: int, settings: Settings | None) -> int:
 
 def _known_cells(cells: Cells) -> Cells:
     """Turn cells other than 0, 1, 2 into unknown."""
+    import numpy as np
+
     if cells.size == 0 or np.maximum.reduce(cells) <= _OCCUPIED:
         return cells
     return np.where(cells <= _OCCUPIED, cells, np.uint8(0))

@@ -9,7 +9,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
+
+import zenoh
 
 log = logging.getLogger("zbridge.bus")
 
@@ -17,6 +20,11 @@ UNDECLARE_S = 1.0
 """Longest time for which undeclaring an entity is tried while its callback runs on."""
 _TRIES_AT_ONCE, _PAUSE_S = 4, 0.0005
 """Tries of the calling thread, which may be the event loop's, and the pause between two tries, seconds."""
+
+
+def threadless(callback: Callable[[Any], object]) -> zenoh.handlers.Callback[Any]:
+    """Let Zenoh's own thread call back, for what is rare and returns at once; else each callback gets a thread."""
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 class Declared:

@@ -12,11 +12,10 @@ from typing import Any
 
 import msgspec
 import zenoh
-import zenoh.ext
 
 from zbridge.bus.interface import Batch, Publisher
 from zbridge.bus.writer import Writer
-from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Congestion, Delivery, Priority, QoS, Topic
 
@@ -36,6 +35,7 @@ class Publishers:
         self._states = states
         self._streams = streams
         self._lossless = lossless
+        self._last_values = _LastValues(session, states)
         self.stream_keys: set[str] = set()
         """Stream keys that ever got publishers."""
 
@@ -46,7 +46,7 @@ class Publishers:
         """Declare ``key`` with the delivery of ``topic``."""
         qos, options = topic.qos, _options(topic)
         if qos.keeps_last:
-            return _StatePublisher(self._session, key, options, self._states)
+            return _StatePublisher(self._session, key, options, self._states, self._last_values)
         if topic.delivery is Delivery.STREAM:
             known = len(self.stream_keys) < STREAM_PUBLISHERS or key in self.stream_keys
             if known:
@@ -59,7 +59,7 @@ class Publishers:
 
     def put_all(self, batch: Batch) -> bool:
         """Publish stream messages, those of a key in order; False asks to pause the source."""
-        return self._streams.put(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
+        return self._streams.put_at_once(partial(_put_batch, batch), sum(len(waiting) for _, waiting in batch))
 
 
 class PlainPublisher(Declared):
@@ -127,36 +127,70 @@ class _Undeclared(msgspec.Struct):
     undeclare: Callable[[], object]
 
 
-class _StatePublisher(Declared):
-    """Writes a state key: cached for late joiners, and answered to a plain get."""
+class _LastValues:
+    """The last value of every state key of a robot, for plain gets: one queryable answers for all of them."""
 
-    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
+    def __init__(self, session: zenoh.Session, writer: Writer) -> None:
+        self._session = session
+        self._writer = writer
+        self._encodings: dict[str, zenoh.Encoding] = {}
+        self._values: dict[str, bytes] = {}
+        self._queryables: dict[str, Declared] = {}
+
+    def add(self, key: str, encoding: zenoh.Encoding) -> None:
+        self._encodings[key] = encoding
+        robot, _, _ = key.rpartition("/")
+        if robot not in self._queryables:
+            self._queryables[robot] = Declared(self._session.declare_queryable(f"{robot}/*", threadless(self._reply)))
+
+    def note(self, key: str, payload: bytes) -> None:
+        self._values[key] = payload
+
+    def forget(self, key: str) -> None:
+        """Answer for a key no longer, and for none of its robot's after the last of them."""
+        self._values.pop(key, None)
+        self._encodings.pop(key, None)
+        robot, _, _ = key.rpartition("/")
+        if not any(other.startswith(f"{robot}/") for other in self._encodings):
+            queryable = self._queryables.pop(robot, None)
+            if queryable is not None:
+                queryable.close()
+
+    def _reply(self, query: zenoh.Query) -> None:
+        asked = query.key_expr
+        known = [(key, value) for key, value in tuple(self._values.items()) if asked.intersects(zenoh.KeyExpr(key))]
+        self._writer.put(lambda: self._answer(query, known))
+
+    def _answer(self, query: zenoh.Query, known: list[tuple[str, bytes]]) -> None:
+        try:
+            for key, value in known:
+                query.reply(key, value, encoding=self._encodings.get(key), express=True)
+        finally:
+            query.drop()  # type: ignore[no-untyped-call]
+
+
+class _StatePublisher(Declared):
+    """Writes a state key, which keeps its last value."""
+
+    def __init__(
+        self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer, last_values: _LastValues
+    ) -> None:
         self.key = key
         self._writer = writer
-        self._last: bytes | None = None
-        self._encoding = options["encoding"]
-        self._publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            key,
-            cache=zenoh.ext.CacheConfig(1),
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
-            publisher_detection=True,
-            **options,
-        )
-        super().__init__(session.declare_queryable(key, self._reply), self._publisher)
+        self._last_values = last_values
+        last_values.add(key, options["encoding"])
+        self._publisher = session.declare_publisher(key, **options)
+        super().__init__(self._publisher)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
-        self._last = payload
+        self._last_values.note(self.key, payload)
         return self._writer.replace(
             self.key, lambda: self._publisher.put(payload, attachment=attachment), 1 + len(payload) // 256
         )
 
-    def _reply(self, query: zenoh.Query) -> None:
-        last = self._last
-        if last is None:
-            query.drop()  # type: ignore[no-untyped-call]
-        else:
-            self._writer.put(lambda: reply_and_drop(query, self.key, last, self._encoding))
+    def close(self) -> None:
+        self._last_values.forget(self.key)
+        super().close()
 
 
 def reply_and_drop(query: zenoh.Query, key: str, payload: bytes, encoding: zenoh.Encoding | None) -> None:

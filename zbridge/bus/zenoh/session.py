@@ -11,12 +11,12 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
-import zenoh.ext
 
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort, Tls
+from zbridge.bus.late_join import LateJoin
 from zbridge.bus.writer import Writer
-from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
     ZenohQuery,
@@ -163,18 +163,15 @@ class ZenohBus:
 
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
+        if history:
+            return self._keep(LateJoin(self, key_expr, handler))
         if isinstance(lane, Lane):
             source = self._inbox.source(handler, read_sample)
             store = lane_callback(lane, source)
         else:
             source = self._inbox.source(handler)
             store = sorted_callback(lane, source)
-        if not history:
-            return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
-        config = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        return self._keep(
-            Declared(zenoh.ext.declare_advanced_subscriber(self._session, key_expr, store, history=config))
-        )
+        return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
 
     def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
@@ -253,7 +250,7 @@ class ZenohBus:
         def changed(status: zenoh.MatchingStatus) -> None:
             loop.call_soon_threadsafe(listened, status.matching)
 
-        self._keep(Declared(plain.declare_matching_listener(changed)))
+        self._keep(Declared(plain.declare_matching_listener(threadless(changed))))
         return self._keep(PlainPublisher(key, plain, None))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
@@ -267,7 +264,7 @@ class ZenohBus:
         def changed(_: zenoh.TransportEvent) -> None:
             loop.call_soon_threadsafe(lambda: handler(bool(info.transports())))
 
-        return self._keep(Declared(info.declare_transport_events_listener(changed, history=True)))
+        return self._keep(Declared(info.declare_transport_events_listener(threadless(changed), history=True)))
 
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""

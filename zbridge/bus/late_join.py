@@ -1,0 +1,87 @@
+"""A subscription to keys that keep their last value, which a late joiner has too. Knows no zenoh.
+
+Theory of operation. Live values come by a plain subscription. The last values are asked for when the liveliness token
+of a robot's gateway is there: at the begin, and again whenever it comes back, since what was published while the two
+could not reach each other is lost. The token may arrive before the way for the question is there: a question without an
+answer is put again, a few times. A value that came live while its robot was being asked is newer than the answer.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+
+from zbridge.bus.interface import Bus, Sample
+from zbridge.errors import BusError
+from zbridge.fleet.topics import gateways_of, of_robot, split_key
+
+ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
+"""Seconds before each question."""
+ASKED_AT_ONCE = 1024
+"""Robots that are asked at the same time."""
+
+
+class LateJoin:
+    """Gives ``handler`` the last values of all keys that an expression matches, and then the live ones."""
+
+    def __init__(self, bus: Bus, key_expr: str, handler: Callable[[Sample], None]) -> None:
+        self._bus = bus
+        self._key_expr = key_expr
+        self._handler = handler
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._live: dict[str, set[str]] = {}
+        """By the robot that is asked, the keys that came live since."""
+        self._subscription = bus.subscribe(key_expr, self._take)
+        self._watch = bus.watch_alive(gateways_of(key_expr), self._on_gateway)
+
+    def __repr__(self) -> str:
+        return f"<LateJoin {self._key_expr} asking {sorted(self._asking)}>"
+
+    def close(self) -> None:
+        """Unsubscribe; idempotent."""
+        for handle in (self._watch, self._subscription):
+            handle.close()
+        for task in self._asking.values():
+            task.cancel()
+
+    def _take(self, sample: Sample) -> None:
+        if self._live:
+            robot, _, _ = sample.key.partition("/")[2].partition("/")
+            if robot in self._live:
+                self._live[robot].add(sample.key)
+        self._handler(sample)
+
+    def _on_gateway(self, key: str, alive: bool) -> None:
+        split = split_key(key)
+        if split is None:
+            return
+        realm, robot, _ = split
+        asked = self._asking.pop(robot, None)
+        if asked is not None:
+            asked.cancel()
+        if alive and len(self._asking) < ASKED_AT_ONCE:
+            self._asking[robot] = asyncio.get_running_loop().create_task(self._ask(realm, robot))
+
+    async def _ask(self, realm: str, robot: str) -> None:
+        live = self._live[robot] = set()
+        try:
+            for after_s in ASK_AFTER_S:
+                await asyncio.sleep(after_s)
+                if await self._asked_once(realm, robot, live):
+                    break
+        finally:
+            if self._live.get(robot) is live:
+                del self._live[robot]
+        self._asking.pop(robot, None)
+
+    async def _asked_once(self, realm: str, robot: str, live: set[str]) -> bool:
+        """Ask one robot, and hand on what did not come live meanwhile; False where it did not answer."""
+        with contextlib.suppress(BusError):
+            replies = await self._bus.ask(of_robot(self._key_expr, realm, robot))
+            answers = [reply for reply in replies if reply.error is None and reply.key.startswith(f"{realm}/{robot}/")]
+            for answer in answers:
+                if answer.key not in live:
+                    self._handler(Sample(answer.key, answer.payload, None))
+            return bool(answers)
+        return False

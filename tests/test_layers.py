@@ -113,3 +113,10 @@ def test_simulators_and_conformance_kits_are_imported_when_they_are_called(packa
         for name in [getattr(node, "module", None) or "", *(alias.name for alias in node.names)]
     ]
     assert [name for name in imported if set(name.split(".")) & set(lazy)] == []
+
+
+@pytest.mark.parametrize("protocol", ["tcpudp", "wc2ec"])
+def test_a_gateway_loads_numpy_only_when_an_array_comes(protocol: str) -> None:
+    loads = f"import gateways.{protocol}, zbridge.app, zbridge.bus.zenoh, zbridge.robot.device, sys"
+    ran = subprocess.run([sys.executable, "-c", f"{loads}; sys.exit('numpy' in sys.modules)"], cwd=ROOT)
+    assert ran.returncode == 0

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from zbridge.bus.writer import BACKLOG, Writer
+from zbridge.bus.writer import AT_ONCE, BACKLOG, SLOW_S, WARY_S, Writer
 from zbridge.metrics import Metrics
 
 SOON_S = 5.0
@@ -163,3 +163,75 @@ def test_a_pause_lasts_until_the_relief_and_the_next_one_is_relieved_too(lossles
     assert lossless.play(f"d e:{2 * BACKLOG}") == "e"
     lossless.release()
     assert lossless.relieved.wait(SOON_S)
+
+
+# Calls on the caller's thread
+
+
+class Clock:
+    """The writer's own clock; a call may take time."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr("zbridge.bus.writer.time.monotonic", lambda: self.now)
+
+    def take(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def lossy() -> Iterator[Rig]:
+    rig = Rig(lossless=False)
+    yield rig
+    rig.end()
+
+
+def made_here(rig: Rig, size: int = 1) -> bool:
+    """Put a call; tell whether it was made before this returned, on this thread."""
+    threads: list[int] = []
+    rig.writer.put_at_once(lambda: threads.append(threading.get_ident()), size)
+    return threads == [threading.get_ident()]
+
+
+def test_a_small_call_is_made_at_once_where_nothing_waits(lossy: Rig) -> None:
+    assert made_here(lossy, AT_ONCE)
+    assert not made_here(lossy, AT_ONCE + 1)
+
+
+def test_a_call_behind_others_waits_for_its_turn(lossy: Rig) -> None:
+    lossy.hold()
+    lossy.play("a b")
+    lossy.writer.put_at_once(lambda: lossy.written.append("c"), 1)
+    assert lossy.written == []
+    lossy.end()
+    assert lossy.written == ["a", "b", "c"]
+
+
+def test_a_lossless_writer_makes_no_call_here_for_it_may_block(lossless: Rig) -> None:
+    assert not made_here(lossless)
+
+
+def test_after_a_slow_call_none_is_made_here_for_a_while(lossy: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock(monkeypatch)
+    lossy.writer.put_at_once(lambda: clock.take(2 * SLOW_S), 1)
+    clock.take(WARY_S / 2)
+    lossy.hold()
+    assert not made_here(lossy)
+    clock.take(WARY_S)
+    assert not made_here(lossy), "one waits"
+    lossy.end()
+    assert not made_here(lossy), "nothing is made here after the end"
+
+
+def test_some_time_after_a_slow_call_small_ones_are_made_here_again(
+    lossy: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    lossy.writer.put_at_once(lambda: clock.take(2 * SLOW_S), 1)
+    clock.take(WARY_S)
+    assert made_here(lossy)
+
+
+def test_a_call_that_fails_here_is_counted(lossy: Rig) -> None:
+    lossy.writer.put_at_once(_fail, 3)
+    assert lossy.metrics.total("bus_out_dropped") == 3

@@ -89,6 +89,8 @@ def _with_ranges(scan: Scan) -> Any:
     """Read the bytes of the ranges as an array; raise ValueError where the last one is incomplete."""
     import numpy as np
 
+    if len(scan.ranges) % 4:
+        raise ValueError("ranges: a bin of float32 was expected")
     return msgspec.structs.replace(scan, ranges=np.frombuffer(scan.ranges, "<f4"))
 
 

@@ -15,6 +15,7 @@ from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Protocol
 from zbridge.simulation.check_report import Finding
 from zbridge.wire import Whole
+from zbridge.wire.fields import CountedArray, Filling
 from zbridge.wire.frames import FrameBuffer
 
 MOST_BYTES = 2**20
@@ -50,11 +51,11 @@ def _value(hint: Any) -> Any:
     if get_origin(hint) is Annotated:
         hint, *marks = get_args(hint)
         whole = next((mark for mark in marks if isinstance(mark, Whole)), None)
+        items = next((mark.dtype for mark in marks if isinstance(mark, CountedArray | Filling)), None)
+        if items is not None:
+            return np.array([1, 2], items)
     if get_origin(hint) is types.UnionType:
         hint = get_args(hint)[0]
-    if get_origin(hint) is np.ndarray:
-        (dtype,) = get_args(get_args(hint)[1])
-        return np.array([1, 2], dtype)
     if hint is int and whole is not None:
         return max(whole.low, min(whole.high, 1))
     return _VALUES[hint]

@@ -1,8 +1,8 @@
 """How protocols are found, and what every robot has by default."""
 
 import importlib.metadata
-import re
 from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
 
 import pytest
 
@@ -43,16 +43,30 @@ def test_every_protocol_says_what_it_is_and_makes_robots_with_its_default_option
     assert robot.driving is None
 
 
-@pytest.mark.parametrize(
-    ("entries", "name", "error"),
-    [
-        (None, "nope", re.escape("protocol = 'nope': expected one of ") + ".*tcpudp"),
-        ([EntryPoint("odd", "math:pi", GROUP)], "odd", "math:pi is no zbridge protocol"),
-        ([], "tcpudp", "none installed"),
-    ],
-)
-def test_what_is_no_installed_protocol_is_an_error_that_names_those_there_are(monkeypatch, entries, name, error):
-    if entries is not None:
-        monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints(entries))
-    with pytest.raises(ConfigError, match=error):
-        find_protocol(name)
+def installed(folder: Path, text: str) -> None:
+    """Write the entry points of a distribution."""
+    (folder / "other-1.0.dist-info").mkdir()
+    (folder / "other-1.0.dist-info" / "entry_points.txt").write_text(text)
+
+
+def test_a_protocol_is_found_beside_others_of_its_distribution(tmp_path: Path, monkeypatch) -> None:
+    text = "[console_scripts]\nalso = a:b\n\n[zbridge.protocols]\nnone = math:pi\nalso=gateways.alf:PROTOCOL\n\n[z]\n"
+    installed(tmp_path, text + "last = gateways.alf:PROTOCOL\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert find_protocol("also").name == "alf"
+    for name, error in (("none", "math:pi is no zbridge protocol"), ("last", "expected one of .*tcpudp")):
+        with pytest.raises(ConfigError, match=error):
+            find_protocol(name)
+
+
+def test_a_protocol_that_only_python_finds_is_found_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = EntryPoints([EntryPoint("zipped", "gateways.alf:PROTOCOL", GROUP)])
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: entries)
+    assert find_protocol("zipped").name == "alf"
+
+
+def test_without_any_protocol_the_error_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda **_: EntryPoints([]))
+    monkeypatch.setattr("sys.path", [str(tmp_path)])
+    with pytest.raises(ConfigError, match="none installed"):
+        find_protocol("tcpudp")

@@ -6,9 +6,13 @@ A package adds a protocol by an entry point in the group ``zbridge.protocols`` t
 from __future__ import annotations
 
 import math
+import operator
+import sys
 import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
+from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
@@ -268,11 +272,33 @@ def protocol_names() -> tuple[str, ...]:
 
 def find_protocol(name: str) -> Protocol:
     """Find an installed protocol; raise ConfigError that lists the installed ones."""
+    where = _entry_point(name) or _any_entry_point(name)
+    if where is None:
+        raise ConfigError(f"protocol = {name!r}: expected one of {', '.join(protocol_names()) or '(none installed)'}")
+    module, _, attributes = where.partition(":")
+    protocol = operator.attrgetter(attributes)(import_module(module))
+    if isinstance(protocol, Protocol):
+        return protocol
+    raise ConfigError(f"protocol = {name!r}: {where} is no zbridge protocol")
+
+
+def _entry_point(name: str) -> str | None:
+    """Return ``module:attribute`` of a protocol's entry point, as installers write it beside the packages.
+
+    This saves a gateway 2.5 MB and 15 ms: :mod:`importlib.metadata` loads parsers of mails and archives.
+    """
+    for folder in sys.path:
+        for file in sorted(Path(folder).glob("*.dist-info/entry_points.txt")):
+            _, _, section = file.read_text("utf-8").partition(f"[{GROUP}]\n")
+            for line in section.partition("\n[")[0].splitlines():
+                key, _, where = line.partition("=")
+                if key.strip() == name:
+                    return where.strip()
+    return None
+
+
+def _any_entry_point(name: str) -> str | None:
+    """Return it wherever Python finds it, in archives too."""
     from importlib.metadata import entry_points
 
-    for point in entry_points(group=GROUP, name=name):
-        protocol = point.load()
-        if isinstance(protocol, Protocol):
-            return protocol
-        raise ConfigError(f"protocol = {name!r}: {point.value} is no zbridge protocol")
-    raise ConfigError(f"protocol = {name!r}: expected one of {', '.join(protocol_names()) or '(none installed)'}")
+    return next((point.value for point in entry_points(group=GROUP, name=name)), None)

@@ -3,7 +3,8 @@
 Theory of operation. Live values come by a plain subscription. The last values are asked for when the liveliness token
 of a robot's gateway is there: at the begin, and again whenever it comes back, since what was published while the two
 could not reach each other is lost. The token may arrive before the way for the question is there: a question without an
-answer is put again, a few times. A value that came live while its robot was being asked is newer than the answer.
+answer is put again, a few times. A value that came live while its robot was being asked is newer than the answer;
+one that was on its way meanwhile comes twice.
 """
 
 from __future__ import annotations

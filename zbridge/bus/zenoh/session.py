@@ -218,7 +218,8 @@ class ZenohBus:
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
         store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
-        return self._keep(Declared(self._session.liveliness().declare_subscriber(key_expr, store, history=True)))
+        watch = self._session.liveliness().declare_subscriber(key_expr, threadless(store), history=True)
+        return self._keep(Declared(watch))
 
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded).

@@ -2,8 +2,8 @@
 
 A robot is simulated by a process of its own and driven by another; the gateway between them runs here, traced. The way
 in begins with Zenoh's callback for ``@cmd/drive`` and ends when the event loop has finished with it; the way out begins
-with the read from the robot's socket and ends with the writer thread's last put. Of all drives and frames of a run the
-most frequent way is printed. Comprehensions are no calls; each step of a generator is one.
+with the read from the robot's socket and ends with the last put, here or by the writer thread. Of all drives and
+frames of a run the most frequent way is printed. Comprehensions are no calls; each step of a generator is one.
 
     python -m tests.benchmarks.ways [PROTOCOL]
 """
@@ -24,7 +24,6 @@ from types import FrameType
 from typing import Any
 
 import zenoh
-import zenoh.ext
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 4.0
@@ -75,7 +74,10 @@ class Ways:
         """Take what one callback of the event loop has done."""
         names = [name for _, name, _ in way]
         if "buffer_updated" in way[0][1] and any(name.endswith("put_all") for name in names):
-            self._read = way
+            if any(name.endswith("_put_batch") for name in names):
+                self.ways_out[way] += 1
+            else:
+                self._read = way
         elif self._came and any(path.endswith("transport/tcp.py") and name.endswith(".write") for path, name, _ in way):
             self.ways_in[self._came[-1] + way] += 1
             self._came.clear()
@@ -102,7 +104,6 @@ def _project_function(frame: FrameType) -> tuple[str, str] | None:
 def traced(ways: Ways) -> Iterator[None]:
     """Trace this thread, every thread that is started from now on, and Zenoh's callbacks for ``@cmd``."""
     original = zenoh.open
-    advanced = zenoh.ext.declare_advanced_publisher, zenoh.ext.declare_advanced_subscriber
 
     class Session:
         def __init__(self, session: zenoh.Session) -> None:
@@ -114,14 +115,7 @@ def traced(ways: Ways) -> Iterator[None]:
         def declare_subscriber(self, key: str, store: Callable[[Any], None]) -> object:
             return self.session.declare_subscriber(key, _traced_callback(store, ways) if "@cmd" in key else store)
 
-    def unwrapped(declare: Callable[..., object]) -> Callable[..., object]:
-        return lambda session, *arguments, **options: declare(
-            getattr(session, "session", session), *arguments, **options
-        )
-
     zenoh.open = lambda config: Session(original(config))  # type: ignore[assignment,return-value]
-    zenoh.ext.declare_advanced_publisher = unwrapped(advanced[0])
-    zenoh.ext.declare_advanced_subscriber = unwrapped(advanced[1])
     threading.setprofile(_Lazy(ways))  # type: ignore[arg-type]
     sys.setprofile(Tracer(ways.on_loop))
     try:
@@ -130,7 +124,6 @@ def traced(ways: Ways) -> Iterator[None]:
         sys.setprofile(None)
         threading.setprofile(None)  # type: ignore[arg-type]
         zenoh.open = original
-        zenoh.ext.declare_advanced_publisher, zenoh.ext.declare_advanced_subscriber = advanced
 
 
 class _Lazy:

@@ -101,6 +101,16 @@ async def test_every_robot_is_asked_by_itself_and_each_value_comes_once(monkeypa
     assert sorted(scene.seen) == [b"1", b"2", b"3"]
 
 
+async def test_a_handler_that_fails_for_one_value_gets_the_next(monkeypatch, caplog: pytest.LogCaptureFixture) -> None:
+    scene = Scene(monkeypatch)
+    scene.answers = [[Answer(MAP, b"bad"), Answer("fleet/r1/map2", b"good")]]
+    scene.gateway.announce("fleet/r1/@alive/gateway")
+    LateJoin(scene.bus, MAP, lambda sample: scene.seen.append(b"%d" % [b"good"].index(sample.payload)))
+    await asyncio.sleep(LONG_S)
+    assert scene.seen == [b"0"]
+    assert [record.message for record in caplog.records] == ["a handler failed"]
+
+
 async def test_a_closed_joiner_is_told_nothing_more(monkeypatch) -> None:
     scene = Scene(monkeypatch)
     scene.publisher.put(b"one")

@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Callable
 
 from zbridge.bus.interface import Bus, Sample
 from zbridge.errors import BusError
 from zbridge.fleet.topics import gateways_of, of_robot, split_key
+
+log = logging.getLogger("zbridge.bus")
 
 ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
 """Seconds before each question."""
@@ -83,6 +86,12 @@ class LateJoin:
             answers = [reply for reply in replies if reply.error is None and reply.key.startswith(f"{realm}/{robot}/")]
             for answer in answers:
                 if answer.key not in live:
-                    self._handler(Sample(answer.key, answer.payload, None))
+                    self._hand_on(Sample(answer.key, answer.payload, None))
             return bool(answers)
         return False
+
+    def _hand_on(self, sample: Sample) -> None:
+        try:
+            self._handler(sample)
+        except Exception:
+            log.exception("a handler failed")

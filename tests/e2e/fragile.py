@@ -216,12 +216,15 @@ class Fragile(Part):
         super().__init__(stack, *module("fragile", name, "127.0.0.1", json.dumps({"seed": seed, **options})))
         self.kind = ROBOTS[name]
         self.port = int(self.line())
+        self._report: dict[str, Any] | None = None
 
     def ended(self) -> dict[str, Any]:
-        """End it; give what it has to say."""
-        self.say("end")
-        report: dict[str, Any] = json.loads(self.rest()[-1])
-        return report
+        """End it; give what it has to say. Idempotent."""
+        if self._report is None:
+            self.say("end")
+            self._report = json.loads(self.rest()[-1])
+        assert self._report is not None
+        return self._report
 
 
 @contextlib.contextmanager

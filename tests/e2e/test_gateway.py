@@ -94,8 +94,8 @@ def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies_too_and_ta
     assert robot.connections == 1
     end(first.process, signal.SIGKILL)
     until(lambda: robot.connections == 2, what="the second gateway's connection")
+    until(lambda: bench.fleet.tokens() == ["fleet/r1/@alive/gateway"], what="the second gateway's token")
     until(lambda: bench.fleet.state() == "established", what="established")
-    assert bench.fleet.tokens() == ["fleet/r1/@alive/gateway"]
     bench.fleet.session.close()
 
 

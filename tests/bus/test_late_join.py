@@ -116,9 +116,11 @@ async def test_a_closed_joiner_is_told_nothing_more(monkeypatch) -> None:
     scene.publisher.put(b"one")
     scene.gateway.announce("fleet/r1/@alive/gateway")
     joined = scene.join()
+    assert not joined.closed
     await asyncio.sleep(0.02)
     joined.close()
     joined.close()
+    assert joined.closed, "so that the bus forgets it"
     await asyncio.sleep(LONG_S)
     assert scene.seen == []
 

@@ -24,6 +24,8 @@ ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
 """Seconds before each question."""
 ASKED_AT_ONCE = 1024
 """Robots that are asked at the same time."""
+LIVE_KEYS = 4096
+"""Keys of a robot that are noted as live while it is asked."""
 
 
 class LateJoin:
@@ -33,6 +35,7 @@ class LateJoin:
         self._bus = bus
         self._key_expr = key_expr
         self._handler = handler
+        self.closed = False
         self._asking: dict[str, asyncio.Task[None]] = {}
         self._live: dict[str, set[str]] = {}
         """By the robot that is asked, the keys that came live since."""
@@ -44,6 +47,7 @@ class LateJoin:
 
     def close(self) -> None:
         """Unsubscribe; idempotent."""
+        self.closed = True
         for handle in (self._watch, self._subscription):
             handle.close()
         for task in self._asking.values():
@@ -52,8 +56,9 @@ class LateJoin:
     def _take(self, sample: Sample) -> None:
         if self._live:
             robot, _, _ = sample.key.partition("/")[2].partition("/")
-            if robot in self._live:
-                self._live[robot].add(sample.key)
+            live = self._live.get(robot)
+            if live is not None and len(live) < LIVE_KEYS:
+                live.add(sample.key)
         self._handler(sample)
 
     def _on_gateway(self, key: str, alive: bool) -> None:

@@ -23,9 +23,13 @@ class Faults:
         return f"<Faults {sorted(self._logged)}>"
 
     def refusal(self, what: str, error: Exception) -> Unsupported:
-        """Return the refusal of what ran into a fault; log each fault once, with its traceback."""
+        """Return the refusal of what ran into a fault, and note the fault."""
+        self.note(what, error)
+        return Unsupported(f"{FAULT}{describe(error)}")
+
+    def note(self, what: str, error: Exception) -> None:
+        """Log a fault with its traceback, each once."""
         fault = describe(error)
         if fault not in self._logged and len(self._logged) < LOGGED:
             self._logged.add(fault)
             log.error("%s: %s: %s%s", self._robot, what, FAULT, fault, exc_info=error)
-        return Unsupported(f"{FAULT}{fault}")

@@ -112,6 +112,6 @@ class Telemetry:
                 self._context.pump()
             except Exception as error:
                 if not isinstance(error, Refused):
-                    self._context.faults.refusal(topic.path, error)
+                    self._context.faults.note(topic.path, error)
 
         return self._bus.watch_listeners(self._context.keys.key(topic.path), changed)

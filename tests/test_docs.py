@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import typer.main
+from typer.core import TyperGroup
 
 from zbridge.cli.app import app
 from zbridge.fleet import topics
@@ -96,7 +97,11 @@ def test_every_command_that_is_named_exists_with_its_options(page: Path) -> None
     text = page.read_text()
     for name, rest in COMMAND.findall("\n".join([*BLOCK.findall(text), *SPAN.findall(BLOCK.sub("", text))])):
         assert name in commands, f"zbridge {name}"
-        known = {option for parameter in commands[name].params for option in parameter.opts}
+        command = commands[name]
+        if isinstance(command, TyperGroup) and (sub := re.match(r" ([a-z]+)", rest)):
+            assert sub[1] in command.commands, f"zbridge {name} {sub[1]}"
+            command = command.commands[sub[1]]
+        known = {option for parameter in command.params for option in parameter.opts}
         unknown = set(re.findall(r"--[a-z-]+", rest.partition("#")[0].partition("&&")[0])) - known
         assert not unknown, f"zbridge {name} {rest}"
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.cli import give_up, run_gateway, run_loop, set_up_log
+from zbridge.cli import certs, give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
 from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address, parse_device_address
@@ -22,6 +22,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.add_typer(certs.app, name="certs")
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]

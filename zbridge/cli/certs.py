@@ -1,0 +1,230 @@
+"""``zbridge certs``: an authority, and the certificates of everyone who may use a secure bus.
+
+What needs the package ``cryptography``, an extra, is imported by the command that uses it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from zbridge.app.roles import OF_ROBOTS, ROLES, Member, load_roles
+from zbridge.errors import ConfigError
+from zbridge.fleet.printable import as_json, shown
+
+if TYPE_CHECKING:
+    from zbridge.app.certs.authority import Issued
+    from zbridge.app.certs.files import Folder
+    from zbridge.app.certs.listing import Entry
+
+app = typer.Typer(
+    help="Make the certificates of a secure bus: an authority, and one certificate for each name.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+Directory = Annotated[Path, typer.Option("--dir", help="the folder of the authority")]
+Name = Annotated[str, typer.Argument(help="letters, digits, '_' and '-'", show_default=False)]
+Days = Annotated[int, typer.Option(help="how long the certificate is valid")]
+Force = Annotated[bool, typer.Option("--force", help="replace what exists")]
+
+RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops."
+_PRINT = 8
+"""Bytes of a fingerprint in a table; all of them with --json."""
+_WIDTH = 180
+"""Characters of a line of the table, at least, also where the terminal has fewer."""
+
+
+@app.command()
+def init(
+    place: Annotated[
+        Path | None, typer.Argument(metavar="[DIR]", help="the folder to make", show_default="certs")
+    ] = None,
+    directory: Directory = Path("certs"),
+    force: Annotated[bool, typer.Option("--force", help="replace an authority; roles.toml stays")] = False,
+) -> None:
+    """Make an authority, and an empty roles.toml."""
+    folder = opened(place or directory)
+    from zbridge.app.certs import authority
+
+    made = authority.init(folder, now(), force=force)
+    say(f"{folder.ca}: {made.common_name}, expires {made.expires:%Y-%m-%d}, {made.fingerprint}")
+    say(f"Keep {folder.ca_key} to yourself: whoever reads it can make a certificate for any name and any role.")
+    if load_roles(folder.roles).names:
+        say("Names in roles.toml need certificates of this authority: zbridge certs renew --all")
+
+
+@app.command()
+def issue(
+    name: Name,
+    role: Annotated[str, typer.Option(help="one of: " + ", ".join(ROLES), show_default=False)],
+    robot: Annotated[
+        list[str] | None, typer.Option(help=f"a robot of this {' or '.join(OF_ROBOTS)}; once for each")
+    ] = None,
+    host: Annotated[
+        list[str] | None, typer.Option(help="a host name or IP address of this router; once for each")
+    ] = None,
+    days: Days = 365,
+    directory: Directory = Path("certs"),
+    force: Force = False,
+) -> None:
+    """Make the key and the certificate of a name, and write the name into roles.toml."""
+    folder = opened(directory)
+    from zbridge.app.certs.authority import Request
+    from zbridge.app.certs.authority import issue as make
+
+    if role not in ROLES:
+        raise ConfigError(f"--role {role!r}: expected one of {', '.join(ROLES)}")
+    member = Member(role, tuple(robot or ()))
+    issued = make(folder, Request(name, member, tuple(host or ()), days), now(), force=force)
+    say_issued(folder, name, issued)
+    if issued.replaced_until is not None:
+        say(
+            f"The certificate that it replaces is valid until {issued.replaced_until:%Y-%m-%d} all the same."
+            f" If its key is lost: zbridge certs revoke {name}, and issue another name."
+        )
+    if host and role != "router":
+        say("It is a server's certificate too: whoever has its key can pose as a router on these hosts.")
+    say(RESTART)
+
+
+@app.command()
+def renew(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", show_default=False)] = None,
+    every: Annotated[bool, typer.Option("--all", help="every name in roles.toml")] = False,
+    days: Days = 365,
+    directory: Directory = Path("certs"),
+) -> None:
+    """Replace the certificate of a name by a new one for the same key, with the same hosts."""
+    folder = opened(directory)
+    from zbridge.app.certs import authority
+
+    if bool(names) == every:
+        raise ConfigError("name one NAME or more, or give --all")
+    for name in names or load_roles(folder.roles).names:
+        say_issued(folder, name, authority.renew(folder, name, now(), days=days))
+    say("The key stays: carry the new certificate.pem and ca.pem to where the old ones are used, and restart there.")
+
+
+@app.command("list")
+def list_names(
+    directory: Directory = Path("certs"),
+    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
+) -> None:
+    """List the names: role, robots, hosts, expiry, fingerprint, and what is wrong."""
+    folder = opened(directory)
+    from zbridge.app.certs import listing
+
+    entries = listing.list_names(folder, now())
+    if json:
+        for entry in entries:
+            say(as_json(_fields(entry)))
+    else:
+        _print_table(entries)
+
+
+@app.command()
+def revoke(name: Name, directory: Directory = Path("certs")) -> None:
+    """Take a name out of roles.toml for good."""
+    folder = opened(directory)
+    from zbridge.app.certs import authority
+
+    gone = authority.revoke(folder, name)
+    say(f"{gone.common_name} is revoked. {name} is never issued again.")
+    if gone.until is not None:
+        say(
+            f"Its certificate is valid until {gone.until:%Y-%m-%d}: Zenoh has no revocation lists. A router lets it"
+            " connect, and after a restart allows it nothing."
+        )
+    if gone.server:
+        say(
+            "It is a server's certificate: whoever has its key can pose as a router, which no rule prevents. If the key"
+            " is lost: zbridge certs init --force, then zbridge certs renew --all."
+        )
+    say(RESTART)
+
+
+@app.command()
+def bundle(
+    name: Name,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", show_default=False)],
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Zenoh endpoint of a router, tls/HOST:PORT; by default the routers issued here, port 7447"),
+    ] = None,
+    at: Annotated[
+        Path | None,
+        typer.Option(help="where the folder will stand on the other machine; FOLDER by default", show_default=False),
+    ] = None,
+    directory: Directory = Path("certs"),
+    force: Force = False,
+) -> None:
+    """Pack a name for another machine: ca.pem, certificate.pem, key.pem, and bus.toml (a router: roles.toml)."""
+    folder = opened(directory)
+    from zbridge.app.certs.bundle import Packing
+    from zbridge.app.certs.bundle import bundle as pack
+
+    for path in pack(folder, name, Packing(output, tuple(connect or ()), at), now(), force=force):
+        say(path)
+
+
+def opened(directory: Path) -> Folder:
+    """Return the folder of the authority; raise ConfigError where the package ``cryptography`` is missing."""
+    if importlib.util.find_spec("cryptography") is None:
+        raise ConfigError("zbridge certs needs the package cryptography: pip install 'zbridge[certs]'")
+    from zbridge.app.certs.files import Folder
+
+    return Folder(directory)
+
+
+def now() -> datetime:
+    """Return the time, to the second: certificates count no finer."""
+    return datetime.now(UTC).replace(microsecond=0)
+
+
+def say(text: object) -> None:
+    """Print one line."""
+    typer.echo(shown(text))
+
+
+def say_issued(folder: Folder, name: str, issued: Issued) -> None:
+    """Print where a certificate is, and what it is."""
+    say(f"{folder.of(name).folder}: {issued.common_name}, expires {issued.expires:%Y-%m-%d}, {issued.fingerprint}")
+
+
+def _fields(entry: Entry) -> dict[str, object]:
+    return {
+        "name": entry.name,
+        "role": entry.role,
+        "robots": list(entry.robots),
+        "hosts": list(entry.hosts),
+        "expires": entry.expires.isoformat() if entry.expires else None,
+        "fingerprint": entry.fingerprint,
+        "problem": entry.problem,
+    }
+
+
+def _print_table(entries: list[Entry]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    console.width = max(console.width, _WIDTH)
+    table = Table("name", "role", "robots", "hosts", "expires", "fingerprint", "problem", box=None)
+    for entry in entries:
+        cells = (
+            entry.name,
+            entry.role or "",
+            " ".join(entry.robots),
+            " ".join(entry.hosts),
+            f"{entry.expires:%Y-%m-%d}" if entry.expires else "",
+            f"{entry.fingerprint[: 3 * _PRINT]}..." if entry.fingerprint else "",
+            entry.problem,
+        )
+        table.add_row(*(Text(shown(cell)) for cell in cells))
+    console.print(table)

@@ -56,4 +56,5 @@ def _entry(folder: Folder, authority: Certificate, roles: Roles, name: str, now:
 
 def _warning(certificate: Certificate, now: datetime) -> str:
     left = certificate.not_valid_after_utc - now
-    return f"expires in {left // timedelta(days=1)} days" if left < SOON else ""
+    days = left // timedelta(days=1)
+    return f"expires in {days} day{'s' * (days != 1)}" if left < SOON else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import stat
@@ -16,6 +15,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from tests.app.certs.lab import Lab
 from zbridge.app.certs import authority
+from zbridge.app.certs.files import changing
 from zbridge.app.roles import OF_ROBOTS, ROLES, Member, Role, Roles, load_roles, save_roles
 from zbridge.errors import ConfigError
 
@@ -289,11 +289,6 @@ def test_a_folder_without_an_authority_is_told(lab: Lab) -> None:
 
 
 def test_two_programs_do_not_change_the_folder_at_once(lab: Lab) -> None:
-    other = os.open(lab.folder.path, os.O_RDONLY)
-    try:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(ConfigError, match="another program issues or revokes here now"):
-            lab.issue("ann")
-    finally:
-        os.close(other)
+    with changing(lab.folder), pytest.raises(ConfigError, match="another program issues or revokes here now"):
+        lab.issue("ann")
     lab.issue("ann")

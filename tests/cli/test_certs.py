@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
+import shlex
 import subprocess
 import sys
 from datetime import UTC, datetime
@@ -13,6 +15,7 @@ import pytest
 
 from zbridge import cli
 
+PAGE = Path(__file__).parents[2] / "docs" / "security.md"
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops.\n"
 
 
@@ -129,6 +132,17 @@ def test_every_command_takes_another_folder(terminal: Terminal) -> None:
     terminal.types("bundle", "ann", "-o", "carry", "--connect", "tls/hub.lab:7447", "--dir", "a/lab")
     terminal.types("revoke", "ann", "--dir", "a/lab")
     assert not Path("certs").exists()
+
+
+def test_the_commands_of_the_page_work_one_after_the_other(terminal: Terminal) -> None:
+    section = PAGE.read_text().partition("\n## Certificates\n")[2].partition("\n## ")[0]
+    commands = re.findall(r"^zbridge certs (.+?)(?: +#.*)?$", section, re.MULTILINE)
+    assert len(commands) >= 10
+    for command in commands:
+        terminal.types(*shlex.split(command))
+    assert [line.split()[0] for line in terminal.types("list").splitlines()] == ["name", "r1", "ann", "hub2", "hub"]
+    assert "another authority" not in terminal.types("list")
+    assert Path("r1-bus/bus.toml").exists()
 
 
 FAILURES = [

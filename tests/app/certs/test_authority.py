@@ -219,6 +219,15 @@ def test_revoking_a_server_says_so_with_its_files_and_without(lab: Lab) -> None:
     assert (gone.server, gone.until) == (True, None)
 
 
+def test_a_name_with_a_spoiled_certificate_is_revoked_and_replaced_all_the_same(lab: Lab) -> None:
+    for name in ("ann", "bob"):
+        lab.issue(name)
+        lab.folder.of(name).certificate.write_text("x")
+    assert lab.issue("bob", force=True).replaced_until is None
+    assert authority.revoke(lab.folder, "ann").until is None
+    assert load_roles(lab.folder.roles).revoked == ("ann",)
+
+
 def test_an_unknown_name_is_neither_renewed_nor_revoked(lab: Lab) -> None:
     lab.issue("ann")
     for act in (lambda: authority.renew(lab.folder, "bob", lab.now), lambda: authority.revoke(lab.folder, "bob")):

@@ -86,12 +86,12 @@ def issue(folder: Folder, request: Request, now: datetime, *, force: bool = Fals
         lifetime = (now, _checked_days(request.days, authority, now))
         key = x509.new_key()
         certificate = x509.new_certificate(authority, key.public_key(), roles.common_name(name), hosts, lifetime)
-        replaced = _end_of(folder, name)
+        replaced = _present(folder, name)
         make_folder(folder.of(name).folder)
         write(folder.of(name).key, x509.key_pem(key), SECRET)
         _write_certificate(folder, name, certificate)
         save_roles(folder.roles, roles)
-    return _issued(certificate, replaced)
+    return _issued(certificate, replaced.not_valid_after_utc if replaced else None)
 
 
 def renew(folder: Folder, name: str, now: datetime, *, days: int = DAYS) -> Issued:
@@ -114,11 +114,9 @@ def revoke(folder: Folder, name: str) -> Revoked:
         roles = load_roles(folder.roles)
         check_known(folder, roles, name)
         save_roles(folder.roles, roles.without(name))
-    gone = roles.common_name(name)
-    path = folder.of(name).certificate
-    if not path.exists():
+    gone, certificate = roles.common_name(name), _present(folder, name)
+    if certificate is None:
         return Revoked(gone, None, roles.names[name].role == "router")
-    certificate = load_certificate(path)
     return Revoked(gone, certificate.not_valid_after_utc, bool(x509.hosts_of(certificate)))
 
 
@@ -166,10 +164,10 @@ def _write_certificate(folder: Folder, name: str, certificate: Certificate) -> N
     write(files.ca, read(folder.ca), PUBLIC)
 
 
-def _end_of(folder: Folder, name: str) -> datetime | None:
-    """Return when the certificate ends that is there already; None if there is none, or none that can be read."""
+def _present(folder: Folder, name: str) -> Certificate | None:
+    """Return the certificate that a name has; None if there is none, or none that can be read."""
     try:
-        return load_certificate(folder.of(name).certificate).not_valid_after_utc
+        return load_certificate(folder.of(name).certificate)
     except ConfigError:
         return None
 

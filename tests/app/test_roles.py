@@ -15,6 +15,7 @@ LAB = Roles(
         "ann": Member("viewer"),
         "op-1": Member("operator"),
         "r1": Member("gateway", ("r1", "arm.left")),
+        "r2": Member("gateway", ("r2",), listeners=True),
         "2nd_router": Member("router"),
     },
     ("lost", "old-1"),
@@ -23,7 +24,10 @@ LAB = Roles(
 WRONG_FILES = [
     ("[names.a]\nrole = 'driver'", "names.a.role = 'driver': expected one of 'gateway', 'hq', 'operator', 'recorder'"),
     ("[names.a]\nrobots = []", "names.a.role: missing, it is required"),
-    ("[names.a]\nrole = 'viewer'\nrobot = 'r1'", "names.a.robot = 'r1': unknown key; expected one of role, robots"),
+    (
+        "[names.a]\nrole = 'viewer'\nrobot = 'r1'",
+        "names.a.robot = 'r1': unknown key; expected one of role, robots",
+    ),
     ("[names.a]\nrole = 'gateway'", "names.a.robots = []: expected the robots of this gateway, at least one"),
     ("[names.a]\nrole = 'hq'\nrobots = []", "names.a.robots = []: expected the robots of this hq, at least one"),
     ("[names.a]\nrole = 'viewer'\nrobots = ['r1']", "names.a.robots = ['r1']: expected none: the role viewer is for"),
@@ -32,6 +36,8 @@ WRONG_FILES = [
     ("[names.a]\nrole = 'gateway'\nrobots = ['r1/**']", "names.a.robots = ['r1/**']: 'r1/**': expected letters"),
     ("[names.a]\nrole = 'gateway'\nrobots = ['r1', 'r1']", "names.a.robots = ['r1', 'r1']: expected each robot once"),
     ("[names.a]\nrole = 'gateway'\nrobots = 'r1'", "names.a.robots = 'r1': expected `array`, got `str`"),
+    ("[names.a]\nrole = 'viewer'\nlisteners = true", "names.a.listeners = true: expected only in a gateway"),
+    ("[names.hq]\nrole = 'viewer'", "names = 'hq': the names of all listeners begin with it"),
     ("[names.'a.b']\nrole = 'viewer'", "names = 'a.b': expected at most 48 letters"),
     ("[names.'$*']\nrole = 'viewer'", "names = '$*': expected at most 48 letters"),
     ("[names.'']\nrole = 'viewer'", "names = '': expected at most 48 letters"),
@@ -97,7 +103,9 @@ def test_a_revoked_name_leaves_the_names_and_is_never_given_again() -> None:
 
 def test_only_a_known_name_is_revoked() -> None:
     for name in ("nobody", "lost"):
-        with pytest.raises(ConfigError, match=f"'{name}': not a name of this bus; known: ann, op-1, r1, 2nd_router"):
+        with pytest.raises(
+            ConfigError, match=f"'{name}': not a name of this bus; known: ann, op-1, r1, r2, 2nd_router"
+        ):
             LAB.without(name)
 
 

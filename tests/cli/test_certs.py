@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from zbridge import cli
+from zbridge.app.roles import Member, load_roles
 
 PAGE = Path(__file__).parents[2] / "docs" / "security.md"
 RESTART = "Restart the router, which reads roles.toml when it starts. That loses the bus: every driven robot stops.\n"
@@ -100,6 +101,14 @@ def test_revoking_says_what_it_does_not_do(terminal: Terminal) -> None:
     assert "pose as a router, which no rule prevents" in terminal.types("revoke", "hub")
 
 
+def test_a_gateway_with_listeners_is_marked_in_the_roles(terminal: Terminal) -> None:
+    terminal.types("init")
+    for name, words in (("g1", ["--listeners"]), ("g2", [])):
+        terminal.types("issue", name, "--role", "gateway", "--robot", "r1", *words)
+    names = load_roles(Path("certs/roles.toml")).names
+    assert names == {"g1": Member("gateway", ("r1",), True), "g2": Member("gateway", ("r1",))}
+
+
 def test_renewing_takes_names_or_all(terminal: Terminal) -> None:
     terminal.types("init")
     for name in ("ann", "bob"):
@@ -153,6 +162,8 @@ FAILURES = [
         ("issue", "bob", "--role", "viewer", "--days", "4000"),
         "--days 4000: expected 1 to 3650: the authority",
     ),
+    (("issue", "bob", "--role", "viewer", "--listeners"), "--listeners: a gateway's; the role viewer has none"),
+    (("issue", "hq", "--role", "viewer"), "NAME = 'hq': the names of all listeners begin with it"),
     (("issue", "bob", "--role", "viewer", "--dir", "none"), "none: No such file or directory: expected the folder"),
     (("renew", "bob"), "certs/roles.toml: 'bob' is not a name of this bus; known: ann"),
     (("revoke", "\x1b[31m"), "certs/roles.toml: '\\x1b[31m' is not a name of this bus; known: ann"),

@@ -68,6 +68,9 @@ def issue(
     host: Annotated[
         list[str] | None, typer.Option(help="a host name or IP address of this router; once for each")
     ] = None,
+    listeners: Annotated[
+        bool, typer.Option("--listeners", help="a gateway that serves HQ programs too, and drives its robots for them")
+    ] = False,
     days: Days = 365,
     directory: Directory = Path("certs"),
     force: Force = False,
@@ -79,7 +82,9 @@ def issue(
 
     if role not in ROLES:
         raise ConfigError(f"--role {role!r}: expected one of {', '.join(ROLES)}")
-    member = Member(role, tuple(robot or ()))
+    if listeners and role != "gateway":
+        raise ConfigError(f"--listeners: a gateway's; the role {role} has none")
+    member = Member(role, tuple(robot or ()), listeners)
     issued = make(folder, Request(name, member, tuple(host or ()), days), now(), force=force)
     say_issued(folder, name, issued)
     if issued.replaced_until is not None:

@@ -10,15 +10,14 @@ from __future__ import annotations
 import ipaddress
 import os
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
-from msgspec import inspect
 
+from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
@@ -29,10 +28,7 @@ from zbridge.protocol.address import Address, DeviceAddress, parse_device_addres
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 
-T = TypeVar("T")
-
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
-_PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
 class RobotSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -70,12 +66,7 @@ class Plan(msgspec.Struct, frozen=True):
 
 def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
     """Read and check a configuration file; raise ConfigError, which names the file as well."""
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from error
+    raw = read_toml(path)
     try:
         return plan(raw, environment)
     except ConfigError as error:
@@ -85,7 +76,7 @@ def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
 def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:
     """Check a configuration given as a dict; raise ConfigError."""
     raw = _substituted(raw, environment, "")
-    config = _convert(raw, Config, "")
+    config = convert(raw, Config, "")
     for key, name in (("robot.name", config.robot.name), ("robot.realm", config.robot.realm)):
         if not is_name(name):
             raise ConfigError(f"{key} = {name!r}: expected letters, digits, '_', '.' and '-' only")
@@ -107,7 +98,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
 
 def _device(settings: DeviceSettings) -> DevicePlan:
     protocol = _protocol("device.", settings.protocol)
-    options = _convert(settings.options, protocol.options, "device.options.")
+    options = convert(settings.options, protocol.options, "device.options.")
     addresses = tuple(_device_address("device.connect", text) for text in settings.connect)
     if len(addresses) > protocol.links:
         raise ConfigError(
@@ -123,7 +114,7 @@ def _listener(settings: HqSettings, key: str) -> ListenerPlan:
         raise ConfigError(f"{key}.protocol = {settings.protocol!r}: serves no HQ programs")
     if settings.name is not None and not is_name(settings.name):
         raise ConfigError(f"{key}.name = {settings.name!r}: expected letters, digits, '_', '.' and '-' only")
-    options = _convert(settings.options, protocol.hq_options, f"{key}.options.")
+    options = convert(settings.options, protocol.hq_options, f"{key}.options.")
     allow = tuple(_network(f"{key}.allow[{number}]", text) for number, text in enumerate(settings.allow))
     return ListenerPlan(protocol, options, _address(f"{key}.listen", settings.listen), settings, allow)
 
@@ -177,68 +168,3 @@ def _variable(name: str, environment: Mapping[str, str], key: str, text: str) ->
     if name not in environment:
         raise ConfigError(f"{key} = {text!r}: expected the environment variable {name} to be set")
     return environment[name]
-
-
-def _convert(raw: Any, kind: type[T], prefix: str) -> T:
-    try:
-        return msgspec.convert(raw, kind)
-    except msgspec.ValidationError as error:
-        raise ConfigError(prefix + _explain(raw, kind, str(error))) from error
-    except ConfigError as error:  # options that contradict each other
-        raise ConfigError(f"{prefix}{error}") from error
-
-
-def _explain(raw: Any, kind: type[Any], text: str) -> str:
-    """Rewrite msgspec's message as ``key = value: what was expected``."""
-    match = _PATH.search(text)
-    path = (match["path"] or match["index"] or "") if match else ""
-    what = text[: match.start()] if match else text
-    if unknown := re.match(r"Object contains unknown field `(.+)`", what):
-        known = ", ".join(_field_names(_type_at(kind, path)))
-        key = f"{path}.{unknown[1]}" if path else unknown[1]
-        return f"{key} = {_value(raw, key)!r}: unknown key; expected one of {known}"
-    if missing := re.match(r"Object missing required field `(.+)`", what):
-        return f"{path}.{missing[1]}: missing, it is required" if path else f"{missing[1]}: missing, it is required"
-    if what.startswith("Invalid enum value"):
-        at = _type_at(kind, path)
-        members = at.types if isinstance(at, inspect.UnionType) else (at,)
-        literals = [value for member in members if isinstance(member, inspect.LiteralType) for value in member.values]
-        what = f"expected one of {', '.join(map(repr, literals))}"
-    return f"{path} = {_value(raw, path)!r}: {what[:1].lower()}{what[1:]}"
-
-
-def _parts(path: str) -> list[str]:
-    return re.findall(r"[^.\[\]]+", path)
-
-
-def _value(raw: Any, path: str) -> Any:
-    for part in _parts(path):
-        try:
-            raw = raw[int(part)] if isinstance(raw, list) else raw[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            return None
-    return raw
-
-
-def _type_at(kind: type[Any], path: str) -> inspect.Type:
-    """Return the declared type at a path of a configuration."""
-    at = _plain_type(inspect.type_info(kind))
-    for part in _parts(path):
-        if isinstance(at, inspect.StructType):
-            fields = {field.encode_name: field.type for field in at.fields}
-            at = _plain_type(fields.get(part, inspect.AnyType()))
-        elif isinstance(at, inspect.VarTupleType | inspect.ListType):
-            at = _plain_type(at.item_type)
-    return at
-
-
-def _plain_type(at: inspect.Type) -> inspect.Type:
-    """Return X for ``X | None``."""
-    if isinstance(at, inspect.UnionType):
-        types = [member for member in at.types if not isinstance(member, inspect.NoneType)]
-        return types[0] if len(types) == 1 else at
-    return at
-
-
-def _field_names(at: inspect.Type) -> list[str]:
-    return [field.encode_name for field in at.fields] if isinstance(at, inspect.StructType) else []

@@ -25,13 +25,19 @@ OF_ROBOTS: tuple[Role, ...] = ("gateway", "hq")
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
 """With the longest role it fits the 64 characters of a common name."""
+_RESERVED = ("hq",)
+"""Names that nobody has: who may ask ``acquire/hq`` could ask as any listener, ``hq.<name>.<id>``."""
 
 
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a name is. robots: those of a gateway or an hq, at least one; no other role has any."""
+    """What a name is. robots: those of a gateway or an hq, at least one; no other role has any.
+
+    listeners: a gateway whose process serves HQ programs too, so that it drives its robots for them.
+    """
 
     role: Role
     robots: tuple[str, ...] = ()
+    listeners: bool = False
 
 
 class Roles(msgspec.Struct, frozen=True):
@@ -99,6 +105,8 @@ def check_name(key: str, name: str) -> None:
         raise ConfigError(
             f"{key} = {name!r}: expected at most 48 letters, digits, '_' and '-', a letter or digit first"
         )
+    if name in _RESERVED:
+        raise ConfigError(f"{key} = {name!r}: the names of all listeners begin with it; expected another name")
 
 
 def check_member(key: str, member: Member) -> None:
@@ -111,6 +119,8 @@ def check_member(key: str, member: Member) -> None:
             f"{key} = {robots}: expected none: the role {member.role} is for all robots; only {' and '.join(OF_ROBOTS)}"
             " name theirs"
         )
+    if member.listeners and member.role != "gateway":
+        raise ConfigError(f"{key.removesuffix('.robots')}.listeners = true: expected only in a gateway")
     for robot in robots:
         if not is_name(robot):
             raise ConfigError(f"{key} = {robots}: {robot!r}: expected letters, digits, '_', '.' and '-' only")
@@ -135,7 +145,8 @@ def _revoked(names: tuple[str, ...]) -> str:
 
 def _table(name: str, member: Member) -> str:
     robots = f"robots = [{', '.join(map(_quoted, member.robots))}]\n" if member.robots else ""
-    return f'\n[names.{name}]\nrole = "{member.role}"\n{robots}'
+    listeners = "listeners = true\n" if member.listeners else ""
+    return f'\n[names.{name}]\nrole = "{member.role}"\n{robots}{listeners}'
 
 
 def _quoted(name: str) -> str:

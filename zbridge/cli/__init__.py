@@ -1,8 +1,8 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, ls, echo, drive, stop``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``bus``, ``demo``, ``drive`` and ``probe`` carry them out, ``keyboard`` turns keys into
-drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
+``app`` declares the commands, ``bus``, ``demo``, ``drive``, ``probe`` and ``router`` carry them out, ``keyboard``
+turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
 """
 
 from __future__ import annotations

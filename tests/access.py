@@ -5,12 +5,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import NamedTuple, get_args
+from collections.abc import Callable
+from typing import NamedTuple
 
 import zenoh
 
-from zbridge.app.access import Column, Kind, granted
+from zbridge.app.access import Column, Kind, column, granted
 from zbridge.app.roles import Member, Roles
 
 REALM = "fleet"
@@ -31,7 +31,8 @@ LAB = Roles(
         "main": Member("router"),
     }
 )
-COLUMNS: dict[Column, str] = dict(zip(get_args(Column), ("v1", "op1", "sup1", "g1", "g2", "h1", "rec1", "main"), strict=True))
+COLUMNS: dict[Column, str] = {column(member): name for name, member in LAB.names.items()}
+"""The member of each column."""
 
 PATHS = (
     "status",
@@ -84,11 +85,11 @@ class Try(NamedTuple):
         return written if self.robot is None else f"{REALM}/{self.robot}/{written}"
 
 
-def tries(columns: Iterable[Column] = get_args(Column)) -> list[Try]:
+def tries() -> list[Try]:
     """Give every message that can be tried: role x key class x kind of message."""
     return [
         Try(column, path, kind, robot)
-        for column in columns
+        for column in COLUMNS
         for paths, robots in ((PATHS, (OWN, OTHER)), (OTHERS, (None,)))
         for path in paths
         for robot in robots

@@ -1,4 +1,4 @@
-"""A router of ``zbridge router`` with real certificates, and the sessions of its members, each a client over mutual TLS.
+"""A router of ``zbridge router`` with real certificates, and sessions of its members, each a client over mutual TLS.
 
 What reaches another session went through the router; so everything is counted at the session of ``far``, which may do
 everything.

@@ -121,13 +121,15 @@ def in_our_words(line: str) -> tuple[int, str]:
         if re.search(pattern, line):
             return logging.WARNING, text
     match = _LINE.match(line)
-    if match is None:
+    if match is None or _SAID_ELSEWHERE in line:
         return logging.DEBUG, line
     return _LEVELS[match["level"]], f"Zenoh: {_TAIL.sub('', match['text'])}"
 
 
 _LINE = re.compile(r"\S+Z\s+(?P<level>ERROR|WARN|INFO|DEBUG|TRACE) .*?(?P<text>zenoh\S*: .*)")
 _TAIL = re.compile(r"\.? Hint: increase the system open file limit\.|\s+at /\S+\.rs:\d+\.?")
+_SAID_ELSEWHERE = "Unable to open listener"
+"""Also an error, which ends the process with its text."""
 _LEVELS = {
     "ERROR": logging.ERROR,
     "WARN": logging.WARNING,

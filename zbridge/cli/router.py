@@ -10,6 +10,7 @@ import msgspec
 from zbridge.app import until_signal
 from zbridge.app.router import Router, ZenohWarnings
 from zbridge.app.router_settings import RouterSettings, folder_tls, load_router, nested, plan_router, zenoh_values
+from zbridge.app.toml import convert
 from zbridge.bus import hear_zenoh
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
@@ -27,11 +28,8 @@ def settings_of(file: Path | None, given: dict[str, object]) -> RouterSettings:
     given: fields of RouterSettings; empty ones were not given.
     """
     settings = load_router(file) if file is not None else RouterSettings()
-    try:
-        changes = {key: value for key, value in given.items() if value}
-        return msgspec.convert(msgspec.to_builtins(settings) | msgspec.to_builtins(changes), RouterSettings)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{error}") from error
+    changes = {key: value for key, value in given.items() if value}
+    return convert(msgspec.to_builtins(settings) | msgspec.to_builtins(changes), RouterSettings)
 
 
 def run_router(file: Path | None, given: dict[str, object], *, print_config: bool) -> None:

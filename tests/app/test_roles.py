@@ -28,6 +28,8 @@ WRONG_FILES = [
     ("[names.a]\nrole = 'hq'\nrobots = []", "names.a.robots = []: expected the robots of this hq, at least one"),
     ("[names.a]\nrole = 'viewer'\nrobots = ['r1']", "names.a.robots = ['r1']: expected none: the role viewer is for"),
     ("[names.a]\nrole = 'router'\nrobots = ['r1']", "names.a.robots = ['r1']: expected none: the role router is for"),
+    ("[names.hq]\nrole = 'viewer'", "names = 'hq': the names of all listeners begin with it; expected another name"),
+    ("[names.a]\nrole = 'viewer'\nlisteners = true", "names.a.listeners = true: expected only in a gateway"),
     ("[names.a]\nrole = 'gateway'\nrobots = ['*']", "names.a.robots = ['*']: '*': expected letters"),
     ("[names.a]\nrole = 'gateway'\nrobots = ['r1/**']", "names.a.robots = ['r1/**']: 'r1/**': expected letters"),
     ("[names.a]\nrole = 'gateway'\nrobots = ['r1', 'r1']", "names.a.robots = ['r1', 'r1']: expected each robot once"),
@@ -51,7 +53,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_what_is_saved_is_loaded_again(tmp_path: Path) -> None:
-    for roles in (LAB, Roles()):
+    for roles in (LAB, Roles(), Roles({"r1": Member("gateway", ("r1",), listeners=True)})):
         save_roles(tmp_path / "roles.toml", roles)
         assert load_roles(tmp_path / "roles.toml") == roles
         assert [path.name for path in tmp_path.iterdir()] == ["roles.toml"]

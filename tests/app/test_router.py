@@ -26,6 +26,7 @@ LINES = [
     ("received fatal alert: UnknownCA" + HINT, "does not know the authority of this router's certificate"),
     ("received fatal alert: BadCertificate" + HINT, "did not accept this router's certificate"),
     ("tls handshake eof" + HINT, "ended before it had said who it was"),
+    ("Unknown token id=2", "took back a token, subscription or queryable that its rules had not let through"),
     ("Too many open files (os error 24)" + HINT, "may open no more files"),
 ]
 

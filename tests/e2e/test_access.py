@@ -16,8 +16,9 @@ import pytest
 import zenoh
 
 from tests.access import COLUMNS, LAB, Try, granted_by_the_code, table
+from tests.certificates import Authority
 from tests.e2e.conftest import until
-from tests.e2e.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, text
+from tests.e2e.secure import FAR, GRACE_S, ROLES, Matrix, SecureBus, declared, ignore, secure, text
 from zbridge.app.access import Column
 from zbridge.app.access_rules import STOPS_HZ
 from zbridge.app.roles import Roles
@@ -363,6 +364,28 @@ def test_a_router_that_starts_again_knows_only_who_is_left(tmp_path: Path) -> No
                     assert stopped() == drivers
     finally:
         bus.stop()
+
+
+REFUSED = [
+    ("nobody", "refused a connection: it showed no certificate"),
+    ("other", "refused a connection: its certificate is of another authority"),
+    ("plain", "refused a connection: it spoke no TLS"),
+]
+
+
+def test_whom_the_router_refuses_is_said_in_its_log(scene: Scene, tmp_path: Path) -> None:
+    other = Authority(tmp_path, "other").issue("viewer.v1")
+    (other / "ca.pem").write_bytes(scene.bus.authority.ca.read_bytes())
+    address = scene.bus.endpoint.partition("/")[2]
+    brief = {"connect__endpoints": [scene.bus.endpoint], "connect__timeout_ms": 300}
+    nobody = {"transport__link__tls__enable_mtls": False} | brief
+    plain = brief | {"connect__endpoints": [f"tcp/{address}"]}
+    for config in (secure(other, **nobody), secure(other, **brief), secure(other, **plain)):
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(config)
+    for _, words in REFUSED:
+        until(lambda words=words: words in scene.bus.log(), what=words)
+    assert "Hint" not in scene.bus.log()
 
 
 def without(name: str) -> Roles:

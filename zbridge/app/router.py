@@ -149,6 +149,7 @@ _WORDS = (
     ("CertificateExpired", f"{_REFUSED} it says that this router's certificate has expired"),
     ("received fatal alert", f"{_REFUSED} it did not accept this router's certificate: its name, authority or dates"),
     ("handshake eof|[Uu]nexpected eof", f"{_REFUSED} it ended before it had said who it was"),
+    ("Unknown \\w+ id", "a member took back a token, subscription or queryable that its rules had not let through"),
     ("Too many open files", "no more connections: this process may open no more files (ulimit -n)"),
 )
 """What Zenoh's lines hold, and what is said instead. The first that fits is taken."""

@@ -167,8 +167,8 @@ def router(
 
     set_up_log(verbose=False)
     given: dict[str, object] = {
-        "listen": tuple(listen),
-        "connect": tuple(connect),
+        "listen": listen,
+        "connect": connect,
         "tls": folder_tls(tls) if tls is not None else None,
         "roles": str(roles) if roles is not None else None,
         "realm": realm,

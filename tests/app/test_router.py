@@ -19,6 +19,7 @@ HEAD = "2026-11-22T03:30:33.272777Z  WARN acc-0 ThreadId(05) zenoh_link_tls::uni
 LINES = [
     ("invalid peer certificate: certificate expired: verification time 1 (UNIX), but" + HINT, "has expired"),
     ("invalid peer certificate: certificate not valid yet: verification time 1" + HINT, "is not valid yet"),
+    ("Closing TLS link 127.0.0.1:1 => 127.0.0.1:2 : remote certificate chain expired", "closed a connection: its"),
     ("peer sent no certificates" + HINT, "showed no certificate"),
     ("invalid peer certificate: UnknownIssuer" + HINT, "is of another authority"),
     ("invalid peer certificate: Other" + HINT, "its certificate is not valid"),

@@ -21,20 +21,16 @@ def test_the_deployed_configuration_is_what_the_deployed_settings_make(capsys: p
 
 
 def test_options_go_before_the_file(tmp_path: Path) -> None:
-    file = tmp_path / "router.toml"
+    file, tls = tmp_path / "router.toml", Tls("ca.pem", "c.pem", "k.pem")
     file.write_text("listen = ['tcp/127.0.0.1:1']\nrealm = 'lab'\n")
-    assert settings_of(file, {"listen": (), "realm": ""}).listen == ("tcp/127.0.0.1:1",)
-    settings = settings_of(file, {"listen": ("tls/127.0.0.1:2",), "tls": Tls("ca.pem", "c.pem", "k.pem")})
-    assert (settings.listen, settings.realm, settings.tls) == (
-        ("tls/127.0.0.1:2",),
-        "lab",
-        Tls("ca.pem", "c.pem", "k.pem"),
-    )
+    assert settings_of(file, {"listen": [], "realm": ""}).listen == ("tcp/127.0.0.1:1",)
+    settings = settings_of(file, {"listen": ["tls/127.0.0.1:2"], "tls": tls})
+    assert (settings.listen, settings.realm, settings.tls) == (("tls/127.0.0.1:2",), "lab", tls)
 
 
 def test_a_wrong_option_or_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"^listen\[0\] = 'hello'"):
-        settings_of(None, {"listen": ("hello",)})
+        settings_of(None, {"listen": ["hello"]})
     (tmp_path / "router.toml").write_text("roles = 'roles.toml'")
     save_roles(tmp_path / "roles.toml", LAB)
     with pytest.raises(ConfigError, match=r"router\.toml: roles = .*: expected tls too"):

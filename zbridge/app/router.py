@@ -138,8 +138,10 @@ _LEVELS = {
     "TRACE": logging.DEBUG,
 }
 _REFUSED = "refused a connection:"
+_RENEW = "its certificate has expired (zbridge certs renew)"
 _WORDS = (
-    ("certificate expired", f"{_REFUSED} its certificate has expired (zbridge certs renew), or a clock is wrong"),
+    ("remote certificate chain expired", f"closed a connection: {_RENEW}"),
+    ("certificate expired", f"{_REFUSED} {_RENEW}, or a clock is wrong"),
     ("not valid yet", f"{_REFUSED} its certificate is not valid yet: the clock of one machine is wrong"),
     ("peer sent no certificates", f"{_REFUSED} it showed no certificate"),
     ("UnknownIssuer|BadSignature", f"{_REFUSED} its certificate is of another authority"),

@@ -91,7 +91,6 @@ def said(each: Try) -> str:
 
 PUTS: list[tuple[Column, str, bool]] = [
     ("viewer", "fleet/*/@cmd/stop", True),
-    ("viewer", "fleet/r$*/@cmd/stop", True),
     ("viewer", "fleet/**", False),
     ("viewer", "fleet/r1/**", False),
     ("viewer", "fleet/r1/@cmd/*", False),
@@ -102,6 +101,7 @@ PUTS: list[tuple[Column, str, bool]] = [
     ("operator", "fleet/r1/*", False),
     ("operator", "fleet/r1/@cmd/**", True),
     ("supervisor", "fleet/**", False),
+    ("supervisor", "fleet/r$*/@cmd/stop", True),
     ("gateway", "fleet/r1/**", True),
     ("gateway", "fleet/**", False),
     ("gateway", "fleet/*/status", False),
@@ -136,7 +136,6 @@ def test_a_wildcard_reaches_no_further_than_the_keys_that_are_allowed(scene: Sce
     with Heard(scene.far, *WIDE) as heard:
         for column, key_expr, _ in PUTS:
             scene.members[column].put(key_expr, b"", attachment=f"{column} puts")
-            time.sleep(APART_S)
         for column, key_expr, _ in QUERIES:
             scene.members[column].get(key_expr, ignore, payload=f"{column} asks", timeout=1.0)
         expected = {
@@ -259,6 +258,7 @@ def test_a_flood_of_stops_is_thinned_for_its_robot_and_no_other_stop_is_lost(sce
         for _ in range(FLOOD):
             viewer.put("fleet/r1/@cmd/stop", b"", attachment="viewer", congestion_control=BLOCK)
         viewer.put("fleet/r2/@cmd/stop", b"", attachment="viewer", congestion_control=BLOCK)
+        until(lambda: ("viewer", "fleet/r2/@cmd/stop") in heard.counts, what="the stop of the other robot")
         time.sleep(APART_S)
         viewer.put("fleet/*/@cmd/stop", b"", attachment="viewer", congestion_control=BLOCK)
         scene.members["operator"].put("fleet/r1/@cmd/stop", b"", attachment="operator", congestion_control=BLOCK)
@@ -273,7 +273,7 @@ def test_a_flood_of_stops_is_thinned_for_its_robot_and_no_other_stop_is_lost(sce
 
 FLOOD = 20_000
 APART_S = 0.005
-"""Between two stops of one member that must both arrive, where one of them has wildcards."""
+"""Before a stop with wildcards that must arrive: it counts for a robot that the flood was for."""
 BLOCK = zenoh.CongestionControl.BLOCK
 SIZES: list[tuple[Column, str, int, bool]] = [
     ("viewer", "fleet/r1/@cmd/stop", 256, True),

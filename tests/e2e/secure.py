@@ -20,7 +20,7 @@ import zenoh
 
 from tests.access import COLUMNS, LAB, OTHER, REALM, Try, granted_by_the_code, tries
 from tests.certificates import Authority
-from tests.e2e.conftest import HOST, free_port, until
+from tests.e2e.conftest import HOST, WAIT_S, free_port, until
 from zbridge.app.access import Column, Keys, Kind, expressions
 from zbridge.app.roles import Member, Roles, save_roles
 
@@ -120,7 +120,7 @@ class Matrix:
     def _wait(self, *kinds: Kind, column: str | None = None) -> None:
         """Wait for what is allowed, as long as that may take; then a while for what is not."""
         expected = {each for each in self._expected if each.kind in kinds and column in (None, each.column)}
-        patience = time.monotonic() + 5.0
+        patience = time.monotonic() + WAIT_S
         while not expected <= self.seen and time.monotonic() < patience:
             time.sleep(0.01)
         time.sleep(GRACE_S)
@@ -149,7 +149,7 @@ class Matrix:
             for each, session in self._of(Kind.DELETE):
                 session.delete(each.key, attachment=each.column)
             for each, session in self._of(Kind.QUERY):
-                session.get(each.key, ignore, payload=each.column, timeout=1.0, target=zenoh.QueryTarget.ALL)
+                session.get(each.key, ignore, payload=each.column, timeout=WAIT_S, target=zenoh.QueryTarget.ALL)
             self._wait(Kind.PUT, Kind.DELETE, Kind.QUERY)
 
     def _subscribers(self) -> None:
@@ -194,26 +194,32 @@ class Matrix:
                     key,
                     replied,
                     payload=FAR,
-                    timeout=2.0,
+                    timeout=WAIT_S,
                     target=zenoh.QueryTarget.ALL,
                     consolidation=zenoh.ConsolidationMode.NONE,
                 )
             self._wait(Kind.QUERYABLE, Kind.REPLY)
 
     def _tokens(self) -> None:
-        for column, session in self.members.items():
+        now: list[Column] = []
+        alive: set[str] = set()
 
-            def changed(sample: zenoh.Sample, column: Column = column) -> None:
-                if sample.kind == zenoh.SampleKind.PUT:
-                    self._note(column, str(sample.key_expr), Kind.TOKEN)
+        def changed(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                alive.add(str(sample.key_expr))
+                self._note(now[-1], str(sample.key_expr), Kind.TOKEN)
+            else:
+                alive.discard(str(sample.key_expr))
 
-            tokens = [each.key for each, _ in self._of(Kind.TOKEN) if each.column == column]
-            far = self.far.liveliness()
-            with (
-                declared(*(far.declare_subscriber(key, changed) for key in self.keys)),
-                declared(*(session.liveliness().declare_token(key) for key in tokens)),
-            ):
-                self._wait(Kind.TOKEN, column=column)
+        far = self.far.liveliness()
+        with declared(*(far.declare_subscriber(key, changed) for key in self.keys)):
+            time.sleep(GRACE_S)
+            for column, session in self.members.items():  # one after the other: a token does not say whose it is
+                now.append(column)
+                keys = [each.key for each, _ in self._of(Kind.TOKEN) if each.column == column]
+                with declared(*(session.liveliness().declare_token(key) for key in keys)):
+                    self._wait(Kind.TOKEN, column=column)
+                until(lambda: not alive, what="the end of the tokens")
 
     def _looks(self) -> None:
         def came(column: Column) -> Callable[[zenoh.Sample], None]:
@@ -239,7 +245,7 @@ class Matrix:
             with declared(*(self.far.liveliness().declare_token(key) for key in self.keys)):
                 self._wait(Kind.WATCH_ALIVE)
                 for each, session in self._of(Kind.ASK_ALIVE):
-                    session.liveliness().get(each.key, found(each.column), timeout=1.0)
+                    session.liveliness().get(each.key, found(each.column), timeout=WAIT_S)
                 self._wait(Kind.ASK_ALIVE)
 
 

@@ -7,6 +7,9 @@ bus starts without it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 from zbridge.bus.interface import (
     Answer,
     Batch,
@@ -16,6 +19,7 @@ from zbridge.bus.interface import (
     IncomingQuery,
     Lane,
     Look,
+    Neighbour,
     Publisher,
     Sample,
     Sort,
@@ -33,11 +37,14 @@ __all__ = [
     "IncomingQuery",
     "Lane",
     "Look",
+    "Neighbour",
     "Publisher",
     "Sample",
     "Sort",
     "Tls",
+    "hear_zenoh",
     "open_bus",
+    "open_router",
 ]
 
 
@@ -52,3 +59,23 @@ async def open_bus(
     from zbridge.bus.zenoh import open_zenoh
 
     return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds)
+
+
+async def open_router(
+    values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
+) -> Bus:
+    """Open a Zenoh router; raise BusError where that is not possible.
+
+    values: Zenoh's configuration, by paths (``listen/endpoints``). on_neighbour: called on the event loop with every
+    process that connects (True) or leaves (False).
+    """
+    from zbridge.bus.zenoh import open_router as open_zenoh_router
+
+    return await open_zenoh_router(values, metrics, on_neighbour)
+
+
+def hear_zenoh(handler: Callable[[str], None]) -> None:
+    """Give ``handler`` the warnings that Zenoh prints, on a thread of its own. Call it once, before a bus is open."""
+    from zbridge.bus.zenoh import hear_log
+
+    hear_log(handler)

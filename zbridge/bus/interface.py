@@ -39,6 +39,14 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.mode or ("client" if self.connect and not self.listen else "peer")
 
 
+class Neighbour(msgspec.Struct, frozen=True):
+    """A process that is connected to a router. name: the common name of its certificate, None without one."""
+
+    name: str | None
+    address: str
+    zid: str
+
+
 class Sample(msgspec.Struct, frozen=True):
     """One message that came in on a key."""
 

@@ -148,6 +148,37 @@ def demo(
 
 
 @app.command()
+def router(
+    file: Annotated[Path | None, typer.Argument(help="a router's configuration (TOML)", show_default=False)] = None,
+    listen: Annotated[list[str], typer.Option(help="where to listen: tls/0.0.0.0:7447")] = [],
+    connect: Annotated[list[str], typer.Option(help="another router")] = [],
+    tls: Annotated[
+        Path | None,
+        typer.Option(help="folder with ca.pem, certificate.pem and key.pem, as `zbridge certs bundle` makes it"),
+    ] = None,
+    roles: Annotated[Path | None, typer.Option(help="roles.toml: who may use the bus")] = None,
+    realm: Annotated[str, typer.Option(help="first chunk of all keys; fleet by default")] = "",
+    insecure: Annotated[bool, typer.Option("--insecure", help="serve other machines without tls")] = False,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="print the configuration for Zenoh's own router (JSON5)")
+    ] = False,
+) -> None:
+    """Run a Zenoh router in the foreground until SIGTERM or SIGINT: with tls, each member may do what its role may."""
+    from zbridge.cli.router import folder_tls, run_router
+
+    set_up_log(verbose=False)
+    given: dict[str, object] = {
+        "listen": listen,
+        "connect": connect,
+        "tls": folder_tls(tls) if tls is not None else None,
+        "roles": str(roles) if roles is not None else None,
+        "realm": realm,
+        "insecure": insecure,
+    }
+    run_router(file, given, print_config=print_config)
+
+
+@app.command()
 def ls(
     connect: Connect = [],
     realm: Realm = "fleet",

@@ -242,6 +242,14 @@ class Query(FleetMessage, frozen=True):
     """A query without fields."""
 
 
+class Membership(FleetMessage, frozen=True):
+    """What a router knows of the member that asks: its name, its role, and the robots that it names."""
+
+    name: str
+    role: str
+    robots: tuple[str, ...] = ()
+
+
 class Acquire(FleetMessage, frozen=True):
     """Ask for the lease of a robot, or take it over.
 

@@ -263,6 +263,11 @@ class KeySpace(msgspec.Struct, frozen=True):
         return self.key(f"@alive/{who}")
 
 
+def whoami(realm: str, name: str) -> str:
+    """Write the key at which a router answers one member what it knows of it; ``*``: all members."""
+    return f"{realm}/@bus/whoami/{name}"
+
+
 def split_key(key: str) -> tuple[str, str, str] | None:
     """Split a full key into realm, robot and path; None where it has fewer chunks."""
     realm, _, rest = key.partition("/")

@@ -7,7 +7,7 @@ import contextlib
 import json
 import re
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import zenoh
@@ -71,6 +71,11 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
         values["connect/timeout_ms"] = int(OPEN_S * 1000)
     if settings.tls is not None:
         values |= _tls_values(settings.tls)
+    return write_config(values)
+
+
+def write_config(values: Mapping[str, Any]) -> zenoh.Config:
+    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
     config = zenoh.Config()
     for key, value in values.items():
         try:
@@ -102,12 +107,16 @@ async def open_zenoh(
     settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
 ) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
-    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds)
+    session = await open_session(zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds))
+    return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
+
+
+async def open_session(config: zenoh.Config) -> zenoh.Session:
+    """Open a session; raise BusError where that is not possible."""
     try:
-        session = await asyncio.to_thread(zenoh.open, config)
+        return await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
         raise BusError(_ORIGIN.sub("", str(error))) from error
-    return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
 
 
 class ZenohBus:

@@ -1,0 +1,80 @@
+"""A real gateway with a listener behind the access rules: who may look looks, who may drive drives, and nobody else."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+import zbridge
+from tests.access import LAB
+from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, free_port, listener
+from tests.e2e.hq_programs import tcpudp_by_tcp
+from tests.e2e.secure import SecureBus
+from zbridge.app.roles import Member, Roles
+from zbridge.app.router_settings import folder_tls
+from zbridge.bus import BusSettings
+from zbridge.client import Fleet
+from zbridge.errors import BusError
+
+ROLES = Roles({**LAB.names, "op2": Member("operator")})
+DENIED_S = 0.7
+"""How long the forbidden is tried."""
+
+
+@contextlib.asynccontextmanager
+async def member(bus: SecureBus, name: str) -> AsyncIterator[Fleet]:
+    settings = BusSettings(mode="client", connect=(bus.endpoint,), multicast=False, tls=folder_tls(bus.folders[name]))
+    async with zbridge.connect(settings=settings) as fleet:
+        yield fleet
+
+
+async def established(fleet: Fleet) -> None:
+    async for status in fleet["r1"].status:
+        if status.state == "established":
+            return
+
+
+async def refused(fleet: Fleet, who: str, name: str, *, takeover: bool = False) -> None:
+    with pytest.raises(BusError, match="no gateway answered"):
+        async with fleet["r1"].control(who, name=name, takeover=takeover, wait_s=DENIED_S):
+            raise AssertionError(f"{who} drives")
+
+
+async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: Bench, tmp_path: Path) -> None:
+    bus = SecureBus(tmp_path / "bus", ROLES)
+    bench.stack.callback(bus.stop)
+    files, port = folder_tls(bus.folders["g2"]), free_port()
+    tls = f'[bus.tls]\nca = "{files.ca}"\ncertificate = "{files.certificate}"\nkey = "{files.key}"\n'
+    parts = (device(bench.simulator()), listener("g2", "tcpudp", port), tls)
+    gateway = Gateway(bench.stack, tmp_path / "gateway.toml", bus.endpoint, *parts)
+    async with member(bus, "v1") as viewer, member(bus, "op1") as operator, member(bus, "op2") as another:
+        await established(viewer)
+        assert set(await viewer.robots()) == {"r1"}
+        assert set(await viewer.sessions()) == {("r1", "gateway")}
+        await refused(viewer, "v1", "v1")
+        async with operator["r1"].control("op1.laptop", name="op1") as drive:
+            await drive.during(0.3, forward=0.3)
+            await operator["r1"].ask_pose()
+            await refused(another, "op1.laptop", "op1")
+            await refused(another, "op2", "op2", takeover=True)
+            await drive(forward=0.1)
+            assert drive.loss is None
+            async with member(bus, "sup1") as supervisor, supervisor["r1"].control("sup1", takeover=True) as taken:
+                await taken.during(0.2, forward=0.2)
+            assert drive.loss is not None
+        await viewer["r1"].stop()
+        with socket.create_connection((HOST, port)) as tcp:
+            move = await asyncio.to_thread(tcpudp_by_tcp, tcp)
+            async with asyncio.timeout(WAIT_S):
+                async for control in viewer["r1"].control:
+                    if (control.holder or "").startswith("hq.g2."):
+                        break
+                    move(0)  # neutral first, after the stop
+                    await asyncio.sleep(0.2)
+                    move(1)
+    gateway.end()

@@ -1,0 +1,48 @@
+"""``zbridge router``: a Zenoh router, or the configuration of one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+
+from zbridge.app import until_signal
+from zbridge.app.router import Router, ZenohWarnings
+from zbridge.app.router_settings import RouterSettings, folder_tls, load_router, nested, plan_router, zenoh_values
+from zbridge.app.toml import convert
+from zbridge.bus import hear_zenoh
+from zbridge.cli import run_loop
+from zbridge.errors import ConfigError
+
+HEAD = """\
+// The configuration of a Zenoh router, for `zenohd --config FILE`, as `zbridge router --print-config` prints it.
+// Print it again after every change of roles.toml, and restart the router: Zenoh reads rules at its start only.
+// zenohd does not answer `@bus/whoami`: members that it does not know are not told so.
+"""
+
+
+def settings_of(file: Path | None, given: dict[str, object]) -> RouterSettings:
+    """Return the settings of a file with what was given as options instead; raise ConfigError.
+
+    given: fields of RouterSettings; empty ones were not given.
+    """
+    settings = load_router(file) if file is not None else RouterSettings()
+    changes = {key: value for key, value in given.items() if value}
+    return convert(msgspec.to_builtins(settings) | msgspec.to_builtins(changes), RouterSettings)
+
+
+def run_router(file: Path | None, given: dict[str, object], *, print_config: bool) -> None:
+    """Run a router until SIGTERM or SIGINT, or print its configuration for Zenoh's own."""
+    try:
+        plan = plan_router(settings_of(file, given), files=not print_config)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}" if file is not None and str(file) not in str(error) else error) from error
+    if print_config:
+        print(HEAD + json.dumps(nested(zenoh_values(plan)), indent=2))  # noqa: T201
+        return
+    hear_zenoh(ZenohWarnings().take)
+    run_loop(until_signal(Router(plan).run()))
+
+
+__all__ = ["folder_tls", "run_router", "settings_of"]

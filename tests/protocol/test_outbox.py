@@ -142,11 +142,11 @@ def test_frames_leave_as_they_should(script: str) -> None:
     play(Outbox(0.01), script)
 
 
-def test_an_outbox_tells_whether_anything_stands_in_a_slot_and_whether_it_is_idle() -> None:
+def test_an_outbox_tells_whether_anything_stands_in_a_slot_and_whether_anything_is_due() -> None:
     outbox = Outbox(0.01)
     for script, stands in (("due never", False), ("set again m at 0.3", True), ("from 0 to 1 = 0.3:m", False)):
         play(outbox, script)
-        assert (outbox.is_set("again"), outbox.idle) == (stands, not stands)
+        assert (outbox.is_set("again"), outbox.due(99.0)) == (stands, stands)
 
 
 def test_a_flood_of_urgent_groups_leaves_group_by_group() -> None:

@@ -84,10 +84,22 @@ async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_l
     up.conversation.pump()
     up.link.written.clear()
     clock_s[0], freezes = 1.1, [2.0]
+    up.session.outbox.put(b"once")
+    looks.clear()
     up.conversation.pump()
-    assert (clock_s, up.link.written) == ([3.1], [])
+    assert (clock_s, looks[0], up.link.written[0]) == ([3.1], 1.1, b"once")
+    clock_s[0] = 4.0  # after the gap
     up.conversation.pump()
-    assert (looks[-1], up.link.written) == (3.1, [b"motion"])
+    assert (looks[1:], up.link.written[1:]) == ([4.0], [b"motion"])
+
+
+async def test_nothing_is_looked_at_while_nothing_is_due() -> None:
+    looks = list[float]()
+    up = Rig(clock=lambda: 1.0, before=lambda: looks.append(1.0)).begin()
+    up.session.outbox.set("drive", (b"motion",), 1.25)
+    looks.clear()
+    up.conversation.pump()
+    assert (looks, up.link.written) == ([], [])
     up.conversation.abandon()
 
 

@@ -83,11 +83,6 @@ class Outbox:
     def __len__(self) -> int:
         return len(self._exempt) + len(self._urgent) + len(self._queue)
 
-    @property
-    def idle(self) -> bool:
-        """Whether all queues and slots are empty."""
-        return not (self._slots or self._queue or self._urgent or self._exempt)
-
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
         if len(self._queue) >= self._limit:
@@ -183,14 +178,19 @@ class Outbox:
 
     def deadline(self) -> float | None:
         """Give the time at which :meth:`take` has a frame; None: all queues and slots are empty."""
-        if self.idle:
-            return None
         if self._exempt:
             return self._free_at
         free_at = max(self._free_at, self._quiet_until)
         if self._urgent or self._queue:
             return free_at
+        if not self._slots:
+            return None
         return max(free_at, min(group.due for group in self._slots.values()))
+
+    def due(self, now: float) -> bool:
+        """Tell whether :meth:`take` may have a frame now."""
+        at = self.deadline()
+        return at is not None and at <= now
 
     def _hurries(self, group: tuple[bytes, ...]) -> bool:
         """Tell whether a group still waits among the urgent frames, whole and in its order."""

@@ -142,10 +142,10 @@ class Session(ABC, Generic[M]):
     def receive(self, data: bytes, now: float) -> list[M]:
         """Take bytes in any cut; give the messages for the translator, also those before a broken frame."""
         messages: list[M] = []
-        if self.over:
+        established = self.state is _ESTABLISHED
+        if not established and self.over:
             return messages
         traffic, decode, tap, handled = self.traffic, self.decode, self.tap, self.handled
-        established = self.state is _ESTABLISHED
         traffic.bytes_in += len(data)
         frames, allowed = 0, self._allowance.fill(now)
         try:
@@ -235,7 +235,7 @@ class Session(ABC, Generic[M]):
         if self.state is _CLOSED:
             return None
         outbox = self.outbox.deadline() if writing else None
-        timers = math.inf if self.over else self.timers()
+        timers = math.inf if self.state is _CLOSING else self.timers()
         earliest = min(self._limit_at, timers, math.inf if outbox is None else outbox)
         return None if earliest == math.inf else earliest
 

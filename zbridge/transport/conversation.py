@@ -103,10 +103,13 @@ class Conversation:
         self.session.peer = link.peer
         self.session.open(self._clock())
 
-    @_then_pump
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        self._hand_on(self.session.receive(data, self._clock()))
+        try:
+            self._hand_on(self.session.receive(data, self._clock()))
+            self._pump()
+        except Exception as error:
+            self._fault(error)
 
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:
@@ -138,7 +141,7 @@ class Conversation:
         self._foreign.value += 1
 
     def _hand_on(self, messages: list[Any]) -> None:
-        if not self.session.over:
+        if self.session.state is not self._seen[0] and not self.session.over:
             self._notify()
         if messages:  # the messages before the end of a session are delivered before the end is reported
             self._deliver(messages)
@@ -175,10 +178,11 @@ class Conversation:
         if session.drops_source and link is not None:
             session.drops_source = False
             link.drop_source()
-        writing = link is not None and (session.over or self._takes(link))  # last words are written in any case
-        while writing and link is not None and link.ready and not (outbox.idle and session.state is _ESTABLISHED):
-            now = self._clock()  # before ``before``: what becomes due while the process is frozen waits for its turn
-            self._before()
+        established = session.state is _ESTABLISHED
+        writing = link is not None and ((not established and session.over) or self._takes(link))  # last words leave
+        now = self._clock()
+        while writing and link is not None and link.ready and (not established or outbox.due(now)):
+            self._before()  # what becomes due while the process is frozen waits for its turn: ``now`` is older
             frame = session.outgoing(now)
             if frame is None:
                 break
@@ -186,9 +190,8 @@ class Conversation:
                 link.write_datagram(frame)
             else:
                 link.write(frame)
-            outbox.written(self._clock())
-            if session.state is _ESTABLISHED and (outbox.gap_s or outbox.idle):
-                break  # nothing more may be written now
+            now, established = self._clock(), session.state is _ESTABLISHED
+            outbox.written(now)
         self._notify()
         if session.state is State.CLOSED:
             self._end()

@@ -77,7 +77,7 @@ EVERY_KEY = """
 gap_s = 0.05
 force = ["joystick", 50]
 [bus]
-connect = ["tcp/10.0.0.1:7447"]
+connect = ["tls/10.0.0.1:7447"]
 multicast = false
 stream = "block"
 tls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }
@@ -161,6 +161,10 @@ def test_variables_of_the_environment_are_put_into_strings_wherever_they_stand()
         plan(minimal(robot={"name": "${A}"}), {"A": "${B}", "B": "x"})
 
 
+def secure(**bus: Any) -> dict[str, Any]:
+    return minimal(bus={"connect": ["tls/hub.lab:7447"], "tls": {"ca": "a", "certificate": "b", "key": "c"}, **bus})
+
+
 INF, NAN = math.inf, math.nan
 NOT_NAMES = ("a/b", "", "@r", "*")
 
@@ -170,6 +174,12 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     ({"robot": {"name": "r1"}}, "device: missing, it is required where there is no [[hq]]"),
     (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
     (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
+    # On a secure bus every program is a client of a router
+    (secure(mode="peer"), "bus.mode = 'peer': expected 'client': with tls"),
+    (secure(mode="router"), "bus.mode = 'router': expected 'client': with tls"),
+    (secure(listen=["tls/0.0.0.0:7447"]), "bus.listen = ['tls/0.0.0.0:7447']: expected none: with tls"),
+    (secure(connect=[]), "bus.connect: missing, expected tls/host:port"),
+    (secure(connect=["tls/a:1", "tcp/a:1"]), "bus.connect = 'tcp/a:1': expected tls/host:port: with tls nothing"),
     (minimal(colour="red"), "colour = 'red': unknown key"),
     (minimal(robot={"nam": "r1"}), "expected one of name, realm"),
     (serving(hq(colour="red")), "hq[0].colour = 'red': unknown key; expected one of protocol, listen, name, options"),

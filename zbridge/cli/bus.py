@@ -23,7 +23,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
-from zbridge.fleet.topics import split_key
+from zbridge.fleet.topics import is_name, split_key
 from zbridge.metrics import Metrics
 
 _SHOWN = 8
@@ -42,9 +42,9 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emo
 
 
 @contextlib.asynccontextmanager
-async def joined(settings: BusSettings) -> AsyncIterator[Bus]:
-    """Open the bus while the context lasts; raise BusError."""
-    bus = await open_bus(settings, Metrics(), wait_for_peers=True)
+async def joined(settings: BusSettings, realm: str | None) -> AsyncIterator[Bus]:
+    """Open the bus while the context lasts; raise BusError. realm: where a router must know us; None: wherever."""
+    bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
         yield bus
     finally:
@@ -140,7 +140,8 @@ async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) ->
         if seen == count:
             done.set()
 
-    async with joined(settings) as bus:
+    realm = key.partition("/")[0]
+    async with joined(settings, realm if is_name(realm) else None) as bus:
         bus.subscribe(key, show, history=True)
         await done.wait()
 

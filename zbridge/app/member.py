@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from zbridge.app.certs.files import read_secret
 from zbridge.app.config import Plan
 from zbridge.app.roles import ROLES
 from zbridge.bus import Tls
@@ -26,6 +25,8 @@ def check_member(plan: Plan) -> Certificate | None:
         return None
     if tls.certificate is None or tls.key is None:
         raise ConfigError("bus.tls: expected ca, certificate and key: a secure bus knows everybody by a certificate")
+    from zbridge.app.certs.files import read_secret  # of use on a secure bus alone
+
     certificate = own_certificate(tls)
     read_secret(Path(tls.key))
     if problem := unusable(tls):

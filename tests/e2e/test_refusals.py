@@ -1,0 +1,173 @@
+"""Why a router was not reached, tried for real: each case is named by the client, by ``zbridge ls`` and by ``run``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import zenoh
+
+import zbridge
+from tests.e2e.conftest import HOST, WAIT_S, configuration, device, end, free_port, start, until
+from tests.machine import Patience
+from zbridge.app import Gateway, load
+from zbridge.app.certs import authority
+from zbridge.app.certs.authority import Request
+from zbridge.app.certs.files import Folder
+from zbridge.app.member import check_member
+from zbridge.app.roles import Member
+from zbridge.errors import BusError, ConfigError
+
+DAY = timedelta(days=1)
+GATEWAY = Member("gateway", ("r1",))
+
+
+class Lab:
+    """A router with mutual TLS, one of plain TCP, and the folders of members that are wrong in one way each."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.folder = path, Folder(path / "certs")
+        self.port, self.plain, self.nobody = free_port(), free_port(), free_port()
+        self.now = datetime.now(UTC)
+        authority.init(self.folder, self.now)
+        authority.issue(self.folder, Request("hub", Member("router"), (HOST,)), self.now)
+        for name in ("ann", "old", "young"):
+            self.issue(name)
+        authority.renew(self.folder, "old", self.now - 2 * DAY, days=1)
+        authority.renew(self.folder, "young", self.now + 2 * DAY)
+        self.other = Folder(path / "other")
+        authority.init(self.other, self.now)
+        authority.issue(self.other, Request("ann", GATEWAY), self.now)
+        self.mixed("knowing", self.other, ca=self.folder.ca)
+        self.mixed("mismatched", self.folder, key=self.folder.of("old").key)
+
+    def issue(self, name: str) -> None:
+        authority.issue(self.folder, Request(name, GATEWAY), self.now)
+
+    def mixed(self, name: str, folder: Folder, **files: Path) -> None:
+        """Copy the files of ann, some of them replaced."""
+        there = self.path / name
+        shutil.copytree(folder.of("ann").folder, there)
+        for kind, file in files.items():
+            shutil.copy(file, there / f"{kind}.pem")
+
+    @contextlib.contextmanager
+    def routing(self) -> Iterator[None]:
+        log = self.path / "log"
+        options = ("--tls", str(self.folder.of("hub").folder), "--roles", str(self.folder.roles))
+        with log.open("wb") as output:
+            router = start("router", "--listen", f"tls/{HOST}:{self.port}", *options, stdout=output, stderr=output)
+        try:
+            until(lambda: b"router at" in log.read_bytes(), what="router")
+            self.issue("zed")  # the router has read roles.toml
+            with zenoh.open(configuration("router", f"tcp/{HOST}:{self.plain}")):
+                yield
+        finally:
+            end(router)
+
+
+class Case(NamedTuple):
+    """What is wrong. where: an endpoint. folder: of a lab; None: no certificate at all."""
+
+    name: str
+    where: Callable[[Lab], str]
+    folder: Callable[[Lab], Path] | None
+    said: str
+
+
+def router(lab: Lab) -> str:
+    return f"tls/{HOST}:{lab.port}"
+
+
+def member(name: str) -> Callable[[Lab], Path]:
+    return lambda lab: lab.folder.of(name).folder
+
+
+CASES = [
+    Case("no certificate", router, None, "wants a certificate, and we showed none"),
+    Case("ours is of another authority", router, lambda lab: lab.path / "knowing", "another authority"),
+    Case("the router's is of another", router, lambda lab: lab.other.of("ann").folder, "is of another authority than"),
+    Case("expired", router, member("old"), "the certificate of gateway.old expired on "),
+    Case("not yet valid", router, member("young"), "the certificate of gateway.young is not valid before "),
+    Case("another host", lambda lab: f"tls/localhost:{lab.port}", member("ann"), "does not name the host localhost"),
+    Case("another's key", router, lambda lab: lab.path / "mismatched", "key.pem: not the key of the certificate "),
+    Case("plain TCP there", lambda lab: f"tls/{HOST}:{lab.plain}", member("ann"), "speaks no TLS: plain TCP"),
+    Case("TLS there", lambda lab: f"tcp/{HOST}:{lab.port}", None, "speaks TLS: connect to tls/"),
+    Case("nobody there", lambda lab: f"tls/{HOST}:{lab.nobody}", member("ann"), "nobody listens at"),
+    Case("no such host", lambda lab: "tls/zbridge.invalid:7447", member("ann"), "no host has the name zbridge.invalid"),
+    Case("unknown name", router, member("zed"), "the router does not know gateway.zed in realm fleet"),
+]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    lab = Lab(tmp_path)
+    with lab.routing():
+        yield lab
+
+
+async def test_each_case_is_named_by_the_client_by_ls_and_by_run(lab: Lab, caplog: pytest.LogCaptureFixture) -> None:
+    with contextlib.ExitStack() as stack:
+        listing = {}
+        for case in CASES:
+            tls = ("--tls", str(case.folder(lab))) if case.folder is not None else ()
+            listing[case] = start("ls", "--connect", case.where(lab), *tls)
+            stack.callback(end, listing[case], signal.SIGKILL)
+        assert {case.name: await told(lab, case) for case in CASES} == {case.name: True for case in CASES}
+        assert {case.name: await logged(lab, case, caplog) for case in CASES} == {case.name: True for case in CASES}
+        for case in CASES:
+            said = listing[case].communicate(timeout=60)[0]
+            assert case.said in said, case.name
+            assert (listing[case].returncode, said.count("\n")) == (1, 1), said
+
+
+async def told(lab: Lab, case: Case) -> bool | str:
+    """Tell whether the client's error says it."""
+    tls = case.folder(lab) if case.folder is not None else None
+    with pytest.raises(BusError) as raised:
+        async with zbridge.connect(case.where(lab), tls=tls):
+            pass
+    return case.said in str(raised.value) or str(raised.value)
+
+
+async def logged(lab: Lab, case: Case, caplog: pytest.LogCaptureFixture) -> bool | str:
+    """Tell whether a gateway says it: in its log, or as what is wrong with its files."""
+    file = lab.path / "r1.toml"
+    file.write_text(f'[robot]\nname = "r1"\n{device(1)}[bus]\nmulticast = false\nconnect = ["{case.where(lab)}"]\n')
+    plan = load(file, {}, tls=case.folder(lab) if case.folder is not None else None)
+    try:
+        check_member(plan)
+    except ConfigError as error:
+        return case.said in str(error) or str(error)
+    caplog.clear()
+    running = asyncio.create_task(Gateway(plan).run())
+    patience = Patience(WAIT_S)
+    while case.said not in caplog.text and not patience.over:
+        await asyncio.sleep(0.05)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    return case.said in caplog.text or caplog.text
+
+
+async def test_with_a_folder_alone_a_member_is_connected_and_one_without_the_robot_is_told(lab: Lab) -> None:
+    (lab.folder.of("ann").folder / "bus.toml").write_text(f'[bus]\nconnect = ["{router(lab)}"]\n')
+    async with zbridge.connect(tls=lab.folder.of("ann").folder) as fleet:
+        assert await fleet.robots() == {}
+    file = lab.path / "r2.toml"
+    file.write_text(f'[robot]\nname = "r2"\n{device(1)}')
+    checked = start("check", str(file), "--tls", str(lab.folder.of("ann").folder))
+    assert (
+        "not checked: whether the router knows gateway.ann and lets it serve r2" in checked.communicate(timeout=30)[0]
+    )
+    with (lab.path / "r2.log").open("wb") as log:
+        running = start("run", str(file), "--tls", str(lab.folder.of("ann").folder), stdout=log, stderr=log)
+    until(lambda: "gateway.ann is for r1 and not for r2" in (lab.path / "r2.log").read_text(), what="refusal")
+    end(running)
+    assert running.returncode == 0

@@ -106,9 +106,9 @@ CASES = [
 ]
 
 
-@pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Lab]:
-    lab = Lab(tmp_path)
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    lab = Lab(tmp_path_factory.mktemp("lab"))
     with lab.routing():
         yield lab
 
@@ -120,8 +120,8 @@ async def test_each_case_is_named_by_the_client_by_ls_and_by_run(lab: Lab, caplo
             tls = ("--tls", str(case.folder(lab))) if case.folder is not None else ()
             listing[case] = start("ls", "--connect", case.where(lab), *tls)
             stack.callback(end, listing[case], signal.SIGKILL)
-        assert {case.name: await told(lab, case) for case in CASES} == {case.name: True for case in CASES}
-        assert {case.name: await logged(lab, case, caplog) for case in CASES} == {case.name: True for case in CASES}
+        assert await asyncio.gather(*(told(lab, case) for case in CASES)) == [True] * len(CASES)
+        assert await asyncio.gather(*(logged(lab, case, caplog) for case in CASES)) == [True] * len(CASES)
         for case in CASES:
             said = listing[case].communicate(timeout=60)[0]
             assert case.said in said, case.name
@@ -139,17 +139,16 @@ async def told(lab: Lab, case: Case) -> bool | str:
 
 async def logged(lab: Lab, case: Case, caplog: pytest.LogCaptureFixture) -> bool | str:
     """Tell whether a gateway says it: in its log, or as what is wrong with its files."""
-    file = lab.path / "r1.toml"
+    file = lab.path / f"{case.name}.toml"
     file.write_text(f'[robot]\nname = "r1"\n{device(1)}[bus]\nmulticast = false\nconnect = ["{case.where(lab)}"]\n')
     plan = load(file, {}, tls=case.folder(lab) if case.folder is not None else None)
     try:
         check_member(plan)
     except ConfigError as error:
         return case.said in str(error) or str(error)
-    caplog.clear()
     running = asyncio.create_task(Gateway(plan).run())
     patience = Patience(WAIT_S)
-    while case.said not in caplog.text and not patience.over:
+    while case.said not in caplog.text and not patience.over:  # noqa: ASYNC110 - a log, no event
         await asyncio.sleep(0.05)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

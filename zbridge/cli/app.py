@@ -173,12 +173,15 @@ def probe(
 @app.command()
 def demo(
     seconds: Annotated[float, typer.Option(help="end after this many seconds; 0: run until interrupted")] = 0.0,
+    secure: Annotated[
+        bool, typer.Option("--secure", help="on mutual TLS, with roles made on the fly; needs zbridge[certs]")
+    ] = False,
 ) -> None:
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
     from zbridge.cli.demo import run_demo
 
     set_up_log(verbose=False, level=logging.WARNING)
-    run_loop(run_demo(seconds))
+    run_loop(run_demo(seconds, secure=secure))
 
 
 @app.command()

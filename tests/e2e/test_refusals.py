@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import shutil
 import signal
+import socket
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,6 +17,7 @@ import zenoh
 
 import zbridge
 from tests.e2e.conftest import HOST, WAIT_S, configuration, device, end, free_port, start, until
+from tests.e2e.test_certs import routing
 from tests.machine import Patience
 from zbridge.app import Gateway, load
 from zbridge.app.certs import authority
@@ -23,6 +25,8 @@ from zbridge.app.certs.authority import Request
 from zbridge.app.certs.files import Folder
 from zbridge.app.member import check_member
 from zbridge.app.roles import Member
+from zbridge.bus import BusSettings
+from zbridge.cli.bus import list_robots
 from zbridge.errors import BusError, ConfigError
 
 DAY = timedelta(days=1)
@@ -34,7 +38,7 @@ class Lab:
 
     def __init__(self, path: Path) -> None:
         self.path, self.folder = path, Folder(path / "certs")
-        self.port, self.plain, self.nobody = free_port(), free_port(), free_port()
+        self.port, self.plain, self.false, self.silent, self.nobody = (free_port() for _ in range(5))
         self.now = datetime.now(UTC)
         authority.init(self.folder, self.now)
         authority.issue(self.folder, Request("hub", Member("router"), (HOST,)), self.now)
@@ -67,7 +71,11 @@ class Lab:
         try:
             until(lambda: b"router at" in log.read_bytes(), what="router")
             self.issue("zed")  # the router has read roles.toml
-            with zenoh.open(configuration("router", f"tcp/{HOST}:{self.plain}")):
+            with (
+                zenoh.open(configuration("router", f"tcp/{HOST}:{self.plain}")),
+                routing(self.folder.of("ann"), self.false),
+                socket.create_server((HOST, self.silent)),
+            ):
                 yield
         finally:
             end(router)
@@ -97,6 +105,8 @@ CASES = [
     Case("expired", router, member("old"), "the certificate of gateway.old expired on "),
     Case("not yet valid", router, member("young"), "the certificate of gateway.young is not valid before "),
     Case("another host", lambda lab: f"tls/localhost:{lab.port}", member("ann"), "does not name the host localhost"),
+    Case("no router's", lambda lab: f"tls/{HOST}:{lab.false}", member("ann"), "is not one of a server"),
+    Case("silence", lambda lab: f"tls/{HOST}:{lab.silent}", member("ann"), "does not answer in TLS"),
     Case("another's key", router, lambda lab: lab.path / "mismatched", "key.pem: not the key of the certificate "),
     Case("plain TCP there", lambda lab: f"tls/{HOST}:{lab.plain}", member("ann"), "speaks no TLS: plain TCP"),
     Case("TLS there", lambda lab: f"tcp/{HOST}:{lab.port}", None, "speaks TLS: connect to tls/"),
@@ -153,6 +163,15 @@ async def logged(lab: Lab, case: Case, caplog: pytest.LogCaptureFixture) -> bool
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
     return case.said in caplog.text or caplog.text
+
+
+@pytest.mark.parametrize(("port", "hint"), [("port", ": 127.0.0.1:{port} speaks TLS: "), ("plain", "\n")])
+async def test_who_sees_no_robot_is_told_of_a_router_that_speaks_tls(
+    lab: Lab, capsys: pytest.CaptureFixture[str], port: str, hint: str
+) -> None:
+    where = BusSettings(mode="peer", connect=(f"tcp/{HOST}:{getattr(lab, port)}",), multicast=False)
+    await list_robots(where, "fleet", as_json=False)
+    assert f"no robots on fleet/{hint.format(port=lab.port)}" in capsys.readouterr().err
 
 
 async def test_with_a_folder_alone_a_member_is_connected_and_one_without_the_robot_is_told(lab: Lab) -> None:

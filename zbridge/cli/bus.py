@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.bus.tls.refusal import why_not
 from zbridge.client import connect
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
@@ -62,7 +63,9 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
     elif robots:
         console.print(_robot_table(robots))
     else:
-        errors.print(f"no robots on {realm}/")
+        finding = await why_not(settings) if settings.tls is None else None  # the router may speak TLS
+        more = f": {shown(finding.text)}" if finding is not None and finding.refused else ""
+        errors.print(f"no robots on {realm}/{more}")
 
 
 async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> None:

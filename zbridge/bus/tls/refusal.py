@@ -26,10 +26,13 @@ LONGEST_S = 3.0
 """Longest time that finding the cause takes."""
 _HANDSHAKE_S = 1.8
 """Longest time for the handshake; what is left is for telling who it is that answers no TLS."""
+_PLAIN_S = 0.5
+"""Longest time for a router of plain TCP to end a connection that says nonsense."""
 _MOST = 4
 """Endpoints that are tried."""
-_NO_MESSAGE = b"\x01\x00\xff"
-"""A frame of Zenoh's over plain TCP, of one byte, that is no message: it ends the connection. TLS waits for more."""
+_NO_MESSAGE = b"\x16\x03\x03\x04\x00".ljust(2 + 0x0316, b"\xff")
+"""Over plain TCP a whole frame of Zenoh's (its length comes first, 0x0316) that is no message: it ends the connection.
+For TLS the beginning of a record of 0x0400 bytes: the rest is waited for."""
 
 
 class Finding(msgspec.Struct, frozen=True):
@@ -72,12 +75,15 @@ def ask_endpoint(endpoint: str, tls: Tls | None) -> Finding | None:
     at, deadline = f"{host}:{port}", time.monotonic() + LONGEST_S
     host = host.strip("[]")
     try:
+        if kind == "tcp" and _is_plain(host, int(port), deadline):
+            return None
         with socket.create_connection((host, int(port)), _left(deadline)) as link:
             finding = _shake_hands(link, at, host, tls, kind, deadline)
         if finding is not None or kind == "tcp":
             return finding
-        with socket.create_connection((host, int(port)), _left(deadline)) as link:
-            return _ask_in_plain(link, at, deadline)
+        if _is_plain(host, int(port), deadline):
+            return Finding(f"{at} speaks no TLS: plain TCP (tcp/{at}), or no router at all")
+        return Finding(f"{at} does not answer in TLS: a router with much to do, or no router at all", refused=False)
     except ConnectionRefusedError:
         return Finding(f"nobody listens at {at}", refused=False)
     except socket.gaierror:
@@ -119,13 +125,18 @@ def _shake_hands(
         return None
 
 
-def _ask_in_plain(link: socket.socket, at: str, deadline: float) -> Finding:
-    """Tell a router of plain TCP, which ends a connection that says nonsense, from one that is slow."""
-    link.settimeout(min(_left(deadline), 1.0))
-    with contextlib.suppress(ConnectionError):
-        link.sendall(_NO_MESSAGE)
-        link.recv(1)
-    return Finding(f"{at} speaks no TLS: plain TCP (tcp/{at}), or no router at all")
+def _is_plain(host: str, port: int, deadline: float) -> bool:
+    """Tell whether nonsense ends a connection at once, or is answered: so do routers of plain TCP, and many others."""
+    with socket.create_connection((host, port), _left(deadline)) as link:
+        link.settimeout(min(_left(deadline), _PLAIN_S))
+        try:
+            link.sendall(_NO_MESSAGE)
+            link.recv(1)
+        except TimeoutError:
+            return False
+        except ConnectionError:
+            pass
+    return True
 
 
 def _tls_there(at: str) -> Finding:

@@ -25,7 +25,7 @@ VALUES = {
     f"{TLS}/connect_private_key": "/k.pem",
     f"{TLS}/listen_certificate": None,
     f"{TLS}/verify_name_on_connect": True,
-    "connect/retry/period_max_ms": 16_000,
+    "connect/retry": {"period_init_ms": 1000, "period_max_ms": 16_000, "period_increase_factor": 2.0},
 }
 SETTINGS = [BusSettings(connect=(WHERE,), tls=FILES), bus_settings([WHERE], FILES)]
 
@@ -43,7 +43,7 @@ def test_no_program_makes_settings_that_go_round_the_router(fields: dict[str, ob
 
 
 def test_a_client_with_certificates_takes_no_endpoint_in_the_open_and_no_default() -> None:
-    with pytest.raises(ConfigError, match="tcp/hub.lab:1': expected tls/host:port"):
+    with pytest.raises(ConfigError, match=r"tcp/hub\.lab:1': expected tls/host:port"):
         bus_settings(["tcp/hub.lab:1"], FILES)
     with pytest.raises(ConfigError, match="missing, expected tls/host:port"):
         bus_settings([], FILES)

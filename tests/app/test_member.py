@@ -13,9 +13,10 @@ from zbridge.app.certs import authority
 from zbridge.app.certs.authority import Request
 from zbridge.app.certs.files import Folder
 from zbridge.app.config import Plan, load
-from zbridge.app.joining import LOOK_S, RARELY_S, RETRY_S, Pauses, watch_certificate
+from zbridge.app.joining import ENDED_S, RARELY_S, RETRY_S, CertificateEnded, Pauses, watch_certificate
 from zbridge.app.member import check_member
 from zbridge.app.roles import Member
+from zbridge.bus.fake import FakeBus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.control.conditions import Conditions
 from zbridge.errors import BusError, BusRefused, ConfigError
@@ -115,10 +116,10 @@ async def test_the_end_of_a_certificate_shows_on_status_and_once_a_day_in_the_lo
 ) -> None:
     loop, conditions = asyncio.get_running_loop(), Conditions()
     start = loop.time()
-    certificate = Certificate("gateway.g1", NOW, NOW + timedelta(days=32))
+    certificate, bus = Certificate("gateway.g1", NOW, NOW + timedelta(days=32)), FakeBus()
     caplog.set_level(logging.WARNING)
     watching = asyncio.create_task(
-        watch_certificate(certificate, conditions, lambda: NOW + timedelta(seconds=loop.time() - start))
+        watch_certificate(certificate, bus, conditions, lambda: NOW + timedelta(seconds=loop.time() - start))
     )
     await asyncio.sleep(timedelta(days=1.9).total_seconds())
     assert (conditions.texts, caplog.messages) == ((), [])
@@ -126,5 +127,10 @@ async def test_the_end_of_a_certificate_shows_on_status_and_once_a_day_in_the_lo
     (text,) = conditions.texts
     assert text.startswith("the certificate of gateway.g1 ends on ")
     assert caplog.messages == [text] * 3
-    watching.cancel()
-    assert LOOK_S <= 3600.0
+    await asyncio.sleep(timedelta(days=28).total_seconds())
+    assert "expired on" in conditions.texts[0]
+    assert not watching.done()  # nothing has closed the connection
+    bus.connection(False)
+    await asyncio.sleep(2 * ENDED_S)
+    with pytest.raises(CertificateEnded, match=r"gateway\.g1 expired on .*; the bus is left"):
+        await watching

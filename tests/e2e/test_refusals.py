@@ -30,6 +30,8 @@ from zbridge.cli.bus import list_robots
 from zbridge.errors import BusError, ConfigError
 
 DAY = timedelta(days=1)
+ENDS_S = 8
+"""After how long a certificate ends that ends while it is used."""
 GATEWAY = Member("gateway", ("r1",))
 
 
@@ -42,7 +44,7 @@ class Lab:
         self.now = datetime.now(UTC)
         authority.init(self.folder, self.now)
         authority.issue(self.folder, Request("hub", Member("router"), (HOST,)), self.now)
-        for name in ("ann", "old", "young"):
+        for name in ("ann", "old", "young", "short"):
             self.issue(name)
         authority.renew(self.folder, "old", self.now - 2 * DAY, days=1)
         authority.renew(self.folder, "young", self.now + 2 * DAY)
@@ -54,6 +56,11 @@ class Lab:
 
     def issue(self, name: str) -> None:
         authority.issue(self.folder, Request(name, GATEWAY), self.now)
+
+    def here(self, common_name: str) -> bool:
+        """Tell whether a member is connected, as the router says."""
+        log = (self.path / "log").read_text()
+        return f"{common_name} connected" in log.rpartition(f"{common_name} left")[2]
 
     def mixed(self, name: str, folder: Folder, **files: Path) -> None:
         """Copy the files of ann, some of them replaced."""
@@ -189,3 +196,29 @@ async def test_with_a_folder_alone_a_member_is_connected_and_one_without_the_rob
     until(lambda: "gateway.ann is for r1 and not for r2" in (lab.path / "r2.log").read_text(), what="refusal")
     end(running)
     assert running.returncode == 0
+
+
+async def test_a_gateway_whose_certificate_expires_leaves_and_is_back_with_a_renewed_one(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    authority.renew(lab.folder, "short", datetime.now(UTC) - DAY + timedelta(seconds=ENDS_S), days=1)
+    file = lab.path / "short.toml"
+    file.write_text(f'[robot]\nname = "r1"\n{device(1)}[bus]\nconnect = ["{router(lab)}"]\n')
+    plan = load(file, {}, tls=lab.folder.of("short").folder)
+    running = asyncio.create_task(Gateway(plan).run())
+
+    async def logs(*texts: str) -> None:
+        patience = Patience(3 * WAIT_S)
+        while not all(text in caplog.text for text in texts):
+            assert not patience.over, caplog.text
+            await asyncio.sleep(0.05)
+
+    await logs("the certificate of gateway.short ends on ")
+    await logs("expired on ", "; the bus is left", "no bus: the certificate of gateway.short expired")
+    authority.renew(lab.folder, "short", datetime.now(UTC))
+    patience = Patience(3 * WAIT_S)
+    while not lab.here("gateway.short"):
+        assert not patience.over
+        await asyncio.sleep(0.05)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from zbridge.app.config import Plan
-from zbridge.app.joining import join_bus, watch_certificate
+from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate
@@ -71,11 +71,14 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
         with self._audit() as audit:
-            bus = await join_bus(self._plan, self.metrics)
-            try:
-                await self._run(bus, audit)
-            finally:
-                self.left = await bus.close()
+            while True:
+                bus = await join_bus(self._plan, self.metrics)
+                try:
+                    await self._run(bus, audit)
+                except CertificateEnded as error:
+                    log.error("%s", error)
+                finally:
+                    self.left = await bus.close()
 
     async def _run(self, bus: Bus, audit: Audit) -> None:
         async with contextlib.AsyncExitStack() as stack:
@@ -91,7 +94,7 @@ class Gateway:
                 robot.open()
                 stack.callback(robot.close)
             if certificate is not None:
-                work.append(watch_certificate(certificate, self.conditions))
+                work.append(watch_certificate(certificate, bus, self.conditions))
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:

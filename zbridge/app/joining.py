@@ -1,4 +1,8 @@
-"""A gateway joins the bus, and again until that succeeds; and its certificate is warned of before it ends."""
+"""A gateway joins the bus, and again until that succeeds; its certificate is warned of, and the bus left at its end.
+
+Zenoh's session would knock with an expired certificate every 4 s for good, and each time the router accepts nobody for
+0.1 s. So a gateway whose certificate has expired leaves, and tries rarely, with the file as it is then.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +31,13 @@ LOOK_S = 3600.0
 """Seconds between looks at the certificate's end."""
 SAY_S = 86_400.0
 """Seconds between log lines about the certificate's end."""
+ENDED_S = 5.0
+"""Seconds between looks after the certificate's end: at the next one without a bus the gateway leaves."""
 _CERTIFICATE = "certificate"
+
+
+class CertificateEnded(BusError):
+    """The certificate has expired and the bus is lost: this session will not get it back."""
 
 
 class Pauses:
@@ -68,15 +78,27 @@ async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
 
 
 async def watch_certificate(
-    certificate: Certificate, conditions: Conditions, now: Callable[[], datetime] = utc_now
+    certificate: Certificate, bus: Bus, conditions: Conditions, now: Callable[[], datetime] = utc_now
 ) -> None:
-    """Warn on ``status`` and in the log from 30 days before a certificate ends."""
+    """Warn on ``status`` and in the log from 30 days before a certificate ends.
+
+    Raises CertificateEnded when it has ended and there is no connection to the bus.
+    """
     loop = asyncio.get_running_loop()
-    said, said_at = None, 0.0
+    said, said_at, here = None, 0.0, True
+
+    def connected(is_here: bool) -> None:
+        nonlocal here
+        here = is_here
+
+    bus.watch_connected(connected)
     while True:
         text = ends_soon(certificate, now())
         conditions.set(_CERTIFICATE, text)
         if text is not None and (text != said or loop.time() - said_at >= SAY_S):
             said, said_at = text, loop.time()
             log.warning("%s", text)
-        await asyncio.sleep(LOOK_S)
+        left_s = (certificate.ends - now()).total_seconds()
+        if left_s <= 0 and not here:
+            raise CertificateEnded(f"{text}; the bus is left")
+        await asyncio.sleep(min(max(left_s, 0.0) + ENDED_S, LOOK_S))

@@ -25,7 +25,6 @@ VALUES = {
     f"{TLS}/connect_private_key": "/k.pem",
     f"{TLS}/listen_certificate": None,
     f"{TLS}/verify_name_on_connect": True,
-    "connect/retry": {"period_init_ms": 1000, "period_max_ms": 16_000, "period_increase_factor": 2.0},
 }
 SETTINGS = [BusSettings(connect=(WHERE,), tls=FILES), bus_settings([WHERE], FILES)]
 

@@ -19,9 +19,6 @@ PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
-RETRY_MS = {"period_init_ms": 1000, "period_max_ms": 16_000, "period_increase_factor": 2.0}
-"""How often a secure session that lost its router connects again. Zenoh does not tell a router that is away from one
-that refuses, and a router accepts nobody for 0.1 s after each failed handshake."""
 _INGRESS = ("ingress",)
 _BOUNDED = ("put", "delete", "query")
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
@@ -77,7 +74,6 @@ def _secure_values(tls: Tls) -> dict[str, Any]:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/protocols": list(SECURE),
-        "connect/retry": RETRY_MS,
         f"{at}/root_ca_certificate": tls.ca,
         f"{at}/verify_name_on_connect": True,
     }

@@ -95,7 +95,7 @@ FOLDERS: list[tuple[str, str | None, str]] = [
     ("", "", "no bus.toml there; give --connect tls/HOST:7447"),
     ("", "[bus]\n", "bus.toml: expected a [bus] table with connect = "),
     ("", "hello", "bus.toml: expected a [bus] table with connect = "),
-    ('[bus]\nmode = "peer"\n', BUNDLED, "bus.mode = 'peer': expected 'client'"),
+    ('[bus]\nmode = "peer"\n', BUNDLED, "bus.mode = 'peer': expected 'client', or none"),
     ("[bus]\n" + BUNDLED + FILES, BUNDLED, "expected only for a file without bus.tls"),
 ]
 
@@ -229,8 +229,8 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
     (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
     # On a secure bus every program is a client of a router
-    (secure(mode="peer"), "bus.mode = 'peer': expected 'client': with tls"),
-    (secure(mode="router"), "bus.mode = 'router': expected 'client': with tls"),
+    (secure(mode="peer"), "bus.mode = 'peer': expected 'client', or none: with tls"),
+    (secure(mode="router"), "bus.mode = 'router': expected 'client', or none: with tls"),
     (secure(listen=["tls/0.0.0.0:7447"]), "bus.listen = ['tls/0.0.0.0:7447']: expected none: with tls"),
     (secure(connect=[]), "bus.connect: missing, expected tls/host:port"),
     (secure(connect=["tls/a:1", "tcp/a:1"]), "bus.connect = 'tcp/a:1': expected tls/host:port: with tls nothing"),

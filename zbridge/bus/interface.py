@@ -46,7 +46,7 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return
         why = "with tls every program is a client of a router"
         if self.mode not in (None, "client"):
-            raise ConfigError(f"bus.mode = {self.mode!r}: expected 'client': {why}")
+            raise ConfigError(f"bus.mode = {self.mode!r}: expected 'client', or none: {why}")
         if self.listen:
             raise ConfigError(f"bus.listen = {list(self.listen)}: expected none: {why}")
         if not self.connect:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import socket
 
 import pytest
 
-from zbridge.bus import BusSettings, Tls
+from zbridge.bus import BusSettings, Tls, open_bus
 from zbridge.bus.zenoh import zenoh_config
 from zbridge.client import bus_settings
-from zbridge.errors import ConfigError
+from zbridge.errors import BusError, ConfigError
+from zbridge.metrics import Metrics
 
 WHERE, FILES = "tls/hub.lab:7447", Tls("/a.pem", "/c.pem", "/k.pem")
 TLS = "transport/link/tls"
@@ -46,3 +48,13 @@ def test_a_client_with_certificates_takes_no_endpoint_in_the_open_and_no_default
         bus_settings(["tcp/hub.lab:1"], FILES)
     with pytest.raises(ConfigError, match="missing, expected tls/host:port"):
         bus_settings([], FILES)
+
+
+async def test_an_address_to_listen_at_that_is_taken_is_what_is_told() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken, socket.create_server(("127.0.0.1", 0)) as away:
+        listen, connect = (f"tcp/127.0.0.1:{each.getsockname()[1]}" for each in (taken, away))
+        away.close()
+        settings = BusSettings(mode="router", listen=(listen,), connect=(connect,), multicast=False)
+        with pytest.raises(BusError) as raised:
+            await open_bus(settings, Metrics())
+    assert "nobody listens" not in str(raised.value)

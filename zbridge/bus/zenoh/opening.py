@@ -96,7 +96,8 @@ async def open_or_say_why(config: zenoh.Config, settings: BusSettings) -> zenoh.
     try:
         return await open_session(config)
     except BusError as error:
-        finding = await why_not(settings)
+        # Others open without a connection: what failed is something else, an address to listen at.
+        finding = await why_not(settings) if settings.effective_mode == "client" else None
         if finding is None:
             raise
         raise (BusRefused if finding.refused else BusError)(finding.text) from error

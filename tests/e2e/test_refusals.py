@@ -7,7 +7,7 @@ import contextlib
 import shutil
 import signal
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -88,6 +88,9 @@ class Lab:
             end(router)
 
 
+AT_A_TIME, TRIES = 5, 3
+
+
 class Case(NamedTuple):
     """What is wrong. where: an endpoint. folder: of a lab; None: no certificate at all."""
 
@@ -95,6 +98,9 @@ class Case(NamedTuple):
     where: Callable[[Lab], str]
     folder: Callable[[Lab], Path] | None
     said: str
+
+
+Try = Callable[[Lab, Case], Awaitable[bool | str]]
 
 
 def router(lab: Lab) -> str:
@@ -131,18 +137,20 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
 
 
 async def test_each_case_is_named_by_the_client_by_ls_and_by_run(lab: Lab, caplog: pytest.LogCaptureFixture) -> None:
-    with contextlib.ExitStack() as stack:
-        listing = {}
-        for case in CASES:
-            tls = ("--tls", str(case.folder(lab))) if case.folder is not None else ()
-            listing[case] = start("ls", "--connect", case.where(lab), *tls)
-            stack.callback(end, listing[case], signal.SIGKILL)
-        assert await asyncio.gather(*(told(lab, case) for case in CASES)) == [True] * len(CASES)
-        assert await asyncio.gather(*(logged(lab, case, caplog) for case in CASES)) == [True] * len(CASES)
-        for case in CASES:
-            said = listing[case].communicate(timeout=60)[0]
-            assert case.said in said, case.name
-            assert (listing[case].returncode, said.count("\n")) == (1, 1), said
+    some = asyncio.Semaphore(AT_A_TIME)
+    assert await asyncio.gather(*(again(told, lab, case, some) for case in CASES)) == [True] * len(CASES)
+    assert await asyncio.gather(*(again(listed, lab, case, some) for case in CASES)) == [True] * len(CASES)
+    assert await asyncio.gather(*(logged(lab, case, caplog) for case in CASES)) == [True] * len(CASES)
+
+
+async def again(try_it: Try, lab: Lab, case: Case, some: asyncio.Semaphore) -> bool | str:
+    """Try a case again where nothing was found: on a busy machine a handshake may take longer than it is given."""
+    async with some:
+        for _ in range(TRIES):
+            found = await try_it(lab, case)
+            if found is True:
+                break
+        return found
 
 
 async def told(lab: Lab, case: Case) -> bool | str:
@@ -152,6 +160,18 @@ async def told(lab: Lab, case: Case) -> bool | str:
         async with zbridge.connect(case.where(lab), tls=tls):
             pass
     return case.said in str(raised.value) or str(raised.value)
+
+
+async def listed(lab: Lab, case: Case) -> bool | str:
+    """Tell whether ``zbridge ls`` says it, in one line."""
+    tls = ("--tls", str(case.folder(lab))) if case.folder is not None else ()
+    process = start("ls", "--connect", case.where(lab), *tls)
+    try:
+        said: str = (await asyncio.to_thread(process.communicate, timeout=60))[0]
+    finally:
+        end(process, signal.SIGKILL)
+    assert (process.returncode, said.count("\n")) == (1, 1), said
+    return case.said in said or said
 
 
 async def logged(lab: Lab, case: Case, caplog: pytest.LogCaptureFixture) -> bool | str:

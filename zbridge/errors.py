@@ -146,5 +146,9 @@ class BusError(ZbridgeError):
     """The bus cannot be opened, or a query on it has no answer."""
 
 
+class BusRefused(BusError):
+    """The bus cannot be opened, and trying again soon helps nobody: the text says who refused whom, and why."""
+
+
 class ConfigError(ZbridgeError):
     """A configuration is not valid; the text names file, key, value and what was expected."""

@@ -11,6 +11,7 @@ import pytest
 from zbridge.app import config
 from zbridge.app.config import Plan, load, plan
 from zbridge.app.templates import listener_template, robot_template
+from zbridge.bus import Tls
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError
 from zbridge.hq.settings import HqSettings
@@ -60,6 +61,59 @@ def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
     assert (bus.effective_mode, bus.multicast, bus.stream) == ("peer", True, "drop")
 
 
+SECURE = MINIMAL + '[bus]\nconnect = ["tls/hub.lab:7447"]\n'
+FILES = 'tls = { ca = "ca.pem", certificate = "own/c.pem", key = "/etc/k.pem" }\n'
+
+
+def test_files_of_tls_are_relative_to_the_file(tmp_path: Path) -> None:
+    tls = loaded(tmp_path, SECURE + FILES).config.bus.tls
+    assert tls == Tls(str(tmp_path / "ca.pem"), str(tmp_path / "own" / "c.pem"), "/etc/k.pem")
+
+
+BUNDLED = 'connect = ["tls/other.lab:7447"]\n'
+BUSES: list[tuple[str, bool, str]] = [
+    ("", True, "tls/other.lab:7447"),
+    ("", False, "tls/other.lab:7447"),
+    ('[bus]\nconnect = ["tls/hub.lab:7447"]\n', True, "tls/hub.lab:7447"),
+    ('[bus]\nconnect = ["tls/hub.lab:7447"]\n', False, "tls/hub.lab:7447"),
+]
+
+
+@pytest.mark.parametrize(("bus", "option", "endpoint"), BUSES)
+def test_a_folder_makes_a_file_without_tls_secure(tmp_path: Path, bus: str, option: bool, endpoint: str) -> None:
+    file, folder = tmp_path / "r1.toml", tmp_path / "bundle"
+    file.write_text(MINIMAL + bus)
+    folder.mkdir()
+    (folder / "bus.toml").write_text("[bus]\n" + BUNDLED)
+    settings = load(file, {} if option else {"ZBRIDGE_TLS": str(folder)}, tls=folder if option else None).config.bus
+    assert (settings.connect, settings.effective_mode) == ((endpoint,), "client")
+    assert settings.tls == Tls(*(str(folder / f"{name}.pem") for name in ("ca", "certificate", "key")))
+
+
+FOLDERS: list[tuple[str, str | None, str]] = [
+    ("", None, "no such folder; expected one as `zbridge certs bundle` makes it"),
+    ("", "", "no bus.toml there; give --connect tls/HOST:7447"),
+    ("", "[bus]\n", "bus.toml: expected a [bus] table with connect = "),
+    ("", "hello", "bus.toml: expected a [bus] table with connect = "),
+    ('[bus]\nmode = "peer"\n', BUNDLED, "bus.mode = 'peer': expected 'client', or none"),
+    ("[bus]\n" + BUNDLED + FILES, BUNDLED, "expected only for a file without bus.tls"),
+]
+
+
+@pytest.mark.parametrize(("bus", "bundled", "told"), FOLDERS)
+def test_a_folder_that_does_not_fit_is_told(tmp_path: Path, bus: str, bundled: str | None, told: str) -> None:
+    file, folder = tmp_path / "r1.toml", tmp_path / "bundle"
+    file.write_text(MINIMAL + bus)
+    if bundled is not None:
+        folder.mkdir()
+    if bundled:
+        (folder / "bus.toml").write_text(bundled if bundled != BUNDLED else "[bus]\n" + BUNDLED)
+    with pytest.raises(ConfigError) as raised:
+        load(file, {}, tls=folder)
+    assert told in str(raised.value)
+    assert str(raised.value).startswith(f"{file}: ")
+
+
 @pytest.mark.parametrize("name", protocol_names())
 def test_the_templates_of_every_protocol_are_configurations_with_all_defaults(tmp_path: Path, name: str) -> None:
     protocol = find_protocol(name)
@@ -77,10 +131,10 @@ EVERY_KEY = """
 gap_s = 0.05
 force = ["joystick", 50]
 [bus]
-connect = ["tcp/10.0.0.1:7447"]
+connect = ["tls/10.0.0.1:7447"]
 multicast = false
 stream = "block"
-tls = { ca = "ca.pem", certificate = "c.pem", key = "k.pem" }
+tls = { ca = "/etc/ca.pem", certificate = "/etc/c.pem", key = "/etc/k.pem" }
 [control]
 lease_s = 10.0
 deadman_s = 0.5
@@ -161,6 +215,10 @@ def test_variables_of_the_environment_are_put_into_strings_wherever_they_stand()
         plan(minimal(robot={"name": "${A}"}), {"A": "${B}", "B": "x"})
 
 
+def secure(**bus: Any) -> dict[str, Any]:
+    return minimal(bus={"connect": ["tls/hub.lab:7447"], "tls": {"ca": "a", "certificate": "b", "key": "c"}, **bus})
+
+
 INF, NAN = math.inf, math.nan
 NOT_NAMES = ("a/b", "", "@r", "*")
 
@@ -170,6 +228,12 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     ({"robot": {"name": "r1"}}, "device: missing, it is required where there is no [[hq]]"),
     (serving(hq(), {"protocol": "alf"}), "hq[1].listen: missing, it is required"),
     (minimal(bus={"tls": {}}), "bus.tls.ca: missing"),
+    # On a secure bus every program is a client of a router
+    (secure(mode="peer"), "bus.mode = 'peer': expected 'client', or none: with tls"),
+    (secure(mode="router"), "bus.mode = 'router': expected 'client', or none: with tls"),
+    (secure(listen=["tls/0.0.0.0:7447"]), "bus.listen = ['tls/0.0.0.0:7447']: expected none: with tls"),
+    (secure(connect=[]), "bus.connect: missing, expected tls/host:port"),
+    (secure(connect=["tls/a:1", "tcp/a:1"]), "bus.connect = 'tcp/a:1': expected tls/host:port: with tls nothing"),
     (minimal(colour="red"), "colour = 'red': unknown key"),
     (minimal(robot={"nam": "r1"}), "expected one of name, realm"),
     (serving(hq(colour="red")), "hq[0].colour = 'red': unknown key; expected one of protocol, listen, name, options"),

@@ -36,7 +36,7 @@ async def serving(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIte
     async def open_bus(*_: object, **__: object) -> Bus:
         return bus
 
-    monkeypatch.setattr("zbridge.app.gateway.open_bus", open_bus)
+    monkeypatch.setattr("zbridge.app.joining.open_bus", open_bus)
     running = asyncio.create_task(gateway.run())
     await asyncio.sleep(1.0)
     try:

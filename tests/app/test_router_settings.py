@@ -14,12 +14,12 @@ from zbridge.app.router_settings import (
     LISTEN,
     LISTEN_TLS,
     RouterSettings,
-    folder_tls,
     load_router,
     nested,
     plan_router,
     zenoh_values,
 )
+from zbridge.bus.tls.files import folder_tls
 from zbridge.errors import ConfigError
 
 WITH_TLS = "tls = { ca = 'ca.pem', certificate = 'certificate.pem', key = 'key.pem' }\n"

@@ -88,7 +88,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[tuple[World, BusSettings]]:
     """Have every client find a fake bus of its own; give what was made."""
     worlds: list[tuple[World, BusSettings]] = []
 
-    async def open_bus(settings: BusSettings, metrics: Any, *, wait_for_peers: bool = False) -> FakeBus:
+    async def open_bus(settings: BusSettings, metrics: Any, *, wait_for_peers: bool = False, realm: str) -> FakeBus:
         worlds.append((World(), settings))
         return Bus(worlds[-1][0])
 

@@ -21,12 +21,16 @@ import zenoh
 from tests.access import COLUMNS, LAB, OTHER, REALM, Try, granted_by_the_code, tries
 from tests.certificates import Authority
 from tests.e2e.conftest import HOST, WAIT_S, free_port, until
+from tests.machine import Patience
 from zbridge.app.access import Column, Keys, Kind, expressions
 from zbridge.app.roles import Member, Roles, save_roles
 
 FAR = "far"
 GRACE_S = 0.3
 """How long the forbidden is waited for, after all that is allowed has come."""
+AGAIN_S = 3.0
+"""After how long what is allowed and did not come is sent again."""
+BLOCK = zenoh.CongestionControl.BLOCK
 EVERYTHING = tuple(expressions(Keys.EVERYTHING, REALM, "", ()))
 ROLES = Roles({**LAB.names, FAR: Member("router"), "g3": Member("gateway", (OTHER,))})
 
@@ -117,12 +121,21 @@ class Matrix:
             if each is not None:
                 self.seen.add(each)
 
-    def _wait(self, *kinds: Kind, column: str | None = None) -> None:
-        """Wait for what is allowed, as long as that may take; then a while for what is not."""
+    def _wait(self, *kinds: Kind, column: str | None = None, send: Callable[[], None] = lambda: None) -> None:
+        """Send, and wait for what is allowed, as long as that may take; then a while for what is not.
+
+        On a busy machine Zenoh drops some: replies to liveliness queries, and what comes before a declaration has
+        spread. So all of it is sent again, the forbidden too, until everything that is allowed has come once.
+        """
         expected = {each for each in self._expected if each.kind in kinds and column in (None, each.column)}
-        patience = time.monotonic() + WAIT_S
-        while not expected <= self.seen and time.monotonic() < patience:
-            time.sleep(0.01)
+        patience = Patience(WAIT_S)
+        while True:
+            send()
+            again = time.monotonic() + AGAIN_S
+            while not expected <= self.seen and time.monotonic() < again:
+                time.sleep(0.01)
+            if expected <= self.seen or patience.over:
+                break
         time.sleep(GRACE_S)
 
     def _of(self, kind: Kind) -> Iterator[tuple[Try, zenoh.Session]]:
@@ -139,18 +152,20 @@ class Matrix:
             self._note(text(query.payload), str(query.key_expr), Kind.QUERY)
             query.drop()
 
+        def send() -> None:
+            for each, session in self._of(Kind.PUT):
+                session.put(each.key, b"", attachment=each.column, congestion_control=BLOCK)
+            for each, session in self._of(Kind.DELETE):
+                session.delete(each.key, attachment=each.column, congestion_control=BLOCK)
+            for each, session in self._of(Kind.QUERY):
+                session.get(each.key, ignore, payload=each.column, timeout=WAIT_S, target=zenoh.QueryTarget.ALL)
+
         with declared(
             *(self.far.declare_subscriber(each, sample) for each in EVERYTHING),
             *(self.far.declare_queryable(each, query) for each in EVERYTHING),
         ):
             time.sleep(GRACE_S)
-            for each, session in self._of(Kind.PUT):
-                session.put(each.key, b"", attachment=each.column)
-            for each, session in self._of(Kind.DELETE):
-                session.delete(each.key, attachment=each.column)
-            for each, session in self._of(Kind.QUERY):
-                session.get(each.key, ignore, payload=each.column, timeout=WAIT_S, target=zenoh.QueryTarget.ALL)
-            self._wait(Kind.PUT, Kind.DELETE, Kind.QUERY)
+            self._wait(Kind.PUT, Kind.DELETE, Kind.QUERY, send=send)
 
     def _subscribers(self) -> None:
         def heard(column: Column) -> Callable[[zenoh.Sample], None]:
@@ -160,13 +175,15 @@ class Matrix:
 
             return sample
 
+        def send() -> None:
+            for key in self.keys:
+                self.far.put(key, b"", attachment=FAR, congestion_control=BLOCK)
+
         with declared(
             *(session.declare_subscriber(each.key, heard(each.column)) for each, session in self._of(Kind.SUBSCRIBE))
         ):
             time.sleep(GRACE_S)
-            for key in self.keys:
-                self.far.put(key, b"", attachment=FAR)
-            self._wait(Kind.SUBSCRIBE)
+            self._wait(Kind.SUBSCRIBE, send=send)
 
     def _queryables(self) -> None:
         def asked(column: Column, key: str) -> Callable[[zenoh.Query], None]:
@@ -182,13 +199,7 @@ class Matrix:
             if reply.ok is not None:
                 self._note(text(reply.ok.payload), str(reply.ok.key_expr), Kind.REPLY)
 
-        with declared(
-            *(
-                session.declare_queryable(each.key, asked(each.column, each.key))
-                for each, session in self._of(Kind.QUERYABLE)
-            )
-        ):
-            time.sleep(GRACE_S)
+        def send() -> None:
             for key in self.keys:
                 self.far.get(
                     key,
@@ -198,7 +209,15 @@ class Matrix:
                     target=zenoh.QueryTarget.ALL,
                     consolidation=zenoh.ConsolidationMode.NONE,
                 )
-            self._wait(Kind.QUERYABLE, Kind.REPLY)
+
+        with declared(
+            *(
+                session.declare_queryable(each.key, asked(each.column, each.key))
+                for each, session in self._of(Kind.QUERYABLE)
+            )
+        ):
+            time.sleep(GRACE_S)
+            self._wait(Kind.QUERYABLE, Kind.REPLY, send=send)
 
     def _tokens(self) -> None:
         now: list[Column] = []
@@ -235,6 +254,10 @@ class Matrix:
 
             return reply
 
+        def send() -> None:
+            for each, session in self._of(Kind.ASK_ALIVE):
+                session.liveliness().get(each.key, found(each.column), timeout=WAIT_S)
+
         with declared(
             *(
                 session.liveliness().declare_subscriber(each.key, came(each.column))
@@ -244,9 +267,7 @@ class Matrix:
             time.sleep(GRACE_S)
             with declared(*(self.far.liveliness().declare_token(key) for key in self.keys)):
                 self._wait(Kind.WATCH_ALIVE)
-                for each, session in self._of(Kind.ASK_ALIVE):
-                    session.liveliness().get(each.key, found(each.column), timeout=WAIT_S)
-                self._wait(Kind.ASK_ALIVE)
+                self._wait(Kind.ASK_ALIVE, send=send)
 
 
 def ignore(_: object) -> None:

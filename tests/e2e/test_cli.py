@@ -133,6 +133,16 @@ def test_probe_talks_to_a_robot_only_with_yes_and_asks_a_gateway_first(bench: Be
     assert "version: 1.3" in served.stdout
 
 
+def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
+    shown = zbridge("demo", "--secure", "--seconds", "8")
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "router at tls/127.0.0.1:" in shown.stdout
+    for protocol in protocol_names():
+        assert f"{protocol}1" in shown.stdout
+    assert "established" in shown.stdout  # the viewer sees
+    assert "│demo" in shown.stdout  # the operator drives
+
+
 def test_the_demo_interrupted_leaves_no_process_behind() -> None:
     demo = start("demo")
     assert demo.stdout is not None

@@ -16,8 +16,8 @@ from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, free_port, 
 from tests.e2e.hq_programs import tcpudp_by_tcp
 from tests.e2e.secure import SecureBus
 from zbridge.app.roles import Member, Roles
-from zbridge.app.router_settings import folder_tls
 from zbridge.bus import BusSettings
+from zbridge.bus.tls.files import folder_tls
 from zbridge.client import Fleet
 from zbridge.errors import BusError
 

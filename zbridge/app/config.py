@@ -19,6 +19,7 @@ import msgspec
 
 from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
+from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
@@ -64,13 +65,32 @@ class Plan(msgspec.Struct, frozen=True):
     metrics: Address | None = None
 
 
-def load(path: Path, environment: Mapping[str, str] = os.environ) -> Plan:
-    """Read and check a configuration file; raise ConfigError, which names the file as well."""
+def load(path: Path, environment: Mapping[str, str] = os.environ, *, tls: Path | None = None) -> Plan:
+    """Read and check a configuration file; raise ConfigError, which names the file as well.
+
+    tls: a folder as ``zbridge certs bundle`` makes it, for a file without ``bus.tls``; so does ``ZBRIDGE_TLS``. Paths
+    in ``bus.tls`` are relative to the file.
+    """
     raw = read_toml(path)
     try:
-        return plan(raw, environment)
+        planned = plan(raw, environment)
+        bus = _secured(planned.config.bus, path.absolute().parent, tls, environment.get(TLS_VARIABLE))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+    return msgspec.structs.replace(planned, config=msgspec.structs.replace(planned.config, bus=bus))
+
+
+def _secured(bus: BusSettings, beside: Path, tls: Path | None, variable: str | None) -> BusSettings:
+    """Return the settings with the files of TLS, if there are any."""
+    if bus.tls is not None:
+        if tls is not None:
+            raise ConfigError(f"--tls {tls}: expected only for a file without bus.tls")
+        return msgspec.structs.replace(bus, tls=tls_beside(bus.tls, beside))
+    folder = tls or (Path(variable) if variable else None)
+    if folder is None:
+        return bus
+    given = folder_settings(folder, bus.connect)
+    return msgspec.structs.replace(bus, connect=given.connect, tls=given.tls)
 
 
 def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Plan:

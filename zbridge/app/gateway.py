@@ -19,13 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from zbridge.app.config import Plan
+from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
+from zbridge.bus import Bus, Handle, IncomingQuery
+from zbridge.bus.tls.files import own_certificate
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import BusError, Held
+from zbridge.errors import Held
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
@@ -41,8 +43,6 @@ log = logging.getLogger("zbridge.app.gateway")
 
 _ZID = 6
 """Characters of the bus session's id in a listener's name: they differ between processes."""
-RETRY_S = 1.0
-"""Seconds between attempts to open the bus."""
 TELL_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
@@ -71,17 +71,21 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
         with self._audit() as audit:
-            bus = await self._open_bus()
-            try:
-                await self._run(bus, audit)
-            finally:
-                self.left = await bus.close()
+            while True:
+                bus = await join_bus(self._plan, self.metrics)
+                try:
+                    await self._run(bus, audit)
+                except CertificateEnded as error:
+                    log.error("%s", error)
+                finally:
+                    self.left = await bus.close()
 
     async def _run(self, bus: Bus, audit: Audit) -> None:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
             robot = RobotSubscription(bus, self._keys, self.metrics)
+            certificate = own_certificate(self._plan.config.bus.tls)
             work: list[Coroutine[Any, Any, None]] = [
                 Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
                 for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
@@ -89,6 +93,8 @@ class Gateway:
             if work:
                 robot.open()
                 stack.callback(robot.close)
+            if certificate is not None:
+                work.append(watch_certificate(certificate, bus, self.conditions))
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
@@ -206,14 +212,6 @@ class Gateway:
         finally:
             audit.close()
             file.close()
-
-    async def _open_bus(self) -> Bus:
-        while True:
-            try:
-                return await open_bus(self._plan.config.bus, self.metrics, bounds=topics.size_bounds())
-            except BusError as error:
-                log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
-                await asyncio.sleep(RETRY_S)
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:

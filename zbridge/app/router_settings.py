@@ -19,7 +19,8 @@ from zbridge.app.access_rules import MESSAGE_BYTES, STOPS_HZ, access_control, do
 from zbridge.app.roles import Roles, load_roles
 from zbridge.app.toml import convert, read_toml
 from zbridge.bus import Tls
-from zbridge.bus.interface import Connection
+from zbridge.bus.interface import SECURE, Connection
+from zbridge.bus.tls.files import tls_beside
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
 
@@ -29,7 +30,6 @@ PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full queue before it is dropped, as in every session of the bus."""
 _HEADROOM_BYTES = 65_536
 """What a message is larger than its payload and attachment."""
-_SECURE = ("tls", "quic")
 
 
 class RouterLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,11 +64,6 @@ class RouterPlan(msgspec.Struct, frozen=True):
     roles: Roles = Roles()
 
 
-def folder_tls(folder: Path) -> Tls:
-    """Return the files of a folder as ``zbridge certs bundle`` makes it."""
-    return Tls(str(folder / "ca.pem"), str(folder / "certificate.pem"), str(folder / "key.pem"))
-
-
 def load_router(path: Path) -> RouterSettings:
     """Read a router's TOML file; raise ConfigError, which names the file as well."""
     raw = read_toml(path)
@@ -79,7 +74,7 @@ def load_router(path: Path) -> RouterSettings:
     beside = path.absolute().parent
     tls, roles = settings.tls, settings.roles
     if tls is not None:
-        tls = Tls(*(name and str(beside / name) for name in (tls.ca, tls.certificate, tls.key)))  # type: ignore[arg-type]
+        tls = tls_beside(tls, beside)
     return msgspec.structs.replace(settings, tls=tls, roles=None if roles is None else str(beside / roles))
 
 
@@ -118,7 +113,7 @@ def zenoh_values(plan: RouterPlan) -> dict[str, Any]:
     if settings.tls is not None:
         values |= {
             "adminspace": {"enabled": True, "permissions": {"read": True, "write": False}},
-            "transport/link/protocols": list(_SECURE),
+            "transport/link/protocols": list(SECURE),
             **_tls_values(settings.tls),
             "downsampling": downsampling(plan.roles, settings.realm, limits.stops_hz),
             "access_control": access_control(plan.roles, settings.realm),
@@ -166,7 +161,7 @@ def _check_secure(settings: RouterSettings, tls: Tls, *, files: bool) -> None:
         raise ConfigError("insecure = true: expected no tls beside it")
     for key, addresses in (("listen", settings.listen), ("connect", settings.connect)):
         for address in addresses:
-            if address.partition("/")[0] not in _SECURE:
+            if address.partition("/")[0] not in SECURE:
                 raise ConfigError(f"{key} = {address!r}: expected tls/host:port: with tls nothing goes in the open")
     for key, name in (("ca", tls.ca), ("certificate", tls.certificate), ("key", tls.key)):
         if name is None:

@@ -47,6 +47,7 @@ connect = []                            # for example ["tcp/127.0.0.1:7447"]
 listen = []
 multicast = true                        # find peers on the local network
 stream = "drop"                         # "block": no loss when the bus is slower than the robot
+# tls = { ... }                         # a secure bus: put the [bus] table of `zbridge certs bundle` here instead
 
 """
 COMMON_TEMPLATE = (

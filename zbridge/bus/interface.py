@@ -8,15 +8,19 @@ from typing import Annotated, Literal, Protocol
 
 import msgspec
 
-from zbridge.errors import BusError, Refused
+from zbridge.errors import BusError, ConfigError, Refused
 from zbridge.fleet.topics import Topic
 
 Connection = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
 """Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
 
 
+SECURE = ("tls", "quic")
+"""The kinds of endpoints at which certificates are shown."""
+
+
 class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Files for mutual TLS."""
+    """Files for mutual TLS: the authority's certificate, our own and its key."""
 
     ca: str
     certificate: str | None = None
@@ -24,7 +28,11 @@ class Tls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The ``[bus]`` table of a configuration."""
+    """The ``[bus]`` table of a configuration.
+
+    With ``tls`` a session is a client of routers that it is told: peers with certificates find each other by gossip,
+    and would go round the router's rules in plain TCP. Anything else raises ConfigError.
+    """
 
     mode: Literal["peer", "client", "router"] | None = None
     connect: tuple[Connection, ...] = ()
@@ -33,10 +41,27 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stream: Literal["drop", "block"] = "drop"
     tls: Tls | None = None
 
+    def __post_init__(self) -> None:
+        if self.tls is None:
+            return
+        why = "with tls every program is a client of a router"
+        if self.mode not in (None, "client"):
+            raise ConfigError(f"bus.mode = {self.mode!r}: expected 'client', or none: {why}")
+        if self.listen:
+            raise ConfigError(f"bus.listen = {list(self.listen)}: expected none: {why}")
+        if not self.connect:
+            raise ConfigError(f"bus.connect: missing, expected tls/host:port: {why}")
+        for endpoint in self.connect:
+            if endpoint.partition("/")[0] not in SECURE:
+                raise ConfigError(
+                    f"bus.connect = {endpoint!r}: expected tls/host:port: with tls nothing goes in the open"
+                )
+
     @property
     def effective_mode(self) -> str:
-        """The mode that is used: client when only ``connect`` is given, else peer."""
-        return self.mode or ("client" if self.connect and not self.listen else "peer")
+        """The mode that is used: client with tls, and when only ``connect`` is given, else peer."""
+        alone = self.tls is not None or (self.connect and not self.listen)
+        return self.mode or ("client" if alone else "peer")
 
 
 class Neighbour(msgspec.Struct, frozen=True):

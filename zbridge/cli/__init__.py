@@ -1,9 +1,9 @@
 """The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe`` and
-``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or
-configuration.
+``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo`` (with ``secure_demo`` and
+``processes``), ``drive``, ``probe`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes:
+0 done, 1 failed, 2 wrong arguments or configuration.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.member import check_member
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
@@ -48,14 +49,18 @@ def run_only(protocol: str) -> None:
         give_up(2, error)
 
 
-def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -> None:
-    """Run the gateway of a configuration until SIGTERM or SIGINT."""
+def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, tls: Path | None = None) -> None:
+    """Run the gateway of a configuration until SIGTERM or SIGINT. tls: a folder, for a file without ``bus.tls``."""
     set_up_log(verbose=verbose)
-    plan = load(file)
+    plan = load(file, tls=tls)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
+    try:
+        check_member(plan)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     gateway = Gateway(plan)
     try:

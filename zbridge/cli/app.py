@@ -9,8 +9,12 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
+from zbridge.app.member import check_member, not_checked
+from zbridge.bus.tls.files import TLS_VARIABLE, ends_soon, out_of_date, utc_now
 from zbridge.cli import certs, give_up, run_gateway, run_loop, set_up_log
 from zbridge.client import bus_settings
+from zbridge.errors import ConfigError
+from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
@@ -35,24 +39,53 @@ Connect = Annotated[
         show_default=False,
     ),
 ]
+TlsFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls",
+        help="for a secure bus: a folder as `zbridge certs bundle` makes it; its endpoints are used without --connect",
+        envvar=TLS_VARIABLE,
+        show_default=False,
+    ),
+]
+FileTls = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls",
+        help=f"for a FILE without bus.tls: a folder as `zbridge certs bundle` makes it; or {TLS_VARIABLE}",
+        show_default=False,
+    ),
+]
 
 
 @app.command()
-def run(file: File, verbose: Verbose = False) -> None:
+def run(file: File, tls: FileTls = None, verbose: Verbose = False) -> None:
     """Run a gateway in the foreground until SIGTERM or SIGINT."""
-    run_gateway(file, verbose=verbose)
+    run_gateway(file, verbose=verbose, tls=tls)
 
 
 @app.command()
-def check(file: File) -> None:
+def check(file: File, tls: FileTls = None) -> None:
     """Check a configuration and print what it would run."""
-    plan = load(file)
+    plan = load(file, tls=tls)
     robot, parts = plan.config.robot, []
+    try:
+        certificate = check_member(plan)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:
         parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
     parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
     parts.append(f"bus as {plan.config.bus.effective_mode}")
-    typer.echo(f"{file}: ok: {robot.realm}/{robot.name}, {', '.join(parts)}")
+    if certificate is not None:
+        if problem := out_of_date(certificate, utc_now()):
+            raise ConfigError(f"{file}: {problem}")
+        parts.append(f"certificate of {certificate.common_name} until {certificate.ends:%Y-%m-%d}")
+    typer.echo(shown(f"{file}: ok: {robot.realm}/{robot.name}, {', '.join(parts)}"))
+    if certificate is not None:
+        if warning := ends_soon(certificate, utc_now()):
+            typer.echo(shown(f"{file}: warning: {warning}"), err=True)
+        typer.echo(shown(f"{file}: {not_checked(plan, certificate)}"))
 
 
 @app.command()
@@ -124,6 +157,7 @@ def probe(
         bool, typer.Option("--yes", help="connect to the device although that may use up its only connection")
     ] = False,
     connect: Connect = [],
+    tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Print what a device is: from its gateway on the bus, else, with --yes, by a handshake with it."""
@@ -131,7 +165,7 @@ def probe(
 
     set_up_log(verbose=False, level=logging.ERROR)
     found, at = find_protocol(protocol), parse_device_address(address)
-    code = run_loop(ask(bus_settings(connect), found, at, realm=realm, sure=yes))
+    code = run_loop(ask(bus_settings(connect, tls), found, at, realm=realm, sure=yes))
     if code:
         raise typer.Exit(code)
 
@@ -139,12 +173,15 @@ def probe(
 @app.command()
 def demo(
     seconds: Annotated[float, typer.Option(help="end after this many seconds; 0: run until interrupted")] = 0.0,
+    secure: Annotated[
+        bool, typer.Option("--secure", help="on mutual TLS, with roles made on the fly; needs zbridge[certs]")
+    ] = False,
 ) -> None:
     """Show a simulated robot of each protocol, their gateways, a router and a live table; loopback only."""
     from zbridge.cli.demo import run_demo
 
     set_up_log(verbose=False, level=logging.WARNING)
-    run_loop(run_demo(seconds))
+    run_loop(run_demo(seconds, secure=secure))
 
 
 @app.command()
@@ -154,7 +191,9 @@ def router(
     connect: Annotated[list[str], typer.Option(help="another router")] = [],
     tls: Annotated[
         Path | None,
-        typer.Option(help="folder with ca.pem, certificate.pem and key.pem, as `zbridge certs bundle` makes it"),
+        typer.Option(
+            help="folder with ca.pem, certificate.pem and key.pem, as `zbridge certs bundle` makes it",
+        ),
     ] = None,
     roles: Annotated[Path | None, typer.Option(help="roles.toml: who may use the bus")] = None,
     realm: Annotated[str, typer.Option(help="first chunk of all keys; fleet by default")] = "",
@@ -181,6 +220,7 @@ def router(
 @app.command()
 def ls(
     connect: Connect = [],
+    tls: TlsFolder = None,
     realm: Realm = "fleet",
     sessions: Annotated[bool, typer.Option("--sessions", help="list the sessions with robots and HQ programs")] = False,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
@@ -190,13 +230,14 @@ def ls(
 
     set_up_log(verbose=False, level=logging.ERROR)
     show = bus.list_sessions if sessions else bus.list_robots
-    run_loop(show(bus_settings(connect), realm, as_json=json))
+    run_loop(show(bus_settings(connect, tls), realm, as_json=json))
 
 
 @app.command()
 def echo(
     key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
     connect: Connect = [],
+    tls: TlsFolder = None,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
     count: Annotated[int, typer.Option(help="end after this many messages; 0: run until interrupted")] = 0,
 ) -> None:
@@ -204,7 +245,7 @@ def echo(
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
-    run_loop(until_signal(bus.echo(bus_settings(connect), key, as_json=json, count=count)))
+    run_loop(until_signal(bus.echo(bus_settings(connect, tls), key, as_json=json, count=count)))
 
 
 @app.command()
@@ -214,6 +255,7 @@ def drive(
     who: Annotated[str, typer.Option(help="shown to others as the driver; user@host by default")] = "",
     takeover: Annotated[bool, typer.Option("--takeover", help="take the robot from whoever drives it")] = False,
     connect: Connect = [],
+    tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Drive a robot by keyboard: it moves only while a key is held down; space stops it."""
@@ -221,7 +263,7 @@ def drive(
 
     set_up_log(verbose=False, level=logging.ERROR)
     check_name("ROBOT", robot)
-    work = drive_robot(bus_settings(connect), realm, robot, speed, who=who or None, takeover=takeover)
+    work = drive_robot(bus_settings(connect, tls), realm, robot, speed, who=who or None, takeover=takeover)
     run_loop(until_signal(work))
 
 
@@ -230,6 +272,7 @@ def stop(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
     connect: Connect = [],
+    tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Stop a robot, or all of them; open to everyone who can write the key."""
@@ -240,7 +283,7 @@ def stop(
         give_up(2, "name one ROBOT, or give --all")
     if robot:
         check_name("ROBOT", robot)
-    if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):
+    if not run_loop(bus.stop(bus_settings(connect, tls), realm, robot or None)):
         raise typer.Exit(1)
 
 

@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.bus.tls.refusal import why_not
 from zbridge.client import connect
 from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
@@ -23,7 +24,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
-from zbridge.fleet.topics import split_key
+from zbridge.fleet.topics import is_name, split_key
 from zbridge.metrics import Metrics
 
 _SHOWN = 8
@@ -42,9 +43,9 @@ errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emo
 
 
 @contextlib.asynccontextmanager
-async def joined(settings: BusSettings) -> AsyncIterator[Bus]:
-    """Open the bus while the context lasts; raise BusError."""
-    bus = await open_bus(settings, Metrics(), wait_for_peers=True)
+async def joined(settings: BusSettings, realm: str | None) -> AsyncIterator[Bus]:
+    """Open the bus while the context lasts; raise BusError. realm: where a router must know us; None: wherever."""
+    bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
         yield bus
     finally:
@@ -62,7 +63,9 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
     elif robots:
         console.print(_robot_table(robots))
     else:
-        errors.print(f"no robots on {realm}/")
+        finding = await why_not(settings) if settings.tls is None else None  # the router may speak TLS
+        more = f": {shown(finding.text)}" if finding is not None and finding.refused else ""
+        errors.print(f"no robots on {realm}/{more}")
 
 
 async def list_sessions(settings: BusSettings, realm: str, *, as_json: bool) -> None:
@@ -140,7 +143,8 @@ async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) ->
         if seen == count:
             done.set()
 
-    async with joined(settings) as bus:
+    realm = key.partition("/")[0]
+    async with joined(settings, realm if is_name(realm) else None) as bus:
         bus.subscribe(key, show, history=True)
         await done.wait()
 

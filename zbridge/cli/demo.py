@@ -1,4 +1,7 @@
-"""``zbridge demo``: a simulated robot of each protocol, their gateways, an embedded router, a table. Loopback only."""
+"""``zbridge demo``: a simulated robot of each protocol, their gateways, a router, a table. Loopback only.
+
+Here the bus is open to all of this machine, and its router embedded; ``secure_demo`` makes one with roles.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,10 @@ import asyncio
 import contextlib
 import json
 import math
-import os
-import random
-import socket
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import IO
 
@@ -22,8 +22,10 @@ from rich.live import Live
 from rich.table import Table
 
 from zbridge.app import until_signal
-from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.bus import BusSettings, Sample, open_bus
 from zbridge.cli.bus import cell
+from zbridge.cli.processes import end, free_port, process
+from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
 from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
@@ -35,11 +37,6 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
 
 REFRESH_S = 0.5
-START_S = 20.0
-"""Longest time a simulator may take to start."""
-END_S = 3.0
-"""Longest time processes are given to end by themselves."""
-REALM = "fleet"
 FIGURE_S = 2.0
 """Seconds that the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
@@ -97,31 +94,34 @@ class Watch:
         return table
 
 
-async def run_demo(seconds: float) -> None:
-    """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data."""
+async def run_demo(seconds: float, *, secure: bool = False) -> None:
+    """Show the demo for ``seconds`` (0: until interrupted); raise ZbridgeError if a robot sent no data.
+
+    secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
+    """
     robots = {f"{protocol}1": protocol for protocol in protocol_names()}
     watch = Watch(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
         log = stack.enter_context((folder / "log").open("w+b"))
-        bus, endpoint = await _router()
-        stack.push_async_callback(bus.close)
-        listeners = {robot: f"tcp://127.0.0.1:{_free_port()}" for robot in robots}
+        bus = await stack.enter_async_context(secure_bus(folder, log, list(robots)) if secure else _open_to_all())
+        listeners = {robot: f"tcp://127.0.0.1:{free_port()}" for robot in robots}
         processes = [
-            await stack.enter_async_context(_robot(folder, log, robot, protocol, endpoint, listeners[robot]))
+            await stack.enter_async_context(_robot(folder, log, robot, protocol, listeners[robot], bus.table(robot)))
             for robot, protocol in robots.items()
         ]
         for key_expr in ("*", "sensor/*"):
-            bus.subscribe(f"{REALM}/*/{key_expr}", watch.take)
+            bus.looking.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         how = [
-            f"router at {endpoint}; try, in another terminal:\n  zbridge ls --sessions --connect {endpoint}",
+            f"router at {bus.endpoint}; try, in another terminal:",
+            *(f"  {line}" for line in bus.commands),
             "HQ programs connect to the robots here; to simulate one:",
             *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in robots),
         ]
-        await until_signal(_show(bus, watch, seconds, how))
+        await until_signal(_show(bus.driving, watch, seconds, how))
         simulators, gateways = zip(*processes, strict=True)
-        await _end(gateways)  # all at once: each needs about a second to stop its robot
-        await _end(simulators)
+        await end(gateways)  # all at once: each needs about a second to stop its robot
+        await end(simulators)
         silent = [robot for robot, row in watch.rows.items() if not row.heard]
         if seconds and silent:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
@@ -136,35 +136,33 @@ def _how_to_connect(protocol: Protocol, listener: str) -> str:
     return f"zbridge simulate {protocol.name} --hq {listener}" if protocol.simulate_hq is not None else listener
 
 
-async def _router() -> tuple[Bus, str]:
+@contextlib.asynccontextmanager
+async def _open_to_all() -> AsyncIterator[DemoBus]:
     """Open the embedded router, at Zenoh's usual port if that is free."""
-    for endpoint in (LOCAL_ROUTER, f"tcp/127.0.0.1:{_free_port()}"):
+    for endpoint in (LOCAL_ROUTER, f"tcp/127.0.0.1:{free_port()}"):
         try:
-            settings = BusSettings(mode="router", listen=(endpoint,), multicast=False)
-            return await open_bus(settings, Metrics()), endpoint
+            bus = await open_bus(BusSettings(mode="router", listen=(endpoint,), multicast=False), Metrics())
+            break
         except BusError:
             continue
-    raise BusError("no port for the embedded router")
-
-
-def _free_port() -> int:
-    """Return a port that is free for TCP and UDP, outside the range from which the system assigns ports."""
-    while True:
-        port = random.randrange(20_000, 32_000)
-        with contextlib.suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
-            tcp.bind(("127.0.0.1", port))
-            udp.bind(("127.0.0.1", port))
-            return port
+    else:
+        raise BusError("no port for the embedded router")
+    table = f'[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
+    try:
+        commands = (f"zbridge ls --sessions --connect {endpoint}",)
+        yield DemoBus(endpoint, bus, Fleet(bus, REALM), lambda robot: table, commands)
+    finally:
+        await bus.close()
 
 
 @contextlib.asynccontextmanager
 async def _robot(
-    folder: Path, log: IO[bytes], robot: str, protocol: str, endpoint: str, listener: str
+    folder: Path, log: IO[bytes], robot: str, protocol: str, listener: str, bus: str
 ) -> AsyncIterator[tuple[asyncio.subprocess.Process, asyncio.subprocess.Process]]:
-    """Run a simulator and its gateway with a listener; yield both processes."""
+    """Run a simulator and its gateway with a listener; yield both processes. bus: the ``[bus]`` table."""
     found = find_protocol(protocol)
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
-    async with _process(log, "simulate", protocol, *listen, read=True) as simulator:
+    async with process(log, "simulate", protocol, *listen, read=True) as simulator:
         assert simulator.stdout is not None
         async with asyncio.timeout(START_S):
             line = (await simulator.stdout.readline()).decode()
@@ -176,9 +174,9 @@ async def _robot(
         file.write_text(
             f'[robot]\nname = "{robot}"\n'
             f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
-            f'{serving}[bus]\nmode = "client"\nconnect = ["{endpoint}"]\nmulticast = false\n'
+            f"{serving}{bus}"
         )
-        async with _process(log, "run", str(file)) as gateway:
+        async with process(log, "run", str(file)) as gateway:
             yield simulator, gateway
 
 
@@ -191,43 +189,10 @@ def _inline(value: object) -> str:
     return json.dumps(value)
 
 
-@contextlib.asynccontextmanager
-async def _process(log: IO[bytes], *arguments: str, read: bool = False) -> AsyncIterator[asyncio.subprocess.Process]:
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *("-m", "zbridge", *arguments),
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE if read else asyncio.subprocess.DEVNULL,
-        stderr=log,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
-    try:
-        yield process
-    finally:
-        await _end((process,))
-
-
-async def _end(processes: Sequence[asyncio.subprocess.Process]) -> None:
-    """End processes together; kill those that still run after :data:`END_S`."""
-    for process in processes:
-        with contextlib.suppress(ProcessLookupError):
-            process.terminate()
-    ended = asyncio.gather(*(process.wait() for process in processes))
-    try:
-        async with asyncio.timeout(END_S):
-            await asyncio.shield(ended)
-    except TimeoutError:
-        for process in processes:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-        await ended
-
-
-async def _show(bus: Bus, watch: Watch, seconds: float, how: list[str]) -> None:
+async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> None:
     """Say how to take part, draw the table, and drive each robot until somebody else does."""
     for line in how:
         print(line, flush=True)  # noqa: T201
-    fleet = Fleet(bus, REALM)
     loop = asyncio.get_running_loop()
     started = loop.time()
     wandering = [asyncio.create_task(_wander(fleet[robot])) for robot in watch.rows]

@@ -10,7 +10,7 @@ import msgspec
 
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import console, errors, joined
-from zbridge.errors import BusError, LinkError, PayloadError
+from zbridge.errors import BusError, BusRefused, LinkError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Status
 from zbridge.fleet.printable import shown
@@ -44,9 +44,12 @@ async def probe(settings: BusSettings, protocol: Protocol, address: DeviceAddres
 
 
 async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> tuple[str, Status] | None:
-    """Return the robot and status of the gateway on the bus that is connected to the address; None without one."""
-    with contextlib.suppress(BusError):
-        async with joined(settings) as bus:
+    """Return the robot and status of the gateway on the bus that is connected to the address; None without one.
+
+    Raises BusRefused where there is a bus that refuses us.
+    """
+    try:
+        async with joined(settings, realm) as bus:
             answers = await bus.ask(f"{realm}/*/status")
         for answer in answers:
             with contextlib.suppress(PayloadError):
@@ -54,6 +57,10 @@ async def _served(settings: BusSettings, address: DeviceAddress, realm: str) -> 
                 split = split_key(answer.key)
                 if split is not None and any(link.peer == str(address) for link in status.links):
                     return split[1], status
+    except BusRefused:  # whether the device has a gateway is not known: it must not be spoken to
+        raise
+    except BusError:
+        pass
     return None
 
 

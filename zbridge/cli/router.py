@@ -9,9 +9,10 @@ import msgspec
 
 from zbridge.app import until_signal
 from zbridge.app.router import Router, ZenohWarnings
-from zbridge.app.router_settings import RouterSettings, folder_tls, load_router, nested, plan_router, zenoh_values
+from zbridge.app.router_settings import RouterSettings, load_router, nested, plan_router, zenoh_values
 from zbridge.app.toml import convert
 from zbridge.bus import hear_zenoh
+from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 

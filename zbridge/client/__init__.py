@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
 
 from zbridge.bus import BusSettings, Tls, open_bus
+from zbridge.bus.tls.files import folder_settings, own_certificate
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
 from zbridge.client.fleet import Fleet, Robot
@@ -28,11 +30,17 @@ LOCAL_ROUTER = "tcp/127.0.0.1:7447"
 """The address at which a router on this machine is expected."""
 
 
-def bus_settings(endpoints: Sequence[str] = (), tls: Tls | None = None) -> BusSettings:
-    """Return how a program joins the bus: by the given endpoints, else by multicast and the router on this machine."""
-    if endpoints:
+def bus_settings(endpoints: Sequence[str] = (), tls: Tls | Path | str | None = None) -> BusSettings:
+    """Return how a program joins the bus: by the given endpoints, else by multicast and the router on this machine.
+
+    tls: the files of this program's certificate, or a folder as ``zbridge certs bundle`` makes it, which names
+    endpoints too. Raises ConfigError where they do not go together.
+    """
+    if isinstance(tls, Path | str):
+        return folder_settings(Path(tls), endpoints)
+    if endpoints or tls is not None:
         return BusSettings(connect=tuple(endpoints), multicast=False, tls=tls)
-    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,), tls=tls)
+    return BusSettings(mode="peer", connect=(LOCAL_ROUTER,))
 
 
 @contextlib.asynccontextmanager
@@ -40,19 +48,22 @@ async def connect(
     endpoints: Sequence[str] | str = (),
     *,
     realm: str = "fleet",
-    tls: Tls | None = None,
+    tls: Tls | Path | str | None = None,
     settings: BusSettings | None = None,
 ) -> AsyncIterator[Fleet]:
     """Join the bus for as long as the context lasts.
 
     endpoints: Zenoh endpoints, ``tcp/192.168.0.2:7447``; by default the local network and the router on this machine.
-    settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
-    Raises BusError if no given endpoint can be reached.
+    tls: for a secure bus, a folder as ``zbridge certs bundle`` makes it, whose endpoints are used if none are given; or
+    the files. settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
+    Raises BusError if no given endpoint can be reached, or the router refuses this program: the text says why.
     """
     if isinstance(endpoints, str):
         endpoints = (endpoints,)
-    bus = await open_bus(settings or bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
+    settings = settings or bus_settings(endpoints, tls)
+    certificate = own_certificate(settings.tls)
+    bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
-        yield Fleet(bus, realm)
+        yield Fleet(bus, realm, certificate.name or None if certificate is not None else None)
     finally:
         await bus.close()

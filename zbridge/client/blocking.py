@@ -15,6 +15,7 @@ import concurrent.futures
 import contextlib
 import threading
 from collections.abc import Coroutine, Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import zbridge.client
@@ -82,7 +83,9 @@ class _Loop:
 
 
 @contextlib.contextmanager
-def connect(endpoints: Sequence[str] | str = (), *, realm: str = "fleet", tls: Tls | None = None) -> Iterator[Fleet]:
+def connect(
+    endpoints: Sequence[str] | str = (), *, realm: str = "fleet", tls: Tls | Path | str | None = None
+) -> Iterator[Fleet]:
     """Join the bus for as long as the context lasts; see :func:`zbridge.client.connect`."""
     joining = zbridge.client.connect(endpoints, realm=realm, tls=tls)
     with contextlib.closing(_Loop()) as loop, _entered(loop, joining) as fleet:

@@ -50,11 +50,15 @@ _ASK_S = 0.3
 
 
 class Fleet:
-    """All robots of one realm: ``fleet["r1"]``."""
+    """All robots of one realm: ``fleet["r1"]``.
 
-    def __init__(self, bus: Bus, realm: str = "fleet") -> None:
+    name: on a secure bus, that of this program's certificate: its leases are under this name.
+    """
+
+    def __init__(self, bus: Bus, realm: str = "fleet", name: str | None = None) -> None:
         self.realm = realm
         self._bus = bus
+        self._name = name
 
     def __repr__(self) -> str:
         return f"<Fleet {self.realm}>"
@@ -63,7 +67,7 @@ class Fleet:
         """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-        return Robot(self._bus, KeySpace(self.realm, name))
+        return Robot(self._bus, KeySpace(self.realm, name), self._name)
 
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status."""
@@ -106,9 +110,10 @@ class Fleet:
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
         super().__init__(bus, keys, topics.CONTROL)
         self._keys = keys
+        self._own = own
 
     @contextlib.asynccontextmanager
     async def __call__(
@@ -125,14 +130,18 @@ class ControlFeed(StateFeed[Control]):
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
         who: the holder's name that others are shown, ``user@host`` by default. name: the first part of ``who``
-        (``op1`` of ``op1.laptop``) if access rules know this program by that part only.
+        (``op1`` of ``op1.laptop``) if access rules know this program by that part only. With a certificate of its own
+        the program is known by the name in it: ``who`` begins with that name, and is it by default.
         priority: a program with a higher priority is given the robot of one with a lower priority.
         deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
         Raises Held with the holder's name, BusError if no gateway answers, or Refused as the gateway did.
         """
+        own = self._own if name is None else None
+        if own is not None and (who is None or not topics.speaks_for(who, escape(own))):
+            who = f"{own}.{who}" if who else own
         who = who or default_who()
-        name = name or who
+        name = name or own or who
         request = Acquire(
             who=who,
             priority=priority,
@@ -147,7 +156,7 @@ class ControlFeed(StateFeed[Control]):
 class Robot:
     """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
-    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
         self.name = keys.robot
         self._bus = bus
         self._keys = keys
@@ -161,7 +170,7 @@ class Robot:
         self.lidar: StateFeed[Switch] = StateFeed(bus, keys, topics.LIDAR)
         self.camera: StateFeed[Switch] = StateFeed(bus, keys, topics.CAMERA)
         self.devices: StateFeed[Devices] = StateFeed(bus, keys, topics.DEVICES)
-        self.control = ControlFeed(bus, keys)
+        self.control = ControlFeed(bus, keys, own)
 
     def __repr__(self) -> str:
         return f"<Robot {self._keys.realm}/{self.name}>"

@@ -14,8 +14,10 @@ from typing import Any
 import zenoh
 
 from zbridge.bus.interface import Neighbour
+from zbridge.bus.tls.membership import router_id
 from zbridge.bus.zenoh.declared import Declared, threadless
-from zbridge.bus.zenoh.session import ZenohBus, open_session, write_config
+from zbridge.bus.zenoh.opening import open_session, write_config
+from zbridge.bus.zenoh.session import ZenohBus
 from zbridge.metrics import Metrics
 
 LOG_LEVEL = "warn"
@@ -27,6 +29,7 @@ async def open_router(
     values: Mapping[str, Any], metrics: Metrics, on_neighbour: Callable[[Neighbour, bool], None]
 ) -> ZenohBus:
     """Open a router; raise BusError where that is not possible."""
+    values = {**values, "id": router_id()}
     router = ZenohRouter(await open_session(write_config(values)), asyncio.get_running_loop(), metrics)
     router.watch_neighbours(on_neighbour)
     return router

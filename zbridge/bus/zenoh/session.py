@@ -1,20 +1,20 @@
-"""The Zenoh session of one process: its configuration, what is declared on it, and how it is left."""
+"""The Zenoh session of one process: what is declared on it, and how it is left."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
-import re
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort, Tls
+from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
+from zbridge.bus.tls.files import own_certificate
+from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
@@ -28,6 +28,7 @@ from zbridge.bus.zenoh.incoming import (
     read_sample,
     sorted_callback,
 )
+from zbridge.bus.zenoh.opening import in_short, open_or_say_why, zenoh_config
 from zbridge.bus.zenoh.publishers import PlainPublisher, Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import SizeBounds, Topic
@@ -35,88 +36,35 @@ from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
 
-PATIENCE_US = 20_000
-"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 LEAVE_S = 0.4
 """Longest time leaving the bus takes."""
 FLUSH_S = 2.0
 """Longest time for which :meth:`ZenohBus.flush` waits."""
-OPEN_S = 1.0
-"""Longest time one attempt to open a client session takes."""
 _TIDY = 64
 """Handles that are kept before closed ones are forgotten."""
-_INGRESS = ("ingress",)
-_BOUNDED = ("put", "delete", "query")
-_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
-"""The place in Zenoh's source at the end of its error texts; cut off."""
-
-
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
-    values: dict[str, Any] = {
-        "mode": settings.effective_mode,
-        "connect/endpoints": settings.connect,
-        "scouting/multicast/enabled": settings.multicast,
-        "open/return_conditions/connect_scouted": wait_for_peers,
-        # A pool of 28 MB in every process, for payloads larger than a robot has.
-        "transport/shared_memory/enabled": False,
-        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
-    }
-    if settings.listen:
-        values["listen/endpoints"] = settings.listen
-    if bounds:
-        values["low_pass_filter"] = _size_filters(bounds)
-    if settings.effective_mode == "client":
-        values["connect/timeout_ms"] = int(OPEN_S * 1000)
-    if settings.tls is not None:
-        values |= _tls_values(settings.tls)
-    return write_config(values)
-
-
-def write_config(values: Mapping[str, Any]) -> zenoh.Config:
-    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
-    config = zenoh.Config()
-    for key, value in values.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise BusError(f"{key} = {value!r}: {_ORIGIN.sub('', str(error))}") from error
-    return config
-
-
-def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
-    """Write the filters by which Zenoh drops input that is larger than its key allows."""
-    return [
-        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
-        for number, (key_exprs, most_bytes) in enumerate(bounds)
-    ]
-
-
-def _tls_values(tls: Tls) -> dict[str, Any]:
-    values: dict[str, Any] = {"transport/link/tls/root_ca_certificate": tls.ca}
-    if tls.certificate and tls.key:
-        values["transport/link/tls/enable_mtls"] = True
-        for side in ("listen", "connect"):
-            values[f"transport/link/tls/{side}_certificate"] = tls.certificate
-            values[f"transport/link/tls/{side}_private_key"] = tls.key
-    return values
 
 
 async def open_zenoh(
-    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+    settings: BusSettings,
+    metrics: Metrics,
+    *,
+    wait_for_peers: bool = False,
+    bounds: SizeBounds = (),
+    realm: str | None = None,
+    robot: str | None = None,
 ) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
-    session = await open_session(zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds))
-    return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
-
-
-async def open_session(config: zenoh.Config) -> zenoh.Session:
-    """Open a session; raise BusError where that is not possible."""
-    try:
-        return await asyncio.to_thread(zenoh.open, config)
-    except zenoh.ZError as error:
-        raise BusError(_ORIGIN.sub("", str(error))) from error
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds)
+    session = await open_or_say_why(config, settings)
+    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
+    certificate = own_certificate(settings.tls)
+    if certificate is not None and realm is not None:
+        try:
+            await require_member(bus.ask, [str(zid) for zid in session.info.routers_zid()], certificate, realm, robot)
+        except BaseException:
+            await bus.close()
+            raise
+    return bus
 
 
 class ZenohBus:
@@ -326,7 +274,7 @@ class ZenohBus:
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
-            raise BusError(_ORIGIN.sub("", str(error))) from error
+            raise BusError(in_short(error)) from error
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
                 await done

@@ -1,0 +1,104 @@
+"""A gateway joins the bus, and again until that succeeds; its certificate is warned of, and the bus left at its end.
+
+Zenoh's session would knock with an expired certificate every 4 s for good, and each time the router accepts nobody for
+0.1 s. So a gateway whose certificate has expired leaves, and tries rarely, with the file as it is then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+from collections.abc import Callable
+from datetime import datetime
+
+from zbridge.app.config import Plan
+from zbridge.bus import Bus, open_bus
+from zbridge.bus.tls.certificate import Certificate
+from zbridge.bus.tls.files import ends_soon, utc_now
+from zbridge.control.conditions import Conditions
+from zbridge.errors import BusError, BusRefused
+from zbridge.fleet import topics
+from zbridge.metrics import Metrics
+
+log = logging.getLogger("zbridge.app.gateway")
+
+RETRY_S = 1.0
+"""Seconds between attempts to open the bus, while no router is there."""
+RARELY_S = 60.0
+"""Longest time between two attempts after refusals: each costs the router, and with it everybody, 0.1 s."""
+LOOK_S = 3600.0
+"""Seconds between looks at the certificate's end."""
+SAY_S = 86_400.0
+"""Seconds between log lines about the certificate's end."""
+ENDED_S = 5.0
+"""Seconds between looks after the certificate's end: at the next one without a bus the gateway leaves."""
+_CERTIFICATE = "certificate"
+
+
+class CertificateEnded(BusError):
+    """The certificate has expired and the bus is lost: this session will not get it back."""
+
+
+class Pauses:
+    """How long to wait before the next attempt: a while after a router that is away, more and more after refusals.
+
+    chance: between 0 and 1; it keeps gateways that were refused together from coming back together.
+    """
+
+    def __init__(self, chance: Callable[[], float] = random.random) -> None:
+        self._chance = chance
+        self._refused = 0
+
+    def __repr__(self) -> str:
+        return f"<Pauses after {self._refused} refusals>"
+
+    def after(self, error: BusError) -> float:
+        """Return the seconds to wait after this error."""
+        if not isinstance(error, BusRefused):
+            self._refused = 0
+            return RETRY_S
+        self._refused = min(self._refused + 1, 16)
+        longest = min(2.0 * RETRY_S * 2.0**self._refused, RARELY_S)
+        return longest * (0.5 + 0.5 * self._chance())
+
+
+async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
+    """Open the bus; try again until that succeeds, rarely where the router refuses."""
+    robot, pauses = plan.config.robot, Pauses()
+    while True:
+        try:
+            return await open_bus(
+                plan.config.bus, metrics, bounds=topics.size_bounds(), realm=robot.realm, robot=robot.name
+            )
+        except BusError as error:
+            pause = pauses.after(error)
+            log.warning("no bus: %s; next attempt in %.2g s", error, pause)
+            await asyncio.sleep(pause)
+
+
+async def watch_certificate(
+    certificate: Certificate, bus: Bus, conditions: Conditions, now: Callable[[], datetime] = utc_now
+) -> None:
+    """Warn on ``status`` and in the log from 30 days before a certificate ends.
+
+    Raises CertificateEnded when it has ended and there is no connection to the bus.
+    """
+    loop = asyncio.get_running_loop()
+    said, said_at, here = None, 0.0, True
+
+    def connected(is_here: bool) -> None:
+        nonlocal here
+        here = is_here
+
+    bus.watch_connected(connected)
+    while True:
+        text = ends_soon(certificate, now())
+        conditions.set(_CERTIFICATE, text)
+        if text is not None and (text != said or loop.time() - said_at >= SAY_S):
+            said, said_at = text, loop.time()
+            log.warning("%s", text)
+        left_s = (certificate.ends - now()).total_seconds()
+        if left_s <= 0 and not here:
+            raise CertificateEnded(f"{text}; the bus is left")
+        await asyncio.sleep(min(max(left_s, 0.0) + ENDED_S, LOOK_S))

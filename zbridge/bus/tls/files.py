@@ -1,0 +1,160 @@
+"""The files of one member of a secure bus: what is wrong with them, and a folder with them and its endpoints.
+
+``zbridge certs bundle`` makes such a folder: ``ca.pem``, ``certificate.pem``, ``key.pem``, and ``bus.toml``, whose
+``[bus]`` table names the routers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ssl
+import tomllib
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+
+from zbridge.bus.interface import BusSettings, Tls
+from zbridge.bus.tls.certificate import Certificate, read_certificate
+from zbridge.errors import ConfigError
+
+WARN = timedelta(days=30)
+"""How long before its end a certificate is warned of."""
+TLS_VARIABLE = "ZBRIDGE_TLS"
+"""The environment variable that names a folder, where no option does."""
+_NO_CHECK_TIME = 0x200000
+"""OpenSSL's flag: a chain is checked without its dates."""
+_FLIGHTS = 10
+"""Turns within which a handshake in memory has ended."""
+
+
+def folder_tls(folder: Path) -> Tls:
+    """Return the files of a folder as ``zbridge certs bundle`` makes it."""
+    return Tls(str(folder / "ca.pem"), str(folder / "certificate.pem"), str(folder / "key.pem"))
+
+
+def tls_beside(tls: Tls, folder: Path) -> Tls:
+    """Return files whose relative paths are relative to a folder: that of the configuration which names them."""
+    ca, certificate, key = (name and str(folder / name) for name in (tls.ca, tls.certificate, tls.key))
+    return Tls(ca or tls.ca, certificate, key)
+
+
+def folder_settings(folder: Path, endpoints: Sequence[str] = ()) -> BusSettings:
+    """Return how a program joins the bus with a folder: by these endpoints, else by those of its ``bus.toml``.
+
+    Raises ConfigError where there is no such folder, or neither names a router.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"--tls {folder}: no such folder; expected one as `zbridge certs bundle` makes it")
+    return BusSettings(
+        mode="client", multicast=False, connect=tuple(endpoints) or _routers(folder), tls=folder_tls(folder)
+    )
+
+
+def _routers(folder: Path) -> tuple[str, ...]:
+    file = folder / "bus.toml"
+    try:
+        bus = tomllib.loads(file.read_text(encoding="utf-8"))["bus"]
+        return msgspec.convert(bus["connect"], tuple[str, ...])
+    except FileNotFoundError:
+        raise ConfigError(f"--tls {folder}: no bus.toml there; give --connect tls/HOST:7447") from None
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, msgspec.ValidationError) as error:
+        raise ConfigError(f'{file}: expected a [bus] table with connect = ["tls/HOST:7447"]') from error
+
+
+def own_certificate(tls: Tls | None) -> Certificate | None:
+    """Return what the certificate of these settings says; None where there is none; raise ConfigError."""
+    return read_certificate(Path(tls.certificate)) if tls is not None and tls.certificate is not None else None
+
+
+def unusable(tls: Tls) -> str | None:
+    """Say why no connection can be made with these files, whatever the time is; None where one can."""
+    try:
+        read_certificate(Path(tls.ca))
+        if own_certificate(tls) is None or tls.key is None:
+            return None if tls.certificate is tls.key is None else "certificate and key: expected both, or neither"
+        client_context(tls)
+    except ConfigError as error:
+        return str(error)
+    return None
+
+
+def out_of_date(certificate: Certificate, now: datetime) -> str | None:
+    """Say that a certificate is not valid now; None where it is."""
+    if certificate.ends <= now:
+        renew = f"; `zbridge certs renew {certificate.name}`" if certificate.name else ""
+        return f"the certificate of {certificate.common_name} expired on {certificate.ends:%Y-%m-%d %H:%M} UTC{renew}"
+    if certificate.begins > now:
+        return (
+            f"the certificate of {certificate.common_name} is not valid before {certificate.begins:%Y-%m-%d %H:%M} UTC:"
+            " is the clock of this machine wrong?"
+        )
+    return None
+
+
+def ends_soon(certificate: Certificate, now: datetime) -> str | None:
+    """Warn of a certificate that ends within :data:`WARN`; None where it is valid for longer."""
+    if now < certificate.ends - WARN:
+        return None
+    return out_of_date(certificate, now) or (
+        f"the certificate of {certificate.common_name} ends on {certificate.ends:%Y-%m-%d}: renew it"
+        f" (`zbridge certs renew {certificate.name}`) and restart"
+    )
+
+
+def utc_now() -> datetime:
+    """Return the time by the clock of this machine."""
+    return datetime.now(UTC)
+
+
+def client_context(tls: Tls) -> ssl.SSLContext:
+    """Return what a client with these files shakes hands with; raise ConfigError, which names the file."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.hostname_checks_common_name = False  # nor does Zenoh
+    _load_authority(context, tls)
+    _load_own(context, tls)
+    return context
+
+
+def is_of_authority(tls: Tls) -> bool:
+    """Tell whether the authority has signed the certificate, whatever the time is, by a handshake in memory."""
+    server, client = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
+    server.verify_mode = ssl.CERT_REQUIRED
+    server.verify_flags |= _NO_CHECK_TIME
+    _load_authority(server, tls)
+    for context in (server, client):
+        _load_own(context, tls)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (client.wrap_bio(to_client, to_server), server.wrap_bio(to_server, to_client, server_side=True))
+    try:
+        for _ in range(_FLIGHTS):
+            for end in ends:
+                with contextlib.suppress(ssl.SSLWantReadError):
+                    end.do_handshake()
+    except ssl.SSLError:
+        return False
+    return ends[1].getpeercert() is not None
+
+
+def _load_authority(context: ssl.SSLContext, tls: Tls) -> None:
+    try:
+        context.load_verify_locations(tls.ca)
+    except (OSError, ssl.SSLError) as error:
+        raise ConfigError(f"{tls.ca}: not a certificate in PEM form") from error
+
+
+def _load_own(context: ssl.SSLContext, tls: Tls) -> None:
+    if tls.certificate is None or tls.key is None:
+        return
+    try:
+        context.load_cert_chain(tls.certificate, tls.key, password=lambda: "")  # never ask on the terminal
+    except ssl.SSLError as error:
+        if error.reason in ("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH"):
+            raise ConfigError(f"{tls.key}: not the key of the certificate {tls.certificate}") from error
+        raise ConfigError(f"{tls.key}: not a private key in PEM form without a password") from error
+    except OSError as error:
+        raise ConfigError(f"{tls.key}: {error.strerror or error}") from error

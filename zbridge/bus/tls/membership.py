@@ -1,0 +1,74 @@
+"""Whether the router knows our name: it lets every certificate of its authority connect, and an unknown name hears
+silence.
+
+``zbridge router`` answers each member who it is, and nobody else may ask (``@bus/whoami/<name>``). Zenoh's own router
+answers nobody: the id of a session tells them apart.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Awaitable, Callable, Sequence
+
+from zbridge.bus.interface import Answer
+from zbridge.bus.tls.certificate import Certificate
+from zbridge.errors import BusRefused, PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Membership
+
+_MARK = "7a627264"
+"""How the ids of routers that answer begin: "zbrd"."""
+_ASKED = 3
+_APART_S = 0.3
+_ANSWER_S = 1.0
+
+Ask = Callable[[str], Awaitable[list[Answer]]]
+
+
+def router_id() -> str:
+    """Return a new id for a router that answers its members."""
+    return _MARK + secrets.token_hex(12)
+
+
+async def require_member(
+    ask: Ask, routers: Sequence[str], certificate: Certificate, realm: str, robot: str | None
+) -> None:
+    """Raise BusRefused if the router does not know our name, or gives us no right to this robot.
+
+    routers: the ids of the routers that we are connected to. Nothing is found out where none of them answers members,
+    or the certificate names no member.
+    """
+    name = certificate.name
+    if not topics.is_name(name) or not any(each.startswith(_MARK) for each in routers):
+        return
+    membership = await _asked(ask, topics.whoami(realm, name))
+    if membership is None:
+        raise BusRefused(
+            f"connected, but the router does not know {certificate.common_name} in realm {realm}: its roles.toml does"
+            " not name it (issued later, or revoked?); it reads the file when it starts"
+        )
+    if membership.role != certificate.role:
+        raise BusRefused(
+            f"connected, but roles.toml of the router names {membership.role}.{name}, and the certificate is of"
+            f" {certificate.common_name}"
+        )
+    if robot is not None and membership.robots and robot not in membership.robots:
+        raise BusRefused(
+            f"connected, but {certificate.common_name} is for {', '.join(membership.robots)} and not for {robot}:"
+            " roles.toml of the router says so"
+        )
+
+
+async def _asked(ask: Ask, key: str) -> Membership | None:
+    for attempt in range(_ASKED):
+        if attempt:
+            await asyncio.sleep(_APART_S)
+        for answer in await ask(key):
+            if answer.error is None:
+                try:
+                    return payloads.decode(Membership, answer.payload)
+                except PayloadError:
+                    continue
+    return None

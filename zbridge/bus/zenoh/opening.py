@@ -1,0 +1,111 @@
+"""A Zenoh session is opened: how settings become Zenoh's configuration, and why it was not opened."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import zenoh
+
+from zbridge.bus.interface import SECURE, BusSettings, Tls
+from zbridge.bus.tls.refusal import why_not
+from zbridge.errors import BusError, BusRefused
+from zbridge.fleet.topics import SizeBounds
+
+PATIENCE_US = 20_000
+"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+_INGRESS = ("ingress",)
+_BOUNDED = ("put", "delete", "query")
+_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
+"""The place in Zenoh's source at the end of its error texts; cut off."""
+
+
+def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
+    values: dict[str, Any] = {
+        "mode": settings.effective_mode,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast,
+        "open/return_conditions/connect_scouted": wait_for_peers,
+        # A pool of 28 MB in every process, for payloads larger than a robot has.
+        "transport/shared_memory/enabled": False,
+        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
+    }
+    if settings.listen:
+        values["listen/endpoints"] = settings.listen
+    if bounds:
+        values["low_pass_filter"] = _size_filters(bounds)
+    if settings.effective_mode == "client":
+        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+    if settings.tls is not None:
+        values |= _secure_values(settings.tls)
+    return write_config(values)
+
+
+def write_config(values: Mapping[str, Any]) -> zenoh.Config:
+    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
+    config = zenoh.Config()
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key} = {value!r}: {in_short(error)}") from error
+    return config
+
+
+def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
+    """Write the filters by which Zenoh drops input that is larger than its key allows."""
+    return [
+        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
+        for number, (key_exprs, most_bytes) in enumerate(bounds)
+    ]
+
+
+def _secure_values(tls: Tls) -> dict[str, Any]:
+    """Write what holds with certificates: nobody is found by chance, nothing goes in the open, names are verified."""
+    at = "transport/link/tls"
+    values: dict[str, Any] = {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/protocols": list(SECURE),
+        f"{at}/root_ca_certificate": tls.ca,
+        f"{at}/verify_name_on_connect": True,
+    }
+    if tls.certificate and tls.key:
+        values |= {
+            f"{at}/enable_mtls": True,
+            f"{at}/connect_certificate": tls.certificate,
+            f"{at}/connect_private_key": tls.key,
+        }
+    return values
+
+
+def in_short(error: zenoh.ZError) -> str:
+    """Return the text of an error of Zenoh's, without its place in Zenoh's source."""
+    return _ORIGIN.sub("", str(error))
+
+
+async def open_or_say_why(config: zenoh.Config, settings: BusSettings) -> zenoh.Session:
+    """Open a session; raise BusError, which says which case it is where that can be found."""
+    try:
+        return await open_session(config)
+    except BusError as error:
+        # Others open without a connection: what failed is something else, an address to listen at.
+        finding = await why_not(settings) if settings.effective_mode == "client" else None
+        if finding is None:
+            raise
+        raise (BusRefused if finding.refused else BusError)(finding.text) from error
+
+
+async def open_session(config: zenoh.Config) -> zenoh.Session:
+    """Open a session; raise BusError where that is not possible."""
+    try:
+        return await asyncio.to_thread(zenoh.open, config)
+    except zenoh.ZError as error:
+        raise BusError(in_short(error)) from error

@@ -1,0 +1,116 @@
+"""The bus of ``zbridge demo --secure``: a router, and certificates made on the fly in a temporary folder.
+
+A viewer's session looks, an operator's drives, and each robot's gateway speaks for its robot alone. The folders of the
+members stay as long as the demo runs, for commands in another terminal.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib.util
+from collections.abc import AsyncIterator, Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+from zbridge.app.roles import Member
+from zbridge.bus import Bus, open_bus
+from zbridge.bus.tls.files import folder_settings
+from zbridge.cli.processes import free_port, process
+from zbridge.client import Fleet
+from zbridge.errors import BusError, ConfigError
+from zbridge.metrics import Metrics
+
+REALM = "fleet"
+START_S = 20.0
+"""Longest time a process may take to start."""
+DAYS = 60
+"""How long the certificates are valid: no warning of their end is shown."""
+_ROUTER, _LOOKS, _DRIVES, _READER = "hub", "screen", "demo", "you"
+
+
+class DemoBus(msgspec.Struct, frozen=True):
+    """How the parts of a demo use its bus.
+
+    looking: the session of the table. driving: the robots as the program that drives them sees them. table: the
+    ``[bus]`` table of a robot's gateway. commands: what to try in another terminal.
+    """
+
+    endpoint: str
+    looking: Bus
+    driving: Fleet
+    table: Callable[[str], str]
+    commands: tuple[str, ...]
+
+
+@contextlib.asynccontextmanager
+async def secure_bus(folder: Path, log: IO[bytes], robots: list[str]) -> AsyncIterator[DemoBus]:
+    """Run a router with roles, and join it as a viewer and as an operator; raise ConfigError, BusError."""
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    gateways = {robot: f"g{number}" for number, robot in enumerate(robots, 1)}
+    roles = make_members(folder, endpoint, gateways)
+    async with contextlib.AsyncExitStack() as stack:
+        listening = ("--listen", endpoint, "--tls", str(folder / _ROUTER), "--roles", str(roles))
+        await stack.enter_async_context(process(log, "router", *listening))
+        looking = await stack.enter_async_context(_joined(folder / _LOOKS))
+        driving = await stack.enter_async_context(_joined(folder / _DRIVES))
+        commands = (
+            f"zbridge ls --sessions --tls {folder / _LOOKS}     # a viewer: looks and stops, and drives nothing",
+            f"zbridge drive {robots[0]} --tls {folder / _READER}     # an operator",
+        )
+        fleet = Fleet(driving, REALM, _DRIVES)
+        yield DemoBus(endpoint, looking, fleet, lambda robot: _table(folder / gateways[robot]), commands)
+
+
+def make_members(folder: Path, endpoint: str, gateways: dict[str, str]) -> Path:
+    """Make an authority, and the folders of all members of the demo; return ``roles.toml``; raise ConfigError.
+
+    gateways: the name of each robot's.
+    """
+    if importlib.util.find_spec("cryptography") is None:
+        raise ConfigError("zbridge demo --secure needs the package cryptography: pip install 'zbridge[certs]'")
+    from zbridge.app.certs import authority
+    from zbridge.app.certs.bundle import Packing, bundle
+    from zbridge.app.certs.files import Folder
+
+    members = {
+        _ROUTER: Member("router"),
+        _LOOKS: Member("viewer"),
+        _DRIVES: Member("operator"),
+        _READER: Member("operator"),
+        **{name: Member("gateway", (robot,), listeners=True) for robot, name in gateways.items()},
+    }
+    now, made = datetime.now(UTC).replace(microsecond=0), Folder(folder / "certs")
+    authority.init(made, now)
+    for name, member in members.items():
+        hosts = ("127.0.0.1",) if member.role == "router" else ()
+        authority.issue(made, authority.Request(name, member, hosts, DAYS), now)
+    for name in members:
+        bundle(made, name, Packing(folder / name, (endpoint,)), now)
+    return folder / _ROUTER / "roles.toml"
+
+
+def _table(folder: Path) -> str:
+    return (folder / "bus.toml").read_text(encoding="utf-8")
+
+
+@contextlib.asynccontextmanager
+async def _joined(folder: Path) -> AsyncIterator[Bus]:
+    """Join the bus with the files of a folder, as soon as the router is there; raise BusError."""
+    loop = asyncio.get_running_loop()
+    until = loop.time() + START_S
+    while True:
+        try:
+            bus = await open_bus(folder_settings(folder), Metrics(), realm=REALM)
+            break
+        except BusError:
+            if loop.time() >= until:
+                raise
+            await asyncio.sleep(0.1)
+    try:
+        yield bus
+    finally:
+        await bus.close()

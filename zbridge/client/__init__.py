@@ -17,6 +17,7 @@ import contextlib
 from collections.abc import AsyncIterator, Sequence
 
 from zbridge.bus import BusSettings, Tls, open_bus
+from zbridge.bus.tls.member import own_name
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
 from zbridge.client.fleet import Fleet, Robot
@@ -47,12 +48,14 @@ async def connect(
 
     endpoints: Zenoh endpoints, ``tcp/192.168.0.2:7447``; by default the local network and the router on this machine.
     settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
-    Raises BusError if no given endpoint can be reached.
+    Raises BusError if no given endpoint can be reached, ConfigError if the certificate cannot be read.
     """
     if isinstance(endpoints, str):
         endpoints = (endpoints,)
-    bus = await open_bus(settings or bus_settings(endpoints, tls), Metrics(), wait_for_peers=True)
+    settings = settings or bus_settings(endpoints, tls)
+    name = own_name(settings.tls)
+    bus = await open_bus(settings, Metrics(), wait_for_peers=True)
     try:
-        yield Fleet(bus, realm)
+        yield Fleet(bus, realm, name)
     finally:
         await bus.close()

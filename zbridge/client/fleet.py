@@ -11,7 +11,7 @@ from typing import Any
 from zbridge.bus import Bus, Sample
 from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import Feed, StateFeed, reader
-from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
+from zbridge.errors import BusError, Malformed, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -50,10 +50,11 @@ _ASK_S = 0.3
 
 
 class Fleet:
-    """All robots of one realm: ``fleet["r1"]``."""
+    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says."""
 
-    def __init__(self, bus: Bus, realm: str = "fleet") -> None:
+    def __init__(self, bus: Bus, realm: str = "fleet", name: str | None = None) -> None:
         self.realm = realm
+        self.name = name
         self._bus = bus
 
     def __repr__(self) -> str:
@@ -63,7 +64,7 @@ class Fleet:
         """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-        return Robot(self._bus, KeySpace(self.realm, name))
+        return Robot(self._bus, KeySpace(self.realm, name), self.name)
 
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status."""
@@ -106,9 +107,10 @@ class Fleet:
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
         super().__init__(bus, keys, topics.CONTROL)
         self._keys = keys
+        self._own = own
 
     @contextlib.asynccontextmanager
     async def __call__(
@@ -125,14 +127,14 @@ class ControlFeed(StateFeed[Control]):
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
         who: the holder's name that others are shown, ``user@host`` by default. name: the first part of ``who``
-        (``op1`` of ``op1.laptop``) if access rules know this program by that part only.
+        (``op1`` of ``op1.laptop``) if access rules know this program by that part only. On a secure bus both are by
+        default what the certificate says, and Malformed is raised for another name.
         priority: a program with a higher priority is given the robot of one with a lower priority.
         deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
         Raises Held with the holder's name, BusError if no gateway answers, or Refused as the gateway did.
         """
-        who = who or default_who()
-        name = name or who
+        who, name = _names(who, name, self._own)
         request = Acquire(
             who=who,
             priority=priority,
@@ -144,10 +146,22 @@ class ControlFeed(StateFeed[Control]):
             yield driver
 
 
+def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str]:
+    """Return as whom the lease is asked for, and the name in the key; own: the name in the certificate, if any."""
+    if own is None:
+        who = who or default_who()
+        return who, name or who
+    who = who or own
+    if name not in (None, own) or not topics.speaks_for(who, escape(own)):
+        wrong = f"name = {name!r}" if name not in (None, own) else f"who = {who!r}"
+        raise Malformed(f"{wrong}: the certificate of this program says {own!r}: expected that, or {f'{own}.suffix'!r}")
+    return who, own
+
+
 class Robot:
     """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
-    def __init__(self, bus: Bus, keys: KeySpace) -> None:
+    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
         self.name = keys.robot
         self._bus = bus
         self._keys = keys
@@ -161,7 +175,7 @@ class Robot:
         self.lidar: StateFeed[Switch] = StateFeed(bus, keys, topics.LIDAR)
         self.camera: StateFeed[Switch] = StateFeed(bus, keys, topics.CAMERA)
         self.devices: StateFeed[Devices] = StateFeed(bus, keys, topics.DEVICES)
-        self.control = ControlFeed(bus, keys)
+        self.control = ControlFeed(bus, keys, own)
 
     def __repr__(self) -> str:
         return f"<Robot {self._keys.realm}/{self.name}>"

@@ -7,5 +7,6 @@ from zbridge.transport.by_address import connect
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.tcp import TcpLink, listen
+from zbridge.transport.tls import TlsLink, server_context
 
-__all__ = ["Accepted", "Conversation", "Link", "Receiver", "TcpLink", "connect", "listen"]
+__all__ = ["Accepted", "Conversation", "Link", "Receiver", "TcpLink", "TlsLink", "connect", "listen", "server_context"]

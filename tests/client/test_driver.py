@@ -190,7 +190,7 @@ async def test_with_a_certificate_a_program_asks_in_its_name_and_in_no_other(
         assert world.gateway.control.holder == said
         assert [path for _, path in world.gateway.asked] == [f"@rpc/control/{asked}"]
         (token,) = tokens(world.bus)
-        assert token == "operator.op1.mine"
+        assert token == f"operator.op1.{world.bus.zid}"
 
 
 @pytest.mark.parametrize(("wishes", "wait_s"), [({}, 5.0), ({"wait_s": 1.5}, 1.5)])

@@ -132,11 +132,13 @@ class TlsLink(Receiver):
             if not self._open:
                 self._shake_hands()
             while self._link is not None:
-                self._receiver.received(self._tls.read(_READ_BYTES))
+                plain = self._tls.read(_READ_BYTES)
+                if not plain:
+                    self._fail("closed by peer")
+                else:
+                    self._receiver.received(plain)
         except ssl.SSLWantReadError:
             self._flush()
-        except ssl.SSLZeroReturnError:
-            self._fail("closed by peer")
         except ssl.SSLError as error:
             self._fail(f"TLS: {_said(error)}")
 

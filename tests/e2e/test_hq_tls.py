@@ -97,4 +97,5 @@ allow = ["10.0.0.0/8"]
     until(lambda: bench.fleet.last("r1/control").get("holder") is None)
     log = gateway.end()
     assert " gone: TLS: " in log, log
-    assert log.count("its network is not allowed") == 1, "three in a second are one line"
+    assert log.count("turned away (1 so far): its network is not allowed") == 1, log
+    assert "2 more turned away: its network is not allowed" in log, log

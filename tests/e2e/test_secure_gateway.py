@@ -19,7 +19,7 @@ from zbridge.app.roles import Member, Roles
 from zbridge.app.router_settings import folder_tls
 from zbridge.bus import BusSettings
 from zbridge.client import Fleet
-from zbridge.errors import BusError
+from zbridge.errors import BusError, Malformed
 
 ROLES = Roles({**LAB.names, "op2": Member("operator")})
 DENIED_S = 0.7
@@ -60,7 +60,8 @@ async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: B
         async with operator["r1"].control("op1.laptop", name="op1") as drive:
             await drive.during(0.3, forward=0.3)
             await operator["r1"].ask_pose()
-            await refused(another, "op1.laptop", "op1")
+            with pytest.raises(Malformed, match="the certificate of this program says 'op2'"):
+                await another["r1"].control("op1.laptop", name="op1").__aenter__()
             await refused(another, "op2", "op2", takeover=True)
             await drive(forward=0.1)
             assert drive.loss is None

@@ -33,6 +33,11 @@ def test_a_name_that_leaves_no_room_for_numbers_is_named() -> None:
         listener_names(plans("d", "d" * 7), "h" * 48, ZID)
 
 
+def test_two_listeners_that_would_have_one_name_on_the_bus_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"^hq\[1\]\.name: 'h1\.desk' is another listener's name on the bus"):
+        listener_names(plans("desk", "h1.desk"), "h1", ZID)
+
+
 def test_a_process_is_called_by_its_certificate_or_else_by_its_first_listener() -> None:
     assert process_name(["h1.desk", "h1.east"], "h1", ZID) == f"hq.h1.{ZID}"
     assert process_name(["desk", "east"], None, ZID) == f"hq.desk.{ZID}"

@@ -34,6 +34,8 @@ def listener_names(plans: Sequence[ListenerPlan], own: str | None, zid: str) -> 
             name = _of_member(name, own)
         if len(name) > _MOST:
             raise ConfigError(f"hq[{number}].name: {name!r} has more than {_MOST} characters: expected a shorter name")
+        if name in names:
+            raise ConfigError(f"hq[{number}].name: {name!r} is another listener's name on the bus: expected its own")
         names.append(name)
     return names
 

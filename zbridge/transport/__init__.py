@@ -1,4 +1,4 @@
-"""Links to peers (tcp, tls, udp, serial), and conversations: one session over one link. Knows no protocol and no bus."""
+"""Links to peers (tcp, tls, udp, serial), and conversations: one session over a link. Knows no protocol and no bus."""
 
 from __future__ import annotations
 

@@ -219,6 +219,9 @@ def secure(**bus: Any) -> dict[str, Any]:
     return minimal(bus={"connect": ["tls/hub.lab:7447"], "tls": {"ca": "a", "certificate": "b", "key": "c"}, **bus})
 
 
+TLS = {"certificate": "/none.pem", "key": "/key.pem"}
+
+
 INF, NAN = math.inf, math.nan
 NOT_NAMES = ("a/b", "", "@r", "*")
 
@@ -267,6 +270,15 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     (minimal(metrics={"listen": "9100"}), "metrics.listen = '9100': expected host:port"),
     (serving(hq(allow=["10.0.0.0/8", "home"])), "hq[0].allow[1] = 'home': expected a network like '192.168.1.0/24': "),
     (serving(hq(allow=["10.0.0.1/8"])), "hq[0].allow[0] = '10.0.0.1/8': expected a network like '192.168.1.0/24': "),
+    (serving(hq(listen="tls://127.0.0.1")), "hq[0].listen = 'tls://127.0.0.1': expected tls://host:port"),
+    (serving(hq(listen="tls://a:1")), "hq[0].tls: missing, it is required with listen = 'tls://a:1'"),
+    (serving(hq(listen="tls://a:1", tls={"key": "k"})), "hq[0].tls.certificate: missing"),
+    (
+        serving(hq(tls=TLS)),
+        "hq[0].listen = 'tcp://127.0.0.1:11002': expected tls://host:port, for there is a table tls",
+    ),
+    (serving(hq(listen="tls://a:1", tls=TLS)), "hq[0].tls: certificate '/none.pem' with key '/key.pem': No such file"),
+    (serving(hq(), hq(listen="tls://127.0.0.1:11002", tls=TLS)), "hq[1].tls: certificate '/none.pem'"),
     # The environment
     (serving(hq(listen="tcp://${NONE}:1")), "hq[0].listen = 'tcp://${NONE}:1': expected the environment variable NONE"),
     (device(connect=["${NONE}"]), "device.connect[0] = '${NONE}': expected the environment variable NONE"),

@@ -12,6 +12,7 @@ from typing import Any
 import msgpack
 import pytest
 
+from tests.certificates import Authority
 from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
@@ -81,6 +82,23 @@ async def test_the_configuration_caps_a_lease_and_every_lease_has_an_id_and_a_to
         assert ({len(token) for token in tokens}, {len(each) for each in ids}) == ({32}, {8})
         assert len(tokens) == len(ids) == 20
         assert len({byte for token in tokens for byte in token}) > 100, "nothing that could be guessed"
+
+
+@jumping
+@pytest.mark.parametrize("name", [None, "h1"])
+async def test_a_process_with_listeners_only_answers_for_its_sessions_under_its_own_name(
+    name: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    listener = {"protocol": "tcpudp", "listen": "tcp://127.0.0.1:0", "name": "desk"}
+    raw: dict[str, Any] = {"robot": {"name": "r1"}, "hq": [listener]}
+    if name is not None:
+        folder = Authority(tmp_path).issue(f"hq.{name}")
+        files = {"ca": "ca", "certificate": str(folder / "certificate.pem"), "key": str(folder / "key.pem")}
+        raw["bus"] = {"connect": ["tls/localhost:1"], "multicast": False, "tls": files}
+    gateway = Gateway(plan(raw))
+    async with serving(gateway, monkeypatch) as bus:
+        (answer,) = await bus.ask("fleet/r1/@rpc/sessions/*")
+        assert answer.key == f"fleet/r1/@rpc/sessions/hq.{name or 'desk'}.1"
 
 
 @jumping

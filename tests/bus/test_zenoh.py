@@ -241,6 +241,9 @@ BOUNDS = {
 }
 
 
+REPORT = "fleet/r1/@rpc/control/refused/hq.desk"
+
+
 async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called() -> None:
     where = (f"tcp/127.0.0.1:{free_port()}",)
     gateway = await open_zenoh(BusSettings(multicast=False, listen=where), Metrics(), bounds=topics.size_bounds())
@@ -253,6 +256,7 @@ async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called
 
     gateway.subscribe("fleet/r1/@cmd/**", lambda sample: seen.take(sample.key, len(sample.payload)), lane=sort)
     gateway.answer("fleet/r1/@rpc/pose", lambda question: question.answer(b"yes"))
+    gateway.answer(REPORT, lambda question: question.answer(b"yes"))
 
     def put_all() -> None:
         while not list(sender.get("fleet/r1/@rpc/pose", timeout=0.1)):
@@ -261,6 +265,8 @@ async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called
             for payload, attachment in ((most + 1, 0), (most - 9, 10), (most - 10, 10), (0, most + 1), (1, 0)):
                 sender.put(f"fleet/{key}", bytes(payload), attachment=bytes(attachment), congestion_control=BLOCK)
         assert list(sender.get("fleet/r1/@rpc/pose", payload=bytes(1025), timeout=SOON_S)) == []
+        reports = [list(sender.get(REPORT, payload=bytes(size), timeout=SOON_S)) for size in (16_384, 16_385)]
+        assert list(map(len, reports)) == [1, 0]
 
     try:
         await asyncio.to_thread(put_all)

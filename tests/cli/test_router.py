@@ -20,6 +20,11 @@ def test_the_deployed_configuration_is_what_the_deployed_settings_make(capsys: p
     assert capsys.readouterr().out == (DEPLOYED / "router.json5").read_text()
 
 
+def test_rules_for_the_ports_of_the_deployed_router_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    run_router(DEPLOYED / "router.toml", {}, print_nftables=True)
+    assert "tcp dport { 7447 } ct state new" in capsys.readouterr().out
+
+
 def test_options_go_before_the_file(tmp_path: Path) -> None:
     file, tls = tmp_path / "router.toml", Tls("ca.pem", "c.pem", "k.pem")
     file.write_text("listen = ['tcp/127.0.0.1:1']\nrealm = 'lab'\n")

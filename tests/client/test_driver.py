@@ -162,6 +162,37 @@ async def test_a_bad_wish_is_refused_at_once_with_the_reason(wishes: dict[str, A
     world.assert_nothing_is_left()
 
 
+CERTIFIED: list[tuple[dict[str, Any], str, str]] = [
+    # what is asked for; the holder, or why there is none; the key
+    ({}, "op1", "acquire/op1"),
+    ({"who": "op1"}, "op1", "acquire/op1"),
+    ({"who": "op1.laptop"}, "op1.laptop", "acquire/op1"),
+    ({"who": "op1.laptop", "name": "op1"}, "op1.laptop", "acquire/op1"),
+    ({"takeover": True}, "op1", "takeover/op1"),
+    ({"who": "op2"}, "who = 'op2': the certificate of this program says 'op1': expected that, or 'op1.suffix'", ""),
+    ({"who": "op12"}, "who = 'op12': the certificate of this program says 'op1': expected that, or 'op1.suffix'", ""),
+    ({"name": "op2"}, "name = 'op2': the certificate of this program says 'op1': expected that, or 'op1.suffix'", ""),
+]
+
+
+@pytest.mark.parametrize(("wishes", "said", "asked"), CERTIFIED)
+async def test_with_a_certificate_a_program_asks_in_its_name_and_in_no_other(
+    wishes: dict[str, Any], said: str, asked: str
+) -> None:
+    world = World()
+    robot = Fleet(world.bus, name="op1")["r1"]
+    if not asked:
+        with pytest.raises(Malformed) as raised:
+            await robot.control(**wishes).__aenter__()
+        assert (str(raised.value), world.gateway.asked) == (said, [])
+        return
+    async with robot.control(**wishes):
+        assert world.gateway.control.holder == said
+        assert [path for _, path in world.gateway.asked] == [f"@rpc/control/{asked}"]
+        (token,) = tokens(world.bus)
+        assert token == f"operator.op1.{world.bus.zid}"
+
+
 @pytest.mark.parametrize(("wishes", "wait_s"), [({}, 5.0), ({"wait_s": 1.5}, 1.5)])
 async def test_a_gateway_that_does_not_come_is_waited_for_so_long(wishes: dict[str, float], wait_s: float) -> None:
     world = World(served=False)

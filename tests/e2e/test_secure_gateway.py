@@ -12,14 +12,14 @@ import pytest
 
 import zbridge
 from tests.access import LAB
-from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, free_port, listener
+from tests.e2e.conftest import HOST, WAIT_S, Bench, Gateway, device, free_port, listener, until
 from tests.e2e.hq_programs import tcpudp_by_tcp
 from tests.e2e.secure import SecureBus
 from zbridge.app.roles import Member, Roles
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_tls
 from zbridge.client import Fleet
-from zbridge.errors import BusError
+from zbridge.errors import BusError, Malformed
 
 ROLES = Roles({**LAB.names, "op2": Member("operator")})
 DENIED_S = 0.7
@@ -45,12 +45,17 @@ async def refused(fleet: Fleet, who: str, name: str, *, takeover: bool = False) 
             raise AssertionError(f"{who} drives")
 
 
+def tls(bus: SecureBus, name: str) -> str:
+    """Write ``[bus.tls]``; the last part of a configuration."""
+    files = folder_tls(bus.folders[name])
+    return f'[bus.tls]\nca = "{files.ca}"\ncertificate = "{files.certificate}"\nkey = "{files.key}"\n'
+
+
 async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: Bench, tmp_path: Path) -> None:
     bus = SecureBus(tmp_path / "bus", ROLES)
     bench.stack.callback(bus.stop)
-    files, port = folder_tls(bus.folders["g2"]), free_port()
-    tls = f'[bus.tls]\nca = "{files.ca}"\ncertificate = "{files.certificate}"\nkey = "{files.key}"\n'
-    parts = (device(bench.simulator()), listener("g2", "tcpudp", port), tls)
+    port = free_port()
+    parts = (device(bench.simulator()), listener("g2", "tcpudp", port), tls(bus, "g2"))
     gateway = Gateway(bench.stack, tmp_path / "gateway.toml", bus.endpoint, *parts)
     async with member(bus, "v1") as viewer, member(bus, "op1") as operator, member(bus, "op2") as another:
         await established(viewer)
@@ -60,7 +65,8 @@ async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: B
         async with operator["r1"].control("op1.laptop", name="op1") as drive:
             await drive.during(0.3, forward=0.3)
             await operator["r1"].ask_pose()
-            await refused(another, "op1.laptop", "op1")
+            with pytest.raises(Malformed, match="the certificate of this program says 'op2'"):
+                await another["r1"].control("op1.laptop", name="op1").__aenter__()
             await refused(another, "op2", "op2", takeover=True)
             await drive(forward=0.1)
             assert drive.loss is None
@@ -78,3 +84,41 @@ async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: B
                     await asyncio.sleep(0.2)
                     move(1)
     gateway.end()
+
+
+async def test_a_process_with_listeners_only_drives_lives_and_answers_under_the_name_in_its_certificate(
+    bench: Bench, tmp_path: Path
+) -> None:
+    bus = SecureBus(tmp_path / "bus", ROLES)
+    bench.stack.callback(bus.stop)
+    port = free_port()
+    gateway = Gateway(bench.stack, tmp_path / "r1.toml", bus.endpoint, device(bench.simulator()), tls(bus, "g1"))
+    listeners = Gateway(
+        bench.stack, tmp_path / "hq.toml", bus.endpoint, listener("desk", "tcpudp", port), tls(bus, "h1")
+    )
+    async with member(bus, "v1") as viewer:
+        await established(viewer)
+        await asyncio.to_thread(until, lambda: listeners.listens(1))
+        processes = {who for _, who in await viewer.sessions()}
+        (own,) = processes - {"gateway"}
+        assert own.startswith("hq.h1.")
+        with socket.create_connection((HOST, port)) as tcp:
+            move = await asyncio.to_thread(tcpudp_by_tcp, tcp)
+            for _ in range(10):  # motion without neutral first is refused, and its report gets through
+                move(1)
+            async with asyncio.timeout(WAIT_S):
+                async for control in viewer["r1"].control:
+                    if any(each.by == "hq.h1.desk" and each.code == "neutral_first" for each in control.refusals):
+                        break
+                async for control in viewer["r1"].control:
+                    if (control.holder or "").startswith("hq.h1.desk."):
+                        break
+                    move(0)
+                    await asyncio.sleep(0.2)
+                    move(1)
+        async with asyncio.timeout(WAIT_S):
+            async for control in viewer["r1"].control:
+                if control.holder is None:
+                    break
+    for process in (listeners, gateway):
+        process.end()

@@ -72,6 +72,10 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     (m.Lease(**GRANTED), GRANTED | none("reason code")),
     (m.Lease(**HELD), HELD | none("lease token")),
     (m.Refusals((OFFLINE,)), {"refusals": [OFFLINE_SENT]}),
+    (
+        m.Membership(name="g1", role="gateway", robots=("r1",)),
+        {"name": "g1", "role": "gateway", "robots": ["r1"]},
+    ),
     (m.Denied("closing", "gateway stopped"), {"code": "closing", "reason": "gateway stopped"}),
     (
         m.Sessions((m.SessionEntry(**SESSION, features=("udp",)),)),

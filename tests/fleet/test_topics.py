@@ -98,6 +98,24 @@ def test_a_program_speaks_in_the_name_that_it_asks_at(chunk: str) -> None:
     assert [who for who in (*may, *may_not) if topics.speaks_for(who, chunk)] == list(may)
 
 
+@pytest.mark.parametrize(
+    ("chunk", "may", "may_not"),
+    [
+        (
+            "op1",
+            ("operator.op1.a1.2", "hq.op1.7"),
+            ("operator.op1", "operator.op12.7", "operator.op2.op1.7", "op1.7", ""),
+        ),
+        ("user%40host", ("operator.user%40host.a1",), ("operator.user@host.a1",)),
+        ("hq.desk", ("hq.desk.7", "hq.desk.7.1"), ("hq.desk", "hq.desk2.7", "operator.desk.7", "operator.hq.desk.7")),
+    ],
+)
+def test_a_program_names_a_token_of_the_name_that_it_asks_at(
+    chunk: str, may: tuple[str, ...], may_not: tuple[str, ...]
+) -> None:
+    assert [alive for alive in (*may, *may_not) if topics.may_name_token(alive, chunk)] == list(may)
+
+
 def test_a_key_is_told_from_an_expression_and_a_plain_name_can_stand_in_it_as_it_is() -> None:
     keys = ("fleet/r1/@cmd/stop", "fleet/*/@cmd/stop", "**", "a$*b")
     assert [key for key in keys if topics.is_concrete(key)] == ["fleet/r1/@cmd/stop"]

@@ -12,6 +12,7 @@ import pytest
 from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import Code, NotReady, Refused
+from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.refusals import EVERY_S, RefusalReports
@@ -110,3 +111,13 @@ async def test_a_teller_that_is_closed_tells_nothing_more(scene: Scene) -> None:
     scene.reports.close()
     await asyncio.sleep(5 * EVERY_S)
     assert len(scene.told) == 1
+
+
+async def test_the_largest_report_keeps_within_the_bound_of_its_key(scene: Scene) -> None:
+    sizes: list[int] = []
+    scene.bus.answer("fleet/r1/@rpc/control/refused/*", lambda question: sizes.append(len(question.payload)))
+    scene.refuse()
+    for number in range(TOLD + 1):
+        scene.refuse(60_000 + number, "motor/" + 1000 * "m", NotReady(1000 * "\u20ac"))
+    await asyncio.sleep(2 * EVERY_S)
+    assert 8192 < max(sizes) <= topics.SETTING_BYTES

@@ -46,3 +46,17 @@ def test_an_address_is_read_and_written(text: str) -> None:
 def test_what_is_no_address_is_an_error_that_says_what_was_expected(text: str, parse, expected: str) -> None:
     with pytest.raises(LinkError, match=re.escape(repr(text)) + ".*" + re.escape(expected)):
         parse(text)
+
+
+def test_a_listener_may_be_at_an_address_of_tls_and_a_robot_may_not() -> None:
+    assert Address.parse_listener("tls://[::1]:6666") == Address("::1", 6666, tls=True)
+    assert str(Address("::1", 6666, tls=True)) == "tls://[::1]:6666"
+    assert Address.parse_listener("tcp://a:1") == Address("a", 1)
+    for parse, text, expected in (
+        (Address.parse_listener, "tls://a", "expected tls://host:port"),
+        (Address.parse_listener, "udp://a:1", "expected tcp://host:port"),
+        (Address.parse, "tls://a:1", "expected tcp://host:port"),
+        (parse_device_address, "tls://a:1", "expected tcp://host:port"),
+    ):
+        with pytest.raises(LinkError, match=re.escape(repr(text)) + ".*" + re.escape(expected)):
+            parse(text)

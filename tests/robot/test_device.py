@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import unquote
 
 import msgpack
 import pytest
@@ -419,9 +420,14 @@ async def test_whoever_acquires_is_given_the_lease_and_shown_as_the_holder_but_t
 
 @pytest.mark.scene(deadman_s=60.0, hold=False)
 async def test_a_holder_whose_liveliness_token_goes_is_lost_and_the_robot_stopped_in_the_same_moment(rig: Rig) -> None:
-    keys = ("r1/@alive/operator.7", "r1/@alive/operator.8", "r2/@alive/operator.7", "r1/@alive/gateway")
+    keys = (
+        "r1/@alive/operator.driver.7",
+        "r1/@alive/operator.driver.8",
+        "r2/@alive/operator.driver.7",
+        "r1/@alive/gateway",
+    )
     own, *others = [rig.hq.announce(f"fleet/{key}") for key in keys]
-    assert rig.hold(alive="operator.7")["ok"]
+    assert rig.hold(alive="operator.driver.7")["ok"]
     await rig.play("left 0.1 > left")
     for token in others:
         token.close()
@@ -449,6 +455,20 @@ REFUSED_QUESTIONS: list[tuple[str, str, bytes, str]] = [
         for how in ("acquire", "takeover")
         for at, name, who in (("op1", "op1", "op12"), ("op1.laptop", "op1.laptop", "op1"), ("%6Fp1", "op1", "op1"))
     ],
+    *[
+        (
+            "r1",
+            f"{how}/{at}",
+            packed({"who": at, "alive": alive}),
+            f"alive = {alive!r}: expected a token of its own name",
+        )
+        for how in ("acquire", "takeover")
+        for at, alive in (
+            *(("op1", each) for each in ("operator.op2.7", "operator.op12.7", "operator.op1", "op1.7", "gateway", "")),
+            ("hq.desk", "hq.desk2.7"),
+            ("hq.desk", "operator.desk.7"),
+        )
+    ],
     *[("r1", f"{how}/ann", bad, "Acquire: ") for how in ("acquire", "takeover") for bad in (b"", b"\xc1")],
     *[
         ("r1", how, bad, "malformed authorization: expected {lease, seq, proof}")
@@ -475,13 +495,15 @@ async def test_a_question_in_another_name_with_wildcards_or_malformed_is_refused
     (reply,) = rig.ask(f"control/{name}", payload, asked=f"fleet/{robot}/@rpc/control/{name}").replies
     assert isinstance(reply.error, Malformed)
     assert reason in str(reply.error)
-    await rig.play(f"refused - {name.split('/')[0]}: {reply.error}\n control held driver")
+    how, _, at = name.partition("/")
+    bound = unquote(at) if at not in ("", "*") and robot == "r1" else "-"
+    await rig.play(f"refused {bound} {how}: {reply.error}\n control held driver")
 
 
 async def test_more_than_five_takeovers_a_second_are_refused_and_the_last_one_keeps_the_robot(rig: Rig) -> None:
     taken = [rig.ask("control/takeover/n", packed({"who": f"n.{number}"})).replies[0] for number in range(8)]
     assert [type(reply.error) for reply in taken] == [type(None)] * 5 + [TooFast] * 3
-    await rig.play("control held n.4\n refused - takeover: more than 5 takeovers a second x3\n 0.25")
+    await rig.play("control held n.4\n refused n takeover: more than 5 takeovers a second x3\n 0.25")
     assert rig.ask("control/takeover/me%40here", packed({"who": "me@here"})).replies[0].error is None
 
 

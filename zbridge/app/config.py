@@ -13,6 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
+from ssl import SSLContext
 from typing import Any
 
 import msgspec
@@ -28,6 +29,7 @@ from zbridge.hq.settings import Network
 from zbridge.protocol.address import Address, DeviceAddress, parse_device_address
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
+from zbridge.transport import server_context
 
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 
@@ -108,9 +110,9 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
     for number, settings in enumerate(config.hq):
         if settings.name is not None and named[settings.name] > 1:
             raise ConfigError(f"hq[{number}].name = {settings.name!r}: expected a name of its own")
-    taken = Counter(listener.address for listener in listeners if listener.address.port)
+    taken = Counter(_port(listener.address) for listener in listeners if listener.address.port)
     for number, listener in enumerate(listeners):
-        if taken[listener.address] > 1:
+        if taken[_port(listener.address)] > 1:
             raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
     metrics = _metrics_address(config.metrics.listen) if config.metrics else None
     return Plan(config, device, listeners, metrics)
@@ -136,7 +138,27 @@ def _listener(settings: HqSettings, key: str) -> ListenerPlan:
         raise ConfigError(f"{key}.name = {settings.name!r}: expected letters, digits, '_', '.' and '-' only")
     options = convert(settings.options, protocol.hq_options, f"{key}.options.")
     allow = tuple(_network(f"{key}.allow[{number}]", text) for number, text in enumerate(settings.allow))
-    return ListenerPlan(protocol, options, _address(f"{key}.listen", settings.listen), settings, allow)
+    address = _listener_address(f"{key}.listen", settings.listen)
+    return ListenerPlan(protocol, options, address, settings, allow, _listener_tls(key, settings, address))
+
+
+def _port(address: Address) -> tuple[str, int]:
+    return address.host, address.port
+
+
+def _listener_tls(key: str, settings: HqSettings, address: Address) -> SSLContext | None:
+    """Read the files of a listener at ``tls://``."""
+    tls = settings.tls
+    if tls is None and address.tls:
+        raise ConfigError(f"{key}.tls: missing, it is required with listen = {settings.listen!r}")
+    if tls is None:
+        return None
+    if not address.tls:
+        raise ConfigError(f"{key}.listen = {settings.listen!r}: expected tls://host:port, for there is a table tls")
+    try:
+        return server_context(tls.certificate, tls.key, tls.ca)
+    except LinkError as error:
+        raise ConfigError(f"{key}.tls: {error}") from error
 
 
 def _protocol(prefix: str, name: str) -> Protocol:
@@ -153,9 +175,9 @@ def _network(key: str, text: str) -> Network:
         raise ConfigError(f"{key} = {text!r}: expected a network like '192.168.1.0/24': {error}") from error
 
 
-def _address(key: str, text: str) -> Address:
+def _listener_address(key: str, text: str) -> Address:
     try:
-        return Address.parse(text)
+        return Address.parse_listener(text)
     except LinkError as error:
         raise ConfigError(f"{key} = {error}") from error
 

@@ -23,6 +23,7 @@ from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate
+from zbridge.bus.tls.member import own_name
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
@@ -33,6 +34,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
+from zbridge.hq.names import listener_names, process_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
@@ -41,8 +43,6 @@ from zbridge.robot.settings import DevicePlan
 
 log = logging.getLogger("zbridge.app.gateway")
 
-_ZID = 6
-"""Characters of the bus session's id in a listener's name: they differ between processes."""
 TELL_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
@@ -64,12 +64,17 @@ class Gateway:
         self.metrics = Metrics()
         self.sessions = SessionTable()
         self.conditions = Conditions()
+        self._own: str | None = None
+        """The name in our certificate."""
+        self._process = "gateway"
+        """The name of this process on the bus, while it does not serve the robot."""
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
+        self._own = own_name(self._plan.config.bus.tls)
         with self._audit() as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
@@ -84,11 +89,13 @@ class Gateway:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+            names = listener_names(self._plan.listeners, self._own, bus.zid)
+            self._process = process_name(names, self._own, bus.zid) if names else "gateway"
             robot = RobotSubscription(bus, self._keys, self.metrics)
             certificate = own_certificate(self._plan.config.bus.tls)
             work: list[Coroutine[Any, Any, None]] = [
                 Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
-                for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
+                for listener, name in zip(self._plan.listeners, names, strict=True)
             ]
             if work:
                 robot.open()
@@ -98,23 +105,15 @@ class Gateway:
             if self._plan.device is not None:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
-                stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
+                stack.callback(self._show_sessions(bus, self._process).close)
             await together(*work)
-
-    def _listener_names(self, bus: Bus) -> list[str]:
-        """Return the names of the listeners on the bus: as configured, else unique by the id of the bus session."""
-        names: list[str] = []
-        for number, listener in enumerate(self._plan.listeners, 1):
-            own = f"{listener.protocol.name}-{bus.zid[:_ZID]}"
-            names.append(listener.settings.name or (f"{own}-{number}" if own in names else own))
-        return names
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         ownership = Ownership(bus, self._keys)
         try:
             while True:
-                shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
+                shown = self._show_sessions(bus, self._process) if self._plan.listeners else None
                 await ownership.take()
                 if shown is not None:
                     shown.close()

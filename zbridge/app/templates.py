@@ -32,6 +32,8 @@ handshake_s = 5.0                       # longest time for a client's handshake
 # idle_s = 60.0                         # close clients that send nothing for so long; left out: never
 rate_hz = 1000.0                        # messages a second of one client; a client that sends more is closed
 allow = []                              # networks that clients may connect from, ["192.168.1.0/24"]; empty: all
+# tls = { certificate = "certificate.pem", key = "key.pem", ca = "ca.pem" }     # with listen = "tls://HOST:PORT"; with
+                                        # ca, clients must show a certificate of it; no datagrams then
 
 """
 ROBOT_TEMPLATE = """\

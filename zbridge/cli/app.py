@@ -201,6 +201,9 @@ def router(
     print_config: Annotated[
         bool, typer.Option("--print-config", help="print the configuration for Zenoh's own router (JSON5)")
     ] = False,
+    print_nftables: Annotated[
+        bool, typer.Option("--print-nftables", help="print nftables rules that limit new connections per address")
+    ] = False,
 ) -> None:
     """Run a Zenoh router in the foreground until SIGTERM or SIGINT: with tls, each member may do what its role may."""
     from zbridge.cli.router import folder_tls, run_router
@@ -214,7 +217,7 @@ def router(
         "realm": realm,
         "insecure": insecure,
     }
-    run_router(file, given, print_config=print_config)
+    run_router(file, given, print_config=print_config, print_nftables=print_nftables)
 
 
 @app.command()

@@ -9,6 +9,7 @@ import msgspec
 
 from zbridge.app import until_signal
 from zbridge.app.router import Router, ZenohWarnings
+from zbridge.app.router_firewall import nftables
 from zbridge.app.router_settings import RouterSettings, load_router, nested, plan_router, zenoh_values
 from zbridge.app.toml import convert
 from zbridge.bus import hear_zenoh
@@ -33,14 +34,19 @@ def settings_of(file: Path | None, given: dict[str, object]) -> RouterSettings:
     return convert(msgspec.to_builtins(settings) | msgspec.to_builtins(changes), RouterSettings)
 
 
-def run_router(file: Path | None, given: dict[str, object], *, print_config: bool) -> None:
-    """Run a router until SIGTERM or SIGINT, or print its configuration for Zenoh's own."""
+def run_router(
+    file: Path | None, given: dict[str, object], *, print_config: bool = False, print_nftables: bool = False
+) -> None:
+    """Run a router until SIGTERM or SIGINT, or print its configuration for Zenoh's own, or rules for its ports."""
     try:
-        plan = plan_router(settings_of(file, given), files=not print_config)
+        plan = plan_router(settings_of(file, given), files=not (print_config or print_nftables))
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}" if file is not None and str(file) not in str(error) else error) from error
     if print_config:
         print(HEAD + json.dumps(nested(zenoh_values(plan)), indent=2))  # noqa: T201
+        return
+    if print_nftables:
+        print(nftables(plan.settings), end="")  # noqa: T201
         return
     hear_zenoh(ZenohWarnings().take)
     run_loop(until_signal(Router(plan).run()))

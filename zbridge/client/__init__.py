@@ -18,7 +18,8 @@ from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
 from zbridge.bus import BusSettings, Tls, open_bus
-from zbridge.bus.tls.files import folder_settings, own_certificate
+from zbridge.bus.tls.files import folder_settings
+from zbridge.bus.tls.member import own_name
 from zbridge.client.driver import Driver
 from zbridge.client.feed import Feed, StateFeed
 from zbridge.client.fleet import Fleet, Robot
@@ -56,14 +57,15 @@ async def connect(
     endpoints: Zenoh endpoints, ``tcp/192.168.0.2:7447``; by default the local network and the router on this machine.
     tls: for a secure bus, a folder as ``zbridge certs bundle`` makes it, whose endpoints are used if none are given; or
     the files. settings: all settings of the bus, instead of ``endpoints`` and ``tls``.
-    Raises BusError if no given endpoint can be reached, or the router refuses this program: the text says why.
+    Raises BusError if no given endpoint can be reached, or the router refuses this program: the text says why;
+    ConfigError if the certificate cannot be read.
     """
     if isinstance(endpoints, str):
         endpoints = (endpoints,)
     settings = settings or bus_settings(endpoints, tls)
-    certificate = own_certificate(settings.tls)
+    name = own_name(settings.tls)
     bus = await open_bus(settings, Metrics(), wait_for_peers=True, realm=realm)
     try:
-        yield Fleet(bus, realm, certificate.name or None if certificate is not None else None)
+        yield Fleet(bus, realm, name)
     finally:
         await bus.close()

@@ -11,7 +11,7 @@ from typing import Any
 from zbridge.bus import Bus, Sample
 from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import Feed, StateFeed, reader
-from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
+from zbridge.errors import BusError, Malformed, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -50,15 +50,12 @@ _ASK_S = 0.3
 
 
 class Fleet:
-    """All robots of one realm: ``fleet["r1"]``.
-
-    name: on a secure bus, that of this program's certificate: its leases are under this name.
-    """
+    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says."""
 
     def __init__(self, bus: Bus, realm: str = "fleet", name: str | None = None) -> None:
         self.realm = realm
+        self.name = name
         self._bus = bus
-        self._name = name
 
     def __repr__(self) -> str:
         return f"<Fleet {self.realm}>"
@@ -67,7 +64,7 @@ class Fleet:
         """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-        return Robot(self._bus, KeySpace(self.realm, name), self._name)
+        return Robot(self._bus, KeySpace(self.realm, name), self.name)
 
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status."""
@@ -130,18 +127,14 @@ class ControlFeed(StateFeed[Control]):
         """Hold the lease while the context lasts: ``async with robot.control() as drive: await drive(forward=0.3)``.
 
         who: the holder's name that others are shown, ``user@host`` by default. name: the first part of ``who``
-        (``op1`` of ``op1.laptop``) if access rules know this program by that part only. With a certificate of its own
-        the program is known by the name in it: ``who`` begins with that name, and is it by default.
+        (``op1`` of ``op1.laptop``) if access rules know this program by that part only. On a secure bus both are by
+        default what the certificate says, and Malformed is raised for another name.
         priority: a program with a higher priority is given the robot of one with a lower priority.
         deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
         Raises Held with the holder's name, BusError if no gateway answers, or Refused as the gateway did.
         """
-        own = self._own if name is None else None
-        if own is not None and (who is None or not topics.speaks_for(who, escape(own))):
-            who = f"{own}.{who}" if who else own
-        who = who or default_who()
-        name = name or own or who
+        who, name = _names(who, name, self._own)
         request = Acquire(
             who=who,
             priority=priority,
@@ -151,6 +144,18 @@ class ControlFeed(StateFeed[Control]):
         )
         async with holding(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s) as driver:
             yield driver
+
+
+def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str]:
+    """Return as whom the lease is asked for, and the name in the key; own: the name in the certificate, if any."""
+    if own is None:
+        who = who or default_who()
+        return who, name or who
+    who = who or own
+    if name not in (None, own) or not topics.speaks_for(who, escape(own)):
+        wrong = f"name = {name!r}" if name not in (None, own) else f"who = {who!r}"
+        raise Malformed(f"{wrong}: the certificate of this program says {own!r}: expected that, or {f'{own}.suffix'!r}")
+    return who, own
 
 
 class Robot:

@@ -28,6 +28,8 @@ _COUNTED = 1_000_000
 """Most refusals of one kind that a report counts."""
 _NAMED = 64
 """Characters of a wrong name that a refusal repeats."""
+_BY_NAME = ("acquire", "takeover", "refused")
+"""Queries whose key ends with the name of who asks. On a secure bus nobody can ask at another's key."""
 _ANYBODY = "*"
 
 Decide = Callable[[IncomingQuery], FleetMessage]
@@ -87,7 +89,7 @@ class LeaseServer:
                 query.answer(payloads.encode(decide(query)))
             except (PayloadError, Refused) as error:
                 refusal = error if isinstance(error, Refused) else Malformed(str(error))
-                self._authority.refuse(command, refusal)
+                self._authority.refuse(command, refusal, _bound_name(query, command))
                 query.refuse(refusal)
             self._enforcer.settle()
 
@@ -133,10 +135,21 @@ class LeaseServer:
         return Query()
 
 
+def _bound_name(query: IncomingQuery, command: str) -> str | None:
+    """Return the name in the key of a query, which its payload cannot change; None where the key has none."""
+    if command not in _BY_NAME or not topics.is_concrete(query.asked):
+        return None
+    return topics.unescape(query.asked.rpartition("/")[2])
+
+
 def _request(query: IncomingQuery) -> Acquire:
-    """Read who asks for the lease; raise Malformed where it asks in another name than its key's."""
+    """Read who asks for the lease; raise Malformed where it asks, or is to live, in another name than its key's."""
     request = payloads.decode(Acquire, query.payload)
     _require_own_name(query, request.who)
+    name = query.asked.rpartition("/")[2]
+    if request.alive is not None and not topics.may_name_token(request.alive, name):
+        own = f"{'' if name.startswith(_LISTENER) else 'operator.'}{name}.<id>"
+        raise Malformed(f"alive = {request.alive[:_NAMED]!r}: expected a token of its own name, {own[:_NAMED]!r}")
     return request
 
 

@@ -10,7 +10,7 @@ from zbridge.fleet.messages import Refusal
 
 REFUSALS = 16
 """Different refusals that ``control`` shows; a new one replaces the one that was counted least recently."""
-_EXPLAINED = 200
+EXPLAINED = 200
 """Characters of a reason that are kept."""
 
 
@@ -25,7 +25,7 @@ class RefusalCounts:
 
     def add(self, command: str, refused: Refused, who: str | None, by: str | None, count: int) -> Refusal:
         """Count a refusal and return it as it is shown, with its total. Names and reasons are shortened."""
-        who, command, reason = who and who[:NAMED], command[:NAMED], str(refused)[:_EXPLAINED]
+        who, command, reason = who and who[:NAMED], command[:NAMED], str(refused)[:EXPLAINED]
         key = (who, command, refused.code, reason, by)
         self._counts[key] = total = self._counts.pop(key, 0) + count
         if len(self._counts) > REFUSALS:

@@ -107,7 +107,7 @@ SMALL_BYTES = 256
 QUERY_BYTES = 1024
 """Bound of a query: an acquire with the longest names."""
 SETTING_BYTES = 16_384
-"""Bound of a sensor setting (1 000 values) and of a listener's report of refusals."""
+"""Bound of a sensor setting (1 000 values), of a listener's report of refusals, and of queries that are not known."""
 LARGE_BYTES = 65_536
 """Bound of a scan (16 000 points), a text and a raw message."""
 
@@ -139,6 +139,15 @@ def speaks_for(who: str, chunk: str) -> bool:
     """
     name = escape(who)
     return name == chunk or name.startswith(f"{chunk}.")
+
+
+def may_name_token(alive: str, chunk: str) -> bool:
+    """Tell whether a program that queries this key chunk may name the liveliness token ``@alive/<alive>`` as its own.
+
+    Access rules let each program declare tokens of its own name only: ``operator.<name>.<id>``, ``hq.<name>.<id>``.
+    """
+    begins = (f"{chunk}.",) if chunk.startswith("hq.") else (f"operator.{chunk}.", f"hq.{chunk}.")
+    return alive.startswith(begins)
 
 
 def is_concrete(key: str) -> bool:
@@ -226,9 +235,9 @@ def size_bounds() -> SizeBounds:
     """Return the bounds of all commands and queries of any robot, for the bus to enforce.
 
     All other keys below ``@cmd`` and ``@rpc``, and puts with wildcards, have bounds too. A message must keep within
-    every bound whose key expression intersects its key.
+    every bound whose key expression intersects its key: a bound of all keys below a chunk is that of the largest.
     """
-    groups: dict[int, list[str]] = {LARGE_BYTES: ["**/@cmd/**"], QUERY_BYTES: ["**/@rpc/**"]}
+    groups: dict[int, list[str]] = {LARGE_BYTES: ["**/@cmd/**"], SETTING_BYTES: ["**/@rpc/**"]}
     for path, most_bytes in _bounded():
         groups.setdefault(most_bytes, []).append(f"**/{path}")
     return tuple((tuple(key_exprs), most_bytes) for most_bytes, key_exprs in sorted(groups.items()))

@@ -28,7 +28,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits
 from zbridge.protocol.session_table import SessionTable
-from zbridge.transport import Accepted, Conversation, Link, listen
+from zbridge.transport import Accepted, Conversation, Link, Receiver, TlsLink, listen
 
 log = logging.getLogger("zbridge.hq")
 
@@ -72,6 +72,9 @@ class Listener:
         )
         self._active: set[Client] = set()
         """Clients whose operator has to be called regularly."""
+        self._secured: Callable[[Receiver], Receiver] | None = None
+        if (tls := plan.tls) is not None:
+            self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
 
     def __repr__(self) -> str:
@@ -85,6 +88,7 @@ class Listener:
             lambda: Accepted(self._admit, logging.DEBUG),  # the end of a client is logged with its reason
             datagrams=self._context.side.datagrams,
             foreign=self._context.counts.foreign_datagrams,
+            secured=self._secured,
         ) as self.address:
             log.info("%s: HQ programs connect at %s", self.name, self.address)
             self.ready.set()
@@ -155,7 +159,7 @@ class Listener:
     def _admit(self, link: Link) -> Conversation | None:
         """Make a client of an accepted link; None if it is refused."""
         context, now = self._context, self._clock()
-        host = link.peer.removeprefix("tcp://").rpartition(":")[0].strip("[]")
+        host = link.peer.partition("://")[2].rpartition(":")[0].strip("[]")
         reason = "the gateway stops" if self._closing else self._admission.refusal(host, len(self.clients), now)
         number = self._numbers.take(now) if reason is None else None
         if number is None:

@@ -10,6 +10,8 @@ import asyncio
 import logging
 
 from zbridge.bus import Bus
+from zbridge.control.refusal_counts import EXPLAINED
+from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -49,7 +51,7 @@ class RefusalReports:
 
     def note(self, who: str, command: str, refusal: Refused) -> None:
         """Report a refusal, now or with the next report; at most :data:`TOLD` different ones wait."""
-        kind = (who, command, refusal.code, str(refusal))
+        kind = (who, command[:NAMED], refusal.code, str(refusal)[:EXPLAINED])
         if kind not in self._waiting and len(self._waiting) >= TOLD:
             self._untold.value += 1
             return

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import ipaddress
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol
 
+if TYPE_CHECKING:
+    from ssl import SSLContext
+
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+
+
+class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The files of a listener at ``tls://``. ca: clients must show a certificate of this authority; None: of none."""
+
+    certificate: str
+    key: str
+    ca: str | None = None
 
 
 class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -20,7 +31,7 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: of the listener on the bus; None: made of the protocol and the process. clients: most at a time. accept_hz:
     connections a second that are accepted from one address. handshake_s: longest time for a client's handshake.
     idle_s: longest silence of a client; None: no limit. rate_hz: messages a second of one client. allow: networks that
-    clients may connect from; empty: all.
+    clients may connect from; empty: all. tls: what is shown to clients, at an address ``tls://host:port``.
     """
 
     protocol: str
@@ -33,13 +44,18 @@ class HqSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     idle_s: Seconds | None = None
     rate_hz: Annotated[float, msgspec.Meta(ge=1, le=1e6)] = 1000.0
     allow: tuple[str, ...] = ()
+    tls: ListenerTls | None = None
 
 
 class ListenerPlan(msgspec.Struct, frozen=True):
-    """What one listener is made of: its protocol, that protocol's options, where it listens, and for whom."""
+    """What one listener is made of: its protocol, that protocol's options, where it listens, and for whom.
+
+    tls: of a listener at ``tls://``, else None.
+    """
 
     protocol: Protocol
     options: Any
     address: Address
     settings: HqSettings
     allow: tuple[Network, ...]
+    tls: SSLContext | None = None

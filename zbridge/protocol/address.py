@@ -12,14 +12,16 @@ import msgspec
 from zbridge.errors import LinkError
 
 _TCP = "tcp://host:port"
+_TLS = "tls://"
 _SERIAL = "serial:///path?baud=N"
 
 
 class Address(msgspec.Struct, frozen=True):
-    """A TCP port: ``tcp://host:port``."""
+    """A TCP port: ``tcp://host:port``. tls: of a listener, which speaks TLS there: ``tls://host:port``."""
 
     host: str
     port: int
+    tls: bool = False
 
     @classmethod
     def parse(cls, text: str) -> Address:
@@ -29,9 +31,21 @@ class Address(msgspec.Struct, frozen=True):
             raise LinkError(f"{text!r}: expected {_TCP}; only a robot is connected by a serial line")
         return _tcp(text, parts, _TCP)
 
+    @classmethod
+    def parse_listener(cls, text: str) -> Address:
+        """Read ``tcp://host:port`` or ``tls://host:port``; raise LinkError that names what was expected."""
+        if not text.startswith(_TLS):
+            return cls.parse(text)
+        plain = "tcp" + text[3:]
+        try:
+            found = cls.parse(plain)
+        except LinkError as error:
+            raise LinkError(f"{text!r}: expected tls://host:port") from error
+        return cls(found.host, found.port, tls=True)
+
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"tcp://{host}:{self.port}"
+        return f"{'tls' if self.tls else 'tcp'}://{host}:{self.port}"
 
 
 class SerialAddress(msgspec.Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""Links to peers (tcp, udp, serial), and conversations: one session over one link. Knows no protocol and no bus."""
+"""Links to peers (tcp, tls, udp, serial), and conversations: one session over a link. Knows no protocol and no bus."""
 
 from __future__ import annotations
 
@@ -7,5 +7,6 @@ from zbridge.transport.by_address import connect
 from zbridge.transport.conversation import Conversation
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.tcp import TcpLink, listen
+from zbridge.transport.tls import TlsLink, server_context
 
-__all__ = ["Accepted", "Conversation", "Link", "Receiver", "TcpLink", "connect", "listen"]
+__all__ = ["Accepted", "Conversation", "Link", "Receiver", "TcpLink", "TlsLink", "connect", "listen", "server_context"]

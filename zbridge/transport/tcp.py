@@ -274,19 +274,25 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
 
 @contextlib.asynccontextmanager
 async def listen(
-    address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False, foreign: Count | None = None
+    address: Address,
+    receiver: Callable[[], Receiver],
+    *,
+    datagrams: bool = False,
+    foreign: Count | None = None,
+    secured: Callable[[Receiver], Receiver] | None = None,
 ) -> AsyncIterator[Address]:
     """Accept peers, each with a receiver of its own; give the address that is bound, with its port.
 
-    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. Raise LinkError if
-    the address cannot be bound.
+    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. ``secured`` puts a
+    filter before each receiver (TLS); then there are no datagrams. Raise LinkError if the address cannot be bound.
     """
     loop = asyncio.get_running_loop()
-    hub = DatagramHub(foreign or Count()) if datagrams else None
+    hub = DatagramHub(foreign or Count()) if datagrams and secured is None else None
+    make = receiver if secured is None else lambda: secured(receiver())
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
-            server = await loop.create_server(lambda: TcpLink(receiver(), hub, buffer), address.host, address.port)
+            server = await loop.create_server(lambda: TcpLink(make(), hub, buffer), address.host, address.port)
             await stack.enter_async_context(server)
             host, port = server.sockets[0].getsockname()[:2]
             if hub is not None:
@@ -294,4 +300,4 @@ async def listen(
                 stack.callback(hub.close)
         except OSError as error:
             raise LinkError(f"{address}: {error.strerror or error}") from error
-        yield Address(host, port)
+        yield Address(host, port, address.tls)

@@ -24,7 +24,7 @@ from tests.e2e.conftest import Bench, Gateway, ask, device, until
 from tests.e2e.secure import FAR, GRACE_S, SecureBus, declared
 from tests.proofs import Holder, packed
 from zbridge.app.roles import Member, Roles
-from zbridge.app.router_settings import folder_tls
+from zbridge.bus.tls.files import folder_tls
 from zbridge.errors import BusError, LeaseLost, Malformed
 
 ROLES = Roles(

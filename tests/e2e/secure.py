@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -79,6 +80,13 @@ class SecureBus:
 
     def log(self) -> str:
         return (self.folder / "log").read_text(errors="replace")
+
+    @property
+    def cpu_s(self) -> float:
+        """The processor time that the router has used, in seconds. Linux only."""
+        assert self._process is not None
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def stop(self) -> None:
         if self._process is not None:

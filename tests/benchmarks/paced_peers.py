@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 import msgpack
@@ -27,6 +28,9 @@ import zenoh
 from tests.benchmarks import alf_wire, wire
 from tests.benchmarks.peer import ROBOT, hear, open_session, tell
 from tests.benchmarks.robot import ACCEPT_S, shake_hands
+from zbridge.bus import BusSettings
+from zbridge.bus.tls.files import folder_tls
+from zbridge.bus.zenoh import zenoh_config
 
 Kind = Literal["position", "scan", "reading"]
 KEYS = {"position": f"fleet/{ROBOT}/pose", "scan": alf_wire.SCAN_KEY, "reading": f"fleet/{ROBOT}/sensor/ds"}
@@ -171,6 +175,17 @@ def subscriber(kind: Kind, endpoint: str) -> None:
         sink.obey()
 
 
+def client(kind: Kind, endpoint: str, folder: str = "") -> None:
+    """Be the consumer behind a router; ``folder``: with these certificates."""
+    tls = folder_tls(Path(folder)) if folder else None
+    sink = _Sink(lambda sample: [_number_published(kind, sample.payload.to_bytes())])
+    settings = BusSettings(mode="client", connect=(endpoint,), multicast=False, tls=tls)
+    with zenoh.open(zenoh_config(settings)) as session:
+        session.declare_subscriber(KEYS[kind], sink.take)
+        tell(ready=True)
+        sink.obey()
+
+
 class _Receiver(asyncio.Protocol):
     """Greets a robot of the kind, then hands every read on."""
 
@@ -229,6 +244,7 @@ def main() -> None:
         "robot": robot,
         "bare": bare,
         "subscriber": subscriber,
+        "client": client,
         "tcp": tcp,
         "minimal": minimal,
     }

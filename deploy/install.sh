@@ -74,9 +74,8 @@ instances() { # the units of single robots that were enabled
 
 remove() {
     local unit
-    mapfile -t enabled < <(instances)
     if has_systemctl; then
-        for unit in "${enabled[@]}" zbridge.service zbridge-router.service zbridge-recorder.service; do
+        for unit in $(instances) zbridge.service zbridge-router.service zbridge-recorder.service; do
             if [ -e "$units/$unit" ] || [[ $unit == zbridge@* ]]; then
                 systemctl disable --quiet "$unit" 2>/dev/null || true
                 if booted; then systemctl stop "$unit" || die "$unit does not stop"; fi
@@ -109,13 +108,12 @@ install_package() {
     local what options=()
     if [ -n "$wheels" ]; then
         [ -e "$wheels" ] || die "--wheels $wheels: no such file" 2
-        local folder=$wheels file found
+        local folder=$wheels file=''
         if [ -f "$wheels" ]; then
             folder=$(dirname "$wheels") file=$wheels
         else
-            mapfile -t found < <(find "$folder" -maxdepth 1 -name 'zbridge-*.whl' | sort -V)
-            [ ${#found[@]} -gt 0 ] || die "--wheels $wheels: no zbridge-*.whl in it" 2
-            file=${found[-1]}
+            file=$(find "$folder" -maxdepth 1 -name 'zbridge-*.whl' | sort -V | tail -n 1)
+            [ -n "$file" ] || die "--wheels $wheels: no zbridge-*.whl in it" 2
         fi
         what=$(realpath "$file") options=(--no-index --find-links "$(realpath "$folder")")
     else

@@ -23,6 +23,12 @@ wheels() { # zbridge and all that it needs, as a host without a network is given
         || { tail -n 2 "$work/pip.log"; fail "no wheels"; }
 }
 
-debian() { # FOLDER PACKAGES: a Debian 12 in a folder
-    mmdebstrap --quiet --variant=minbase --include="$2" bookworm "$1" 2>"$work/mmdebstrap.log" || { tail -n 2 "$work/mmdebstrap.log"; exit 77; }
+debian() { # FOLDER-OR-TAR PACKAGES: a Debian 12; ZBRIDGE_TRY_CACHE keeps it for the next time
+    local made=${ZBRIDGE_TRY_CACHE:-$work}/debian-${2//,/-}.tar
+    [ -f "$made" ] || mmdebstrap --quiet --variant=minbase --include="$2" bookworm "$made" 2>"$work/mmdebstrap.log" \
+        || { tail -n 2 "$work/mmdebstrap.log"; exit 77; }
+    case $1 in
+        *.tar) ln -f "$made" "$1" 2>/dev/null || cp "$made" "$1" ;;
+        *) mkdir "$1" && tar -C "$1" -xf "$made" ;;
+    esac
 }

@@ -81,7 +81,8 @@ systemctl start zbridge zbridge@r1
 established r1 r2 || fail "zbridge@r1"
 echo "[robot" >/etc/zbridge/single/bad.toml
 systemctl start zbridge@bad || true
-within 10 test "$(of Result zbridge@bad)" = exit-code || fail "a bad file is no failure"
+is() { [ "$(of "$1" "$2")" = "$3" ]; }
+within 10 is Result zbridge@bad exit-code || fail "a bad file is no failure"
 sleep 3
 [ "$(of NRestarts zbridge@bad)" = 0 ] || fail "a bad file is tried again and again"
 ok "a unit for one robot; a bad file is not tried again"
@@ -90,7 +91,8 @@ systemctl restart zbridge-router
 established r1 r2 || fail "the router's restart"
 ok "the router restarts: the gateways come back"
 
-if zbridge record --help >/dev/null 2>&1 && /opt/zbridge/bin/python -c 'import mcap' 2>/dev/null; then
+has_tls() { zbridge "$1" --help 2>/dev/null | grep --quiet -- --tls; }
+if has_tls record && /opt/zbridge/bin/python -c 'import mcap' 2>/dev/null; then
     zbridge certs issue box --role recorder >/dev/null
     zbridge certs bundle box -o /etc/zbridge/recorder --force >/dev/null
     zbridge certs bundle hub -o /etc/zbridge/router --force >/dev/null
@@ -100,13 +102,14 @@ if zbridge record --help >/dev/null 2>&1 && /opt/zbridge/bin/python -c 'import m
     within 20 recorded || fail "nothing is recorded"
     ok "the recorder records"
 else
-    echo "not tried: the recorder (this version has no zbridge record, or its extra is not among the wheels)"
+    echo "not tried: the recorder (this version's zbridge record has no --tls, or its extra is not among the wheels)"
 fi
-if zbridge health --help >/dev/null 2>&1; then
-    zbridge health || fail "zbridge health"
+if has_tls health; then
+    zbridge certs bundle wall -o wall >/dev/null
+    zbridge health --connect tls/127.0.0.1:7447 --tls wall || fail "zbridge health"
     ok "zbridge health"
 else
-    echo "not tried: zbridge health (this version has none)"
+    echo "not tried: zbridge health (this version's has no --tls)"
 fi
 
 bash deploy/install.sh --uninstall --purge >/dev/null || fail "--uninstall"

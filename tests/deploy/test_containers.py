@@ -1,8 +1,12 @@
 """The container file, the composition and the chart, as far as they can be read without their tools (deploy/try.sh)."""
 
+import importlib.util
 import json
 import re
+import socket
+import threading
 import tomllib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +38,45 @@ def test_what_the_build_copies_passes_the_list_of_ignored_files() -> None:
     }
     assert copied == passed
     assert all((ROOT / name).exists() for name in copied)
+
+
+SPEC = importlib.util.spec_from_file_location("healthy", DEPLOY / "container" / "healthy.py")
+assert SPEC is not None
+healthy = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(healthy)  # type: ignore[union-attr]
+
+
+def test_the_check_of_the_image_asks_gateways_with_metrics_and_names_the_silent_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Healthz) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        (tmp_path / "r1.toml").write_text(f'[metrics]\nlisten = "0.0.0.0:{server.server_port}"\n')
+        (tmp_path / "r2.toml").write_text("[robot]\nname = 'r2'\n")
+        (tmp_path / "r3.toml").write_text("[robot")
+        (tmp_path / "host.toml").write_text("")
+        assert healthy.main(tmp_path) == 0
+        (tmp_path / "r4.toml").write_text(f'[metrics]\nlisten = "127.0.0.1:{silent_port()}"\n')
+        assert healthy.main(tmp_path) == 1
+        server.shutdown()
+    assert capsys.readouterr().out.splitlines() == ["1 of 1 gateways answer", "1 of 2 gateways answer; r4 does not"]
+
+
+def silent_port() -> int:
+    """Give a port at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return int(taken.getsockname()[1])
+
+
+class Healthz(BaseHTTPRequestHandler):
+    """Answers as a gateway does, and at no other path."""
+
+    def do_GET(self) -> None:
+        self.send_response(200 if self.path == "/healthz" else 404)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Write nothing."""
 
 
 def test_the_composition_has_router_gateways_and_recorder() -> None:

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -59,9 +58,3 @@ def test_what_is_installed_without_a_word_stays_what_it_is() -> None:
 def test_bash_reads_a_script(script: Path) -> None:
     done = subprocess.run(("bash", "-n", str(script)), capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-@pytest.mark.skipif(not shutil.which("shellcheck"), reason="this machine has no shellcheck")
-def test_shellcheck_has_nothing_to_say() -> None:
-    done = subprocess.run(("shellcheck", "-x", *map(str, SCRIPTS)), capture_output=True, text=True, timeout=120)
-    assert done.stdout == ""

@@ -74,20 +74,19 @@ instances() { # the units of single robots that were enabled
 
 remove() {
     local unit
-    if has_systemctl; then
-        for unit in $(instances) zbridge.service zbridge-router.service zbridge-recorder.service; do
-            if [ -e "$units/$unit" ] || [[ $unit == zbridge@* ]]; then
-                systemctl disable --quiet "$unit" 2>/dev/null || true
-                if booted; then systemctl stop "$unit" || die "$unit does not stop"; fi
-            fi
-        done
-    fi
+    # Instances may run without being enabled; the router ends last, for gateways tell the bus that they end.
+    for unit in 'zbridge@*.service' zbridge.service zbridge-recorder.service zbridge-router.service; do
+        if booted; then systemctl stop "$unit" 2>/dev/null || ! systemctl is-active --quiet "$unit" || die "$unit does not stop"; fi
+    done
+    for unit in $(instances) zbridge.service zbridge-recorder.service zbridge-router.service; do
+        ! has_systemctl || systemctl disable --quiet "$unit" 2>/dev/null || true
+    done
     for unit in "${all_units[@]}"; do rm -f "$units/$unit"; done
-    rm -rf "$units/zbridge.service.d" "$prefix"
-    rm -f /usr/local/bin/zbridge /etc/tmpfiles.d/zbridge.conf
+    rm -rf "$prefix"
+    rm -f "$units/zbridge.service.d/serial.conf" /usr/local/bin/zbridge /etc/tmpfiles.d/zbridge.conf
     if booted; then systemctl daemon-reload; fi
     if [ -n "$purge" ]; then
-        rm -rf "$etc" /var/lib/zbridge /var/lib/private/zbridge-recorder /var/lib/zbridge-recorder
+        rm -rf "$etc" "$units"/zbridge*.service.d /var/lib/zbridge /var/lib/private/zbridge-recorder /var/lib/zbridge-recorder
         rm -f /etc/sysusers.d/zbridge.conf
         ! getent passwd zbridge >/dev/null || userdel zbridge
         ! getent group zbridge >/dev/null || groupdel zbridge

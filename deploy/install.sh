@@ -84,7 +84,7 @@ remove() {
     for unit in "${all_units[@]}"; do rm -f "$units/$unit"; done
     rm -rf "$prefix"
     rm -f "$units/zbridge.service.d/serial.conf" /usr/local/bin/zbridge /etc/tmpfiles.d/zbridge.conf
-    if booted; then systemctl daemon-reload; fi
+    if booted; then systemctl daemon-reload; systemctl reset-failed 'zbridge*' 2>/dev/null || true; fi
     if [ -n "$purge" ]; then
         rm -rf "$etc" "$units"/zbridge*.service.d /var/lib/zbridge /var/lib/private/zbridge-recorder /var/lib/zbridge-recorder
         rm -f /etc/sysusers.d/zbridge.conf

@@ -9,7 +9,8 @@ compose() { podman-compose --file "$root/deploy/container/compose.yaml" "$@" >"$
 say() { tail -n 15 "$work/compose.log"; compose logs || true; tail -n 20 "$work/compose.log"; }
 zbridge simulate tcpudp --listen tcp://127.0.0.1:11001 >/dev/null 2>&1 &
 simulator=$!
-trap 'kill $simulator; compose down --volumes || true' EXIT
+# The containers' runtime gives its standard input, /dev/null, to the container's user.
+trap 'kill $simulator; compose down --volumes || true; chown root:root /dev/null' EXIT
 
 compose up -d --no-build router gateways || { say; fail "podman-compose up"; }
 python "$root/deploy/try/established.py" --folder "$work/certs" r1 || { say; fail "r1 is not established"; }

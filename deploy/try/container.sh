@@ -50,7 +50,7 @@ zbridge certs issue hub --role router --host 127.0.0.1 --host router >/dev/null
 zbridge certs issue r1 --role gateway --robot r1 >/dev/null
 zbridge certs issue wall --role viewer >/dev/null
 zbridge certs bundle hub -o config/router >/dev/null
-zbridge certs bundle r1 -o config/bus/r1 --at /etc/zbridge/bus/r1 >/dev/null
+zbridge certs bundle r1 -o config/bus/r1 --at /etc/zbridge/bus/r1 --connect tls/127.0.0.1:7447 >/dev/null
 { zbridge init tcpudp --name r1 | sed '/^\[bus\]/,/^stream/d'; cat config/bus/r1/bus.toml; printf '[metrics]\nlisten = "127.0.0.1:9100"\n'; } >config/robots/r1.toml
 chown -R 10001:10001 config
 unshare --net --mount --propagation private bash "$root/deploy/try/composed.sh"

@@ -32,8 +32,8 @@ COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z]+)(.*)", re.MULTILINE)
 SPAN = re.compile(r"`([^`\n]+)`")
 BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
-GROUPS = ("zbridge.protocols",)
-"""Dotted names that are no modules: the entry-point group."""
+GROUPS = ("zbridge.protocols", "zbridge.service")
+"""Dotted names that are no modules: the entry-point group, the unit of systemd."""
 THEIRS = ("hq.toml", "r1.toml", "e1.toml", "roles.toml", "bus.toml", "pyproject.toml", "README.md", "CHANGELOG.md")
 """Files that a reader writes, or that stand at the root of every package."""
 

@@ -1,0 +1,157 @@
+"""The container file, the composition and the chart, as far as they can be read without their tools (deploy/try.sh)."""
+
+import importlib.util
+import json
+import re
+import socket
+import threading
+import tomllib
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+COMPOSE = yaml.safe_load((DEPLOY / "container" / "compose.yaml").read_text())
+CHART = DEPLOY / "helm" / "zbridge"
+SCHEMA = json.loads((CHART / "values.schema.json").read_text())
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+CONTAINERFILE = (DEPLOY / "container" / "Containerfile").read_text()
+
+every_service = pytest.mark.parametrize("name", ["router", "gateways", "recorder"])
+
+
+def test_the_image_runs_as_a_user_without_a_name_of_its_own_rights_and_has_a_check() -> None:
+    last = CONTAINERFILE.rpartition("\nFROM ")[2]
+    assert "\nUSER 10001:10001\n" in last
+    assert "\nHEALTHCHECK " in last
+    assert "pip install" not in last
+
+
+def test_what_the_build_copies_passes_the_list_of_ignored_files() -> None:
+    passed = {line.removeprefix("!") for line in (ROOT / ".containerignore").read_text().split() if line[0] == "!"}
+    copied = {
+        name for line in re.findall(r"^COPY (?!--)(.+) \S+$", CONTAINERFILE, re.MULTILINE) for name in line.split()
+    }
+    assert copied == passed
+    assert all((ROOT / name).exists() for name in copied)
+
+
+SPEC = importlib.util.spec_from_file_location("healthy", DEPLOY / "container" / "healthy.py")
+assert SPEC is not None
+healthy = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(healthy)  # type: ignore[union-attr]
+
+
+def test_the_check_of_the_image_asks_gateways_with_metrics_and_names_the_silent_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Healthz) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        (tmp_path / "r1.toml").write_text(f'[metrics]\nlisten = "0.0.0.0:{server.server_port}"\n')
+        (tmp_path / "r2.toml").write_text("[robot]\nname = 'r2'\n")
+        (tmp_path / "r3.toml").write_text("[robot")
+        (tmp_path / "host.toml").write_text("")
+        assert healthy.main(tmp_path) == 0
+        (tmp_path / "r4.toml").write_text(f'[metrics]\nlisten = "127.0.0.1:{silent_port()}"\n')
+        assert healthy.main(tmp_path) == 1
+        server.shutdown()
+    assert capsys.readouterr().out.splitlines() == ["1 of 1 gateways answer", "1 of 2 gateways answer; r4 does not"]
+
+
+def silent_port() -> int:
+    """Give a port at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        return int(taken.getsockname()[1])
+
+
+class Healthz(BaseHTTPRequestHandler):
+    """Answers as a gateway does, and at no other path."""
+
+    def do_GET(self) -> None:
+        self.send_response(200 if self.path == "/healthz" else 404)
+        self.end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Write nothing."""
+
+
+def test_the_composition_has_router_gateways_and_recorder() -> None:
+    assert list(COMPOSE["services"]) == ["router", "gateways", "recorder"]
+
+
+@every_service
+def test_a_service_is_confined_and_bounded(name: str) -> None:
+    service = COMPOSE["services"][name]
+    assert (service["read_only"], service["cap_drop"], service["user"]) == (True, ["ALL"], "10001:10001")
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert {"mem_limit", "pids_limit", "stop_grace_period"} <= service.keys()
+
+
+@every_service
+def test_a_service_sees_its_own_certificates_only(name: str) -> None:
+    folder = {"gateways": "bus"}.get(name, name)
+    mounted = [volume for volume in COMPOSE["services"][name]["volumes"] if "ZBRIDGE_CONFIG" in volume]
+    assert all(volume.endswith(":ro") for volume in mounted)
+    assert {volume.split("/")[-1].removesuffix(":ro") for volume in mounted} <= {folder, "robots"}
+
+
+def test_the_chart_has_the_version_of_the_package() -> None:
+    chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
+    assert (chart["version"], chart["appVersion"]) == (VERSION, VERSION)
+    assert COMPOSE["services"]["router"]["image"].endswith(f":{VERSION}}}")
+
+
+def resolved(schema: dict[str, Any]) -> dict[str, Any]:
+    """Follow a reference to a definition."""
+    name = schema.get("$ref", "").removeprefix("#/definitions/")
+    return SCHEMA["definitions"][name] if name else schema
+
+
+def unknown(values: Any, schema: dict[str, Any], path: str = "") -> list[str]:
+    """List the keys of values that the schema does not have, and those that it has and values lack."""
+    schema = resolved(schema)
+    if "properties" not in schema or not isinstance(values, dict):
+        return []
+    known = schema["properties"]
+    more = [f"{path}.{key}" for key in values if key not in known and not schema.get("additionalProperties", True)]
+    return more + [item for key in values if key in known for item in unknown(values[key], known[key], f"{path}.{key}")]
+
+
+def absent(values: Any, schema: dict[str, Any], path: str = "") -> list[str]:
+    """List the settings of the schema that values do not show."""
+    known = resolved(schema).get("properties", {})
+    if not isinstance(values, dict) or not known:
+        return []
+    less = [f"{path}.{key}" for key in known if key not in values]
+    return less + [item for key in known if key in values for item in absent(values[key], known[key], f"{path}.{key}")]
+
+
+def test_values_show_every_setting_of_the_schema_and_no_other() -> None:
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    assert unknown(values, SCHEMA) == []
+    assert absent(values, SCHEMA) == [".global"]  # Helm's own
+
+
+def test_the_example_names_settings_that_exist() -> None:
+    values = yaml.safe_load((DEPLOY / "helm" / "example.yaml").read_text())
+    robots = values.pop("robots")
+    assert unknown(values, SCHEMA) == []
+    assert [unknown(robot, SCHEMA["definitions"]["robot"]) for robot in robots.values()] == [[]] * len(robots)
+
+
+def test_values_that_are_used_in_templates_are_declared() -> None:
+    used = {
+        tuple(path.split("."))
+        for template in CHART.glob("templates/*")
+        for path in re.findall(r"\.Values\.([\w.]+)", template.read_text())
+    }
+    values = yaml.safe_load((CHART / "values.yaml").read_text())
+    for path in used:
+        at: Any = values
+        for key in path:
+            assert key in at, ".".join(path)
+            at = at[key]

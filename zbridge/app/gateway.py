@@ -107,6 +107,7 @@ class Gateway:
         """Serve the robot whenever no other gateway does."""
         ownership = Ownership(bus, self._keys)
         try:
+            bus.gather(self._keys.key("@rpc/**"))
             while True:
                 shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
                 await ownership.take()

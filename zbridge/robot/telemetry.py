@@ -17,9 +17,10 @@ from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.protocol.plugin import Translate
-from zbridge.robot.connection import Connection, Links
+from zbridge.robot.connection import Links
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries
+from zbridge.robot.raw_frames import RawFrames
 
 log = logging.getLogger("zbridge.robot.telemetry")
 
@@ -39,6 +40,7 @@ class Telemetry:
         self._publishers = publishers
         self._pending = pending
         self._links = links
+        self._frames = RawFrames(context, links)
         self._translators: dict[type, Translate] = {}
         self._published = context.metrics.count("published")
         self._untranslatable = context.metrics.count("untranslatable")
@@ -49,11 +51,13 @@ class Telemetry:
 
     def serve(self) -> list[Handle]:
         """Publish on demand what is only published while somebody listens; read again when the bus is relieved."""
-        self._bus.on_relief(self._links.resume)
-        for connection in self._links:
-            for direction in ("in", "out"):
-                self._watch_frames(connection, direction)
-        return [self._watch_listeners(topic) for topic in self._context.robot.on_demand]
+        bus, keys = self._bus, self._context.keys
+        bus.on_relief(self._links.resume)
+        return [
+            self._frames,
+            bus.watch_listeners(keys.key("@wire/**"), self._frames.listened),
+            *(self._watch_listeners(topic) for topic in self._context.robot.on_demand),
+        ]
 
     def deliver(self, messages: list[Any]) -> None:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
@@ -93,15 +97,6 @@ class Telemetry:
     def _translator(self, kind: type) -> Translate:
         translate = self._translators[kind] = self._context.robot.translator(kind)
         return translate
-
-    def _watch_frames(self, connection: Connection, direction: str) -> None:
-        """Publish the raw frames of one direction while somebody listens."""
-
-        def listened(anybody: bool) -> None:
-            connection.watch(direction, publisher.put if anybody else None)
-
-        key = self._context.keys.key(f"@wire/{connection.name}/{direction}")
-        publisher = self._bus.frames(key, listened)
 
     def _watch_listeners(self, topic: Topic) -> Handle:
         """Tell the robot whether anybody listens to a topic."""

@@ -14,8 +14,9 @@ from typing import Any
 import zenoh
 
 from zbridge.bus.interface import Neighbour
+from zbridge.bus.zenoh.config import write_config
 from zbridge.bus.zenoh.declared import Declared, threadless
-from zbridge.bus.zenoh.session import ZenohBus, open_session, write_config
+from zbridge.bus.zenoh.session import ZenohBus, open_session
 from zbridge.metrics import Metrics
 
 LOG_LEVEL = "warn"

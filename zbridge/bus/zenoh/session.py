@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
-import re
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import zenoh
 
 from zbridge.bus.inbox import Inbox
-from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort, Tls
+from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
 from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.answers import Answers
+from zbridge.bus.zenoh.config import without_origin, zenoh_config
 from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
@@ -35,72 +35,12 @@ from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
 
-PATIENCE_US = 20_000
-"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 LEAVE_S = 0.4
 """Longest time leaving the bus takes."""
 FLUSH_S = 2.0
 """Longest time for which :meth:`ZenohBus.flush` waits."""
-OPEN_S = 1.0
-"""Longest time one attempt to open a client session takes."""
 _TIDY = 64
 """Handles that are kept before closed ones are forgotten."""
-_INGRESS = ("ingress",)
-_BOUNDED = ("put", "delete", "query")
-_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
-"""The place in Zenoh's source at the end of its error texts; cut off."""
-
-
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
-    values: dict[str, Any] = {
-        "mode": settings.effective_mode,
-        "connect/endpoints": settings.connect,
-        "scouting/multicast/enabled": settings.multicast,
-        "open/return_conditions/connect_scouted": wait_for_peers,
-        # A pool of 28 MB in every process, for payloads larger than a robot has.
-        "transport/shared_memory/enabled": False,
-        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
-    }
-    if settings.listen:
-        values["listen/endpoints"] = settings.listen
-    if bounds:
-        values["low_pass_filter"] = _size_filters(bounds)
-    if settings.effective_mode == "client":
-        values["connect/timeout_ms"] = int(OPEN_S * 1000)
-    if settings.tls is not None:
-        values |= _tls_values(settings.tls)
-    return write_config(values)
-
-
-def write_config(values: Mapping[str, Any]) -> zenoh.Config:
-    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
-    config = zenoh.Config()
-    for key, value in values.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise BusError(f"{key} = {value!r}: {_ORIGIN.sub('', str(error))}") from error
-    return config
-
-
-def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
-    """Write the filters by which Zenoh drops input that is larger than its key allows."""
-    return [
-        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
-        for number, (key_exprs, most_bytes) in enumerate(bounds)
-    ]
-
-
-def _tls_values(tls: Tls) -> dict[str, Any]:
-    values: dict[str, Any] = {"transport/link/tls/root_ca_certificate": tls.ca}
-    if tls.certificate and tls.key:
-        values["transport/link/tls/enable_mtls"] = True
-        for side in ("listen", "connect"):
-            values[f"transport/link/tls/{side}_certificate"] = tls.certificate
-            values[f"transport/link/tls/{side}_private_key"] = tls.key
-    return values
 
 
 async def open_zenoh(
@@ -116,7 +56,7 @@ async def open_session(config: zenoh.Config) -> zenoh.Session:
     try:
         return await asyncio.to_thread(zenoh.open, config)
     except zenoh.ZError as error:
-        raise BusError(_ORIGIN.sub("", str(error))) from error
+        raise BusError(without_origin(error)) from error
 
 
 class ZenohBus:
@@ -129,10 +69,18 @@ class ZenohBus:
         metrics: Metrics,
         *,
         stream: str = "drop",
+        beside: ZenohBus | None = None,
     ) -> None:
+        """Begin. beside: a bus whose session this one shares and does not end."""
         self._session = session
         self._loop = loop
+        self._stream = stream
+        self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
+        self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
+        """Of all that share the session: what is urgent to one of them is served with all."""
+        self._inboxes.append(self._inbox)
+        self._answers = Answers(session)
         self._replies_dropped = metrics.count("bus_replies_dropped")
         self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
@@ -151,6 +99,13 @@ class ZenohBus:
     def zid(self) -> str:
         """The id of the Zenoh session."""
         return str(self._session.zid())
+
+    def share(self, metrics: Metrics) -> ZenohBus:
+        """Return a bus on the same session for one robot, with queues, bounds, threads and declarations of its own.
+
+        Its ``close`` takes back what was declared on it, and leaves the session to the others.
+        """
+        return ZenohBus(self._session, self._loop, metrics, stream=self._stream, beside=self)
 
     def publisher(self, key: str, topic: Topic) -> Publisher:
         """Declare that ``key`` will be written."""
@@ -189,7 +144,11 @@ class ZenohBus:
         store = query_callback(
             rate_limited(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
         )
-        return self._keep(Declared(self._session.declare_queryable(key, store)))
+        return self._keep(self._answers.add(key, store))
+
+    def gather(self, key_expr: str) -> Handle:
+        """Declare one queryable, ``key_expr``, for all keys below it that are answered from now on."""
+        return self._answers.gather(key_expr)
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
@@ -211,7 +170,8 @@ class ZenohBus:
 
     def attend(self) -> None:
         """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
-        self._inbox.attend()
+        for inbox in self._inboxes:
+            inbox.attend()
 
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
@@ -279,6 +239,8 @@ class ZenohBus:
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
+        if self._inbox in self._inboxes:
+            self._inboxes.remove(self._inbox)
         left = threading.Event()
 
         def leave() -> None:
@@ -297,7 +259,7 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             for handle in reversed(handles):
                 handle.close()
-        if not self._session.is_closed():
+        if not (self._shares or self._session.is_closed()):
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _relieve(self) -> None:
@@ -326,7 +288,7 @@ class ZenohBus:
         try:
             await asyncio.to_thread(start, handler)
         except zenoh.ZError as error:
-            raise BusError(_ORIGIN.sub("", str(error))) from error
+            raise BusError(without_origin(error)) from error
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s + 0.5):  # wait_for of Python 3.11 may lose a cancellation
                 await done

@@ -1,0 +1,80 @@
+"""Settings of the bus as a Zenoh configuration."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import zenoh
+
+from zbridge.bus.interface import BusSettings, Tls
+from zbridge.errors import BusError
+from zbridge.fleet.topics import SizeBounds
+
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+PATIENCE_US = 20_000
+"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
+_INGRESS = ("ingress",)
+_BOUNDED = ("put", "delete", "query")
+_ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
+"""The place in Zenoh's source at the end of its error texts; cut off."""
+
+
+def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
+    values: dict[str, Any] = {
+        "mode": settings.effective_mode,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast,
+        "open/return_conditions/connect_scouted": wait_for_peers,
+        # A pool of 28 MB in every process, for payloads larger than a robot has.
+        "transport/shared_memory/enabled": False,
+        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
+    }
+    if settings.listen:
+        values["listen/endpoints"] = settings.listen
+    if bounds:
+        values["low_pass_filter"] = _size_filters(bounds)
+    if settings.effective_mode == "client":
+        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+    if settings.tls is not None:
+        values |= _tls_values(settings.tls)
+    return write_config(values)
+
+
+def write_config(values: Mapping[str, Any]) -> zenoh.Config:
+    """Write values as a Zenoh configuration; raise BusError naming the one that Zenoh refuses."""
+    config = zenoh.Config()
+    for key, value in values.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusError(f"{key} = {value!r}: {without_origin(error)}") from error
+    return config
+
+
+def _size_filters(bounds: SizeBounds) -> list[dict[str, Any]]:
+    """Write the filters by which Zenoh drops input that is larger than its key allows."""
+    return [
+        {"id": str(number), "flows": _INGRESS, "messages": _BOUNDED, "key_exprs": key_exprs, "size_limit": most_bytes}
+        for number, (key_exprs, most_bytes) in enumerate(bounds)
+    ]
+
+
+def _tls_values(tls: Tls) -> dict[str, Any]:
+    values: dict[str, Any] = {"transport/link/tls/root_ca_certificate": tls.ca}
+    if tls.certificate and tls.key:
+        values["transport/link/tls/enable_mtls"] = True
+        for side in ("listen", "connect"):
+            values[f"transport/link/tls/{side}_certificate"] = tls.certificate
+            values[f"transport/link/tls/{side}_private_key"] = tls.key
+    return values
+
+
+def without_origin(error: Exception) -> str:
+    """Return the text of an error of Zenoh's without the place in Zenoh's source."""
+    return _ORIGIN.sub("", str(error))

@@ -11,16 +11,20 @@ import asyncio
 import contextlib
 import logging
 import math
+import random
 import secrets
 import signal
 import time
 from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from zbridge.app.config import Plan
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
+from zbridge.bus import Bus, BusSettings, Handle, IncomingQuery, open_bus
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
@@ -36,6 +40,8 @@ from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
+from zbridge.transport import connect
+from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -50,18 +56,28 @@ _NAMED = 3
 _RIVALS = "rivals"
 
 
+class Neighbourhood(msgspec.Struct, frozen=True):
+    """What a gateway shares with others of its process.
+
+    part: of the processor, that its robot may use for long. buffer: where all links of the loop read.
+    """
+
+    part: float
+    buffer: bytearray
+
+
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this process, shared by all parts.
+    metrics, sessions, conditions: of this gateway, shared by all parts.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, metrics: Metrics | None = None) -> None:
         self._plan = plan
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
-        self.metrics = Metrics()
+        self.metrics = metrics or Metrics()
         self.sessions = SessionTable()
         self.conditions = Conditions()
 
@@ -71,16 +87,25 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
         with self._audit() as audit:
-            bus = await self._open_bus()
+            bus = await open_bus_again_and_again(self._plan.config.bus, self.metrics)
             try:
-                await self._run(bus, audit)
+                async with contextlib.AsyncExitStack() as stack:
+                    if self._plan.metrics is not None:
+                        await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+                    await self._run(bus, audit, None)
             finally:
                 self.left = await bus.close()
 
-    async def _run(self, bus: Bus, audit: Audit) -> None:
+    async def run_on(self, bus: Bus, neighbourhood: Neighbourhood | None = None) -> None:
+        """Do the same on a bus, and beside metrics, that somebody else opens and closes.
+
+        neighbourhood: None where the process serves this robot only.
+        """
+        with self._audit() as audit:
+            await self._run(bus, audit, neighbourhood)
+
+    async def _run(self, bus: Bus, audit: Audit, neighbourhood: Neighbourhood | None) -> None:
         async with contextlib.AsyncExitStack() as stack:
-            if self._plan.metrics is not None:
-                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
             robot = RobotSubscription(bus, self._keys, self.metrics)
             work: list[Coroutine[Any, Any, None]] = [
                 Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
@@ -90,7 +115,7 @@ class Gateway:
                 robot.open()
                 stack.callback(robot.close)
             if self._plan.device is not None:
-                work.append(self._robot(bus, audit, self._plan.device))
+                work.append(self._robot(bus, audit, self._plan.device, neighbourhood))
             else:
                 stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
             await together(*work)
@@ -103,7 +128,7 @@ class Gateway:
             names.append(listener.settings.name or (f"{own}-{number}" if own in names else own))
         return names
 
-    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
+    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> None:
         """Serve the robot whenever no other gateway does."""
         ownership = Ownership(bus, self._keys)
         try:
@@ -115,7 +140,7 @@ class Gateway:
                     shown.close()
                 shown = self._show_sessions(bus, "gateway")
                 try:
-                    await self._serve(ownership, self._device(bus, audit, plan))
+                    await self._serve(ownership, self._device(bus, audit, plan, neighbourhood))
                 finally:
                     shown.close()
         finally:
@@ -161,7 +186,7 @@ class Gateway:
 
         return tell
 
-    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> Device:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -177,6 +202,8 @@ class Gateway:
             audit=audit,
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
+            share=FairShare(neighbourhood.part) if neighbourhood is not None else None,
+            connect=partial(connect, buffer=neighbourhood.buffer) if neighbourhood is not None else connect,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 
@@ -208,13 +235,16 @@ class Gateway:
             audit.close()
             file.close()
 
-    async def _open_bus(self) -> Bus:
-        while True:
-            try:
-                return await open_bus(self._plan.config.bus, self.metrics, bounds=topics.size_bounds())
-            except BusError as error:
-                log.warning("no bus: %s; next attempt in %g s", error, RETRY_S)
-                await asyncio.sleep(RETRY_S)
+
+async def open_bus_again_and_again(settings: BusSettings, metrics: Metrics) -> Bus:
+    """Open the bus for gateways; try again, with jitter, until that succeeds."""
+    while True:
+        try:
+            return await open_bus(settings, metrics, bounds=topics.size_bounds())
+        except BusError as error:
+            retry_s = RETRY_S * random.uniform(0.5, 1.5)  # a thousand others may wait for the same router
+            log.warning("no bus: %s; next attempt in %.1f s", error, retry_s)
+            await asyncio.sleep(retry_s)
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:

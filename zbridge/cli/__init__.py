@@ -13,11 +13,13 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
+from zbridge.app.together import Together
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
@@ -26,7 +28,7 @@ def main() -> None:
     """Run the command line; print a ZbridgeError as one line on stderr."""
     try:
         match sys.argv[1:]:
-            case ["run", file] if not file.startswith("-"):
+            case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
                 run_gateway(Path(file))
             case _:
                 from zbridge.cli.app import app
@@ -63,6 +65,20 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
+        logging.shutdown()
+        os._exit(0)
+
+
+def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = False) -> None:
+    """Run the gateways of several configurations in this process until SIGTERM or SIGINT."""
+    set_up_log(verbose=verbose)
+    plans = [(file, load(file)) for file in files]
+    require_different_robots(plans)
+    require_one_bus(plans)
+    gc.freeze()
+    together = Together({plan.config.robot.name: plan for _, plan in plans}, host)
+    run_loop(until_signal(together.run()))
+    if not together.left:
         logging.shutdown()
         os._exit(0)
 

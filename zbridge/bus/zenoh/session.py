@@ -220,8 +220,8 @@ class ZenohBus:
         def changed(status: zenoh.MatchingStatus) -> None:
             loop.call_soon_threadsafe(listened, status.matching)
 
-        self._keep(Declared(plain.declare_matching_listener(threadless(changed))))
-        return self._keep(PlainPublisher(key, plain, None))
+        watch = plain.declare_matching_listener(threadless(changed))
+        return self._keep(PlainPublisher(key, plain, None, watch))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""

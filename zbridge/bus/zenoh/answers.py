@@ -16,7 +16,7 @@ from typing import Any
 import zenoh
 
 from zbridge.bus.interface import Handle
-from zbridge.bus.zenoh.declared import Declared
+from zbridge.bus.zenoh.declared import Declared, Undo
 from zbridge.fleet.topics import is_concrete
 
 Take = Callable[[Any], None]
@@ -39,7 +39,7 @@ class Answers:
         """Answer for all keys below ``key_expr``, which ends with ``/**``, by one queryable from now on."""
         gathered = _Gathered(self._session, key_expr)
         self._gathered.append(gathered)
-        return _Undo(lambda: self._gathered.remove(gathered))
+        return Undo(lambda: self._gathered.remove(gathered))
 
     def add(self, key: str, take: Take) -> Handle:
         """Give the queries for ``key``, whose last chunk may be ``*``, to ``take``."""
@@ -68,7 +68,7 @@ class _Gathered:
         self._takes = {**self._takes, key: take}  # replaced as a whole: Zenoh's thread reads it meanwhile
         if self._queryable is None:
             self._queryable = Declared(self._session.declare_queryable(self._key_expr, self._take))
-        return _Undo(partial(self._remove, key))
+        return Undo(partial(self._remove, key))
 
     def _remove(self, key: str) -> None:
         self._takes = {other: take for other, take in self._takes.items() if other != key}
@@ -113,21 +113,3 @@ class _Parts:
             last = not self._parts
         if last:
             self._query.drop()  # type: ignore[no-untyped-call]
-
-
-class _Undo:
-    """A handle that undoes something once."""
-
-    def __init__(self, undo: Callable[[], object]) -> None:
-        self._undo: Callable[[], object] | None = undo
-
-    @property
-    def closed(self) -> bool:
-        """Whether it was undone."""
-        return self._undo is None
-
-    def close(self) -> None:
-        """Undo it; idempotent."""
-        undo, self._undo = self._undo, None
-        if undo is not None:
-            undo()

@@ -14,6 +14,7 @@ from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, BusSettings, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.bus.late_join import LateJoin
 from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
 from zbridge.bus.zenoh.config import without_origin, zenoh_config
 from zbridge.bus.zenoh.declared import Declared, threadless
@@ -81,6 +82,7 @@ class ZenohBus:
         """Of all that share the session: what is urgent to one of them is served with all."""
         self._inboxes.append(self._inbox)
         self._answers = Answers(session)
+        self._alive = AliveWatches(loop, self._declare_alive)
         self._replies_dropped = metrics.count("bus_replies_dropped")
         self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
@@ -186,9 +188,12 @@ class ZenohBus:
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
+        return self._keep(self._alive.add(key_expr, handler))
+
+    def _declare_alive(self, key_expr: str, handler: Changed) -> Handle:
         store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
         watch = self._session.liveliness().declare_subscriber(key_expr, threadless(store), history=True)
-        return self._keep(Declared(watch))
+        return Declared(watch)
 
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded).

@@ -27,6 +27,7 @@ from tests.benchmarks.harness import Process, process
 from tests.benchmarks.peer import open_session
 
 PACE_HZ = 20.0
+SETTLE_S = 3.0
 BAD = "r000"
 MODES = ("pace 20", "flood", "pace 20", "hang", "pace 20", "die", "pace 20")
 """What one robot does while the others send at their pace."""
@@ -81,7 +82,7 @@ def costs(count: int, *, together: bool, idle_s: float) -> None:
     """Print what the gateways of a host cost."""
     with host(1, together=together) as (_, _, endpoint, gateways, begun):
         when_established(endpoint, 1, begun)
-        time.sleep(2.0)
+        time.sleep(3.0)
         one = Cost.of([each.pid for each in gateways])
     with host(count, together=together) as (_, _, endpoint, gateways, begun):
         established_s = when_established(endpoint, count, begun)
@@ -92,11 +93,9 @@ def costs(count: int, *, together: bool, idle_s: float) -> None:
     more_mb = (cost.private_mb - one.private_mb) / (count - 1)
     print(f"{count} robots {'together' if together else 'apart'}")
     print(f"  all established after          {established_s:.1f} s")
-    print(
-        f"  private memory                 {cost.private_mb:.1f} MB: {one.private_mb:.1f} the first, {more_mb:.2f} each further"
-    )
+    print(f"  private memory                 {one.private_mb:.1f} MB the first, {more_mb:.2f} MB each further")
     print(f"  threads                        {cost.threads}: {cost.threads / count:.1f} a robot")
-    print(f"  idle                           {idle:.2f} % of a core a robot")
+    print(f"  idle                           {idle:.2f} % of a core a robot", flush=True)
 
 
 def neighbours(count: int, *, together: bool, seconds: float) -> None:
@@ -108,19 +107,16 @@ def neighbours(count: int, *, together: bool, seconds: float) -> None:
             robots.say(f"pace {PACE_HZ:g}")
             robots.hear()
         time.sleep(3.0)
-        print(
-            f"{count} robots {'together' if together else 'apart'}, a reading each {1000 / PACE_HZ:g} ms; gaps of the others, ms"
-        )
+        where, pids = "together" if together else "apart", [each.pid for each in gateways]
+        print(f"{count} robots {where}, a reading each {1000 / PACE_HZ:g} ms; gaps of the others, ms")
         print(f"  {'the one':<12}{'p50':>8}{'p99':>8}{'p99.9':>8}{'most':>8}{'CPU %':>8}{'its readings/s':>16}")
         for mode in MODES:
             bad.say(mode)
             bad.hear()
-            time.sleep(1.0)
-            before, at = Cost.of([each.pid for each in gateways]).cpu_s, time.monotonic()
+            time.sleep(SETTLE_S)
+            before, at = Cost.of(pids).cpu_s, time.monotonic()
             measured, of_the_bad = gaps.measured(seconds)
-            cpu = 100 * (Cost.of([each.pid for each in gateways]).cpu_s - before) / (time.monotonic() - at)
-            p50, p99, p999, most = (*np.percentile(measured, (50, 99, 99.9)), measured.max())
-            print(
-                f"  {mode:<12}{p50:>8.1f}{p99:>8.1f}{p999:>8.1f}{most:>8.1f}{cpu:>8.1f}{of_the_bad / seconds:>16,.0f}"
-            )
+            cpu = 100 * (Cost.of(pids).cpu_s - before) / (time.monotonic() - at)
+            spread = "".join(f"{gap:>8.1f}" for gap in (*np.percentile(measured, (50, 99, 99.9)), measured.max()))
+            print(f"  {mode:<12}{spread}{cpu:>8.1f}{of_the_bad / seconds:>16,.0f}", flush=True)
         gaps.close()

@@ -44,7 +44,7 @@ def fleet(count: int, *, routers: int, processes: int) -> None:
             for first in range(processes, count, GROUP)
         ]
         print(
-            f"{count} gateways ({processes} processes of their own, {len(groups)} processes for the rest), {routers} routers"
+            f"{count} gateways ({processes} in processes of their own, {len(groups)} for the rest), {routers} routers"
         )
         print(f"  all established after          {when_established(at[0], count, begun):.1f} s", flush=True)
         time.sleep(SETTLE_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -15,6 +16,8 @@ from zbridge.fleet.topics import SizeBounds
 
 OPEN_S = 1.0
 """Longest time one attempt to open a client session takes."""
+RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
+"""Milliseconds between attempts to connect to a router that was lost: first, at most, and by what they grow."""
 PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 _INGRESS = ("ingress",)
@@ -39,11 +42,19 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
         values["listen/endpoints"] = settings.listen
     if bounds:
         values["low_pass_filter"] = _size_filters(bounds)
+    if settings.connect:
+        values["connect/retry"] = _retry()
     if settings.effective_mode == "client":
         values["connect/timeout_ms"] = int(OPEN_S * 1000)
     if settings.tls is not None:
         values |= _tls_values(settings.tls)
     return write_config(values)
+
+
+def _retry() -> dict[str, float]:
+    """Choose the times between attempts to connect, another for each session: a thousand may have lost one router."""
+    first_ms, most_ms = random.randint(*RETRY_FIRST_MS), random.randint(*RETRY_MOST_MS)
+    return {"period_init_ms": first_ms, "period_max_ms": most_ms, "period_increase_factor": RETRY_FACTOR}
 
 
 def write_config(values: Mapping[str, Any]) -> zenoh.Config:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.bus import SOON_S
+from tests.simulated import simulated
 from zbridge.app import Gateway, plan
 from zbridge.bus import BusSettings
 from zbridge.bus.zenoh import ZenohBus
@@ -19,8 +20,7 @@ from zbridge.bus.zenoh.session import open_session
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery
 from zbridge.metrics import Metrics
-from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import Simulation, find_protocol
+from zbridge.protocol.plugin import find_protocol
 
 MOST = 12
 ALONE = BusSettings(multicast=False, listen=("tcp/127.0.0.1:0",))
@@ -51,16 +51,6 @@ class Counted:
             return declare(key_expr, *args, **options)
 
         return noted
-
-
-async def simulated(protocol: str, stack: contextlib.AsyncExitStack) -> list[str]:
-    """Start a simulated robot; return where it listens."""
-    found = find_protocol(protocol)
-    listens: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
-    at = found.links * (Address("127.0.0.1", 0),)
-    robot = asyncio.create_task(found.simulate(Simulation(at, 1, None, None, False, False, listens.set_result)))
-    stack.callback(robot.cancel)
-    return [str(address) for address in await listens]
 
 
 @pytest.mark.parametrize("protocol", ["alf", "tcpudp", "wc2ec"])

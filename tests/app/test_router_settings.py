@@ -86,7 +86,9 @@ def test_without_listen_there_is_a_default(folder: Path) -> None:
 
 
 def test_with_tls_members_show_certificates_and_rules_hold(folder: Path) -> None:
-    plan = plan_router(load_router(written(folder, WITH_TLS + "roles = 'roles.toml'\n[limits]\nsessions = 7\npending = 3")))
+    plan = plan_router(
+        load_router(written(folder, WITH_TLS + "roles = 'roles.toml'\n[limits]\nsessions = 7\npending = 3"))
+    )
     values = zenoh_values(plan)
     assert plan.roles == LAB
     for key in ("enable_mtls", "verify_name_on_connect", "close_link_on_expiration"):

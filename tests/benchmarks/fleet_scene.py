@@ -19,7 +19,7 @@ from tests.benchmarks.harness import ROOT, BenchmarkError, Process, cpu_s, free_
 from zbridge.client import Fleet, connect
 from zbridge.errors import BusError
 
-SOON_S = 120.0
+SOON_S = 150.0
 """Longest wait for a fleet."""
 _ZBRIDGE = (sys.executable, "-m", "zbridge")
 
@@ -64,7 +64,7 @@ def command(*arguments: object) -> Iterator[Command]:
 
 
 class Routers:
-    """Linked routers on loopback. Each connects to all before it."""
+    """Linked routers on loopback: each connects to all before it."""
 
     def __init__(self, count: int) -> None:
         self.endpoints = [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
@@ -80,8 +80,7 @@ class Routers:
             router.end()
 
     def _start(self, number: int) -> Command:
-        others = [endpoint for other, endpoint in enumerate(self.endpoints) if other != number]
-        links = [word for endpoint in others for word in ("--connect", endpoint)]
+        links = [word for endpoint in self.endpoints[:number] for word in ("--connect", endpoint)]
         router = Command("router", "--listen", self.endpoints[number], *links)
         wait_until(lambda: "router at" in router.log() or not router.alive(), 20.0, "a router")
         return router
@@ -144,7 +143,12 @@ def when_established(endpoint: str, count: int, begun_s: float, timeout_s: float
                 if there >= count:
                     return time.monotonic() - begun_s
                 if time.monotonic() - begun_s > timeout_s:
-                    raise BenchmarkError(f"{there} of {count} robots after {timeout_s:g} s")
+                    missing = [
+                        name for name, status in robots.items() if status is None or status.state != "established"
+                    ]
+                    raise BenchmarkError(
+                        f"{there} of {count} robots after {timeout_s:g} s; not: {missing[:5]}, {len(robots)} tokens"
+                    )
                 await asyncio.sleep(0.05)
 
     return asyncio.run(ask())

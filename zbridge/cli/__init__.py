@@ -70,9 +70,20 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
 
 
 def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = False) -> None:
-    """Run the gateways of several configurations in this process until SIGTERM or SIGINT."""
+    """Run the gateways of several configurations in this process until SIGTERM or SIGINT.
+
+    A faulty file is reported, and the others run.
+    """
     set_up_log(verbose=verbose)
-    plans = [(file, load(file)) for file in files]
+    plans, faults = [], []
+    for file in files:
+        try:
+            plans.append((file, load(file)))
+        except ConfigError as error:
+            faults.append(error)
+            logging.getLogger("zbridge.cli").error("%s", error)
+    if not plans:
+        raise faults[0]
     require_different_robots(plans)
     require_one_bus(plans)
     gc.freeze()

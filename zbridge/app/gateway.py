@@ -24,7 +24,7 @@ import msgspec
 
 from zbridge.app.config import Plan
 from zbridge.app.prometheus import serve_metrics
-from zbridge.bus import Bus, BusSettings, Handle, IncomingQuery, open_bus
+from zbridge.bus import OPEN_S, Bus, BusSettings, Handle, IncomingQuery, open_bus
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
@@ -49,6 +49,8 @@ _ZID = 6
 """Characters of the bus session's id in a listener's name: they differ between processes."""
 RETRY_S = 1.0
 """Seconds between attempts to open the bus."""
+OPEN_MOST_S = 4.0
+"""Longest time that an attempt is given; a process that ends waits for the attempt."""
 TELL_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
@@ -237,14 +239,19 @@ class Gateway:
 
 
 async def open_bus_again_and_again(settings: BusSettings, metrics: Metrics) -> Bus:
-    """Open the bus for gateways; try again, with jitter, until that succeeds."""
+    """Open the bus for gateways; try again until that succeeds.
+
+    A thousand others may wait for the same router: attempts are given more time, and come at other times than theirs.
+    """
+    within_s = OPEN_S
     while True:
         try:
-            return await open_bus(settings, metrics, bounds=topics.size_bounds())
+            return await open_bus(settings, metrics, bounds=topics.size_bounds(), within_s=within_s)
         except BusError as error:
-            retry_s = RETRY_S * random.uniform(0.5, 1.5)  # a thousand others may wait for the same router
+            retry_s = RETRY_S * random.uniform(0.5, 1.5)
             log.warning("no bus: %s; next attempt in %.1f s", error, retry_s)
             await asyncio.sleep(retry_s)
+            within_s = min(2 * within_s, OPEN_MOST_S)
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:

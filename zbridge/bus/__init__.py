@@ -28,7 +28,11 @@ from zbridge.bus.interface import (
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+
 __all__ = [
+    "OPEN_S",
     "Answer",
     "Batch",
     "Bus",
@@ -49,16 +53,21 @@ __all__ = [
 
 
 async def open_bus(
-    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+    settings: BusSettings,
+    metrics: Metrics,
+    *,
+    wait_for_peers: bool = False,
+    bounds: SizeBounds = (),
+    within_s: float = OPEN_S,
 ) -> Bus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
 
     wait_for_peers: return only when the peers that scouting finds at once are connected. bounds: Zenoh drops what comes
     in on these keys and is larger; nobody can count it.
     """
     from zbridge.bus.zenoh import open_zenoh
 
-    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds)
+    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s)
 
 
 async def open_router(

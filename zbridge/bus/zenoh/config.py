@@ -14,8 +14,6 @@ from zbridge.bus.interface import BusSettings, Tls
 from zbridge.errors import BusError
 from zbridge.fleet.topics import SizeBounds
 
-OPEN_S = 1.0
-"""Longest time one attempt to open a client session takes."""
 RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
 """Milliseconds between attempts to connect to a router that was lost: first, at most, and by what they grow."""
 PATIENCE_US = 20_000
@@ -26,8 +24,13 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 """The place in Zenoh's source at the end of its error texts; cut off."""
 
 
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
+def zenoh_config(
+    settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = (), within_s: float = 1.0
+) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses.
+
+    within_s: longest time an attempt to open a client session takes.
+    """
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
         "connect/endpoints": settings.connect,
@@ -45,7 +48,7 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
     if settings.connect:
         values["connect/retry"] = _retry()
     if settings.effective_mode == "client":
-        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+        values["connect/timeout_ms"] = int(within_s * 1000)
     if settings.tls is not None:
         values |= _tls_values(settings.tls)
     return write_config(values)

@@ -45,10 +45,16 @@ _TIDY = 64
 
 
 async def open_zenoh(
-    settings: BusSettings, metrics: Metrics, *, wait_for_peers: bool = False, bounds: SizeBounds = ()
+    settings: BusSettings,
+    metrics: Metrics,
+    *,
+    wait_for_peers: bool = False,
+    bounds: SizeBounds = (),
+    within_s: float = 1.0,
 ) -> ZenohBus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
-    session = await open_session(zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds))
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s)
+    session = await open_session(config)
     return ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
 
 

@@ -66,3 +66,11 @@ def test_robots_that_share_a_session_have_one_bus() -> None:
     require_one_bus([robot("r1", bus=router), robot("r2", bus=router)])
     with pytest.raises(ConfigError, match=r"r2-0\.toml: bus: expected the same as in r1-0\.toml"):
         require_one_bus([robot("r1", bus=router), robot("r2")])
+
+
+def test_the_documented_file_has_the_defaults(tmp_path: Path) -> None:
+    documented = Path(__file__).parents[2] / "deploy" / "config" / "host.toml"
+    (tmp_path / "host.toml").write_text(documented.read_text())
+    assert load_host(tmp_path) == HostSettings()
+    for field in HostSettings.__struct_fields__:
+        assert f"\n{field} = " in documented.read_text()

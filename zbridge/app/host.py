@@ -28,7 +28,7 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     together: bool = False
     stagger_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 0.02
-    share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.25
+    share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.1
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-BURST_S = 0.05
+BURST_S = 0.02
 """Seconds of work that may be done at once after a quiet time."""
 
 

@@ -27,7 +27,7 @@ log = logging.getLogger("zbridge.link")
 
 READ_BYTES = 64 * 1024
 """Most bytes taken from a robot's socket before the loop serves others."""
-SHARED_READ_BYTES = 8 * 1024
+SHARED_READ_BYTES = 4 * 1024
 """The same where the loop serves other robots too."""
 CLIENT_READ_BYTES = 4096
 """The same for an accepted peer: there may be hundreds."""

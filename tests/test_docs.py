@@ -34,7 +34,10 @@ BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 GROUPS = ("zbridge.protocols", "zbridge.service")
 """Dotted names that are no modules: the entry-point group, the unit of systemd."""
-THEIRS = ("hq.toml", "r1.toml", "e1.toml", "roles.toml", "bus.toml", "pyproject.toml", "README.md", "CHANGELOG.md")
+THEIRS = (
+    *("hq.toml", "r1.toml", "r2.toml", "e1.toml", "host.toml", "router.toml", "roles.toml", "bus.toml"),
+    *("pyproject.toml", "README.md", "CHANGELOG.md"),
+)
 """Files that a reader writes, or that stand at the root of every package."""
 
 

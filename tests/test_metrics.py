@@ -29,3 +29,14 @@ def test_the_exposition_names_each_type_once_and_quotes_labels() -> None:
         "# TYPE zbridge_published_total counter",
         "zbridge_published_total 7",
     ]
+
+
+def test_a_labelled_part_counts_into_the_whole_and_shows_its_own_only() -> None:
+    whole = Metrics()
+    parts = [whole.labelled(robot=name) for name in ("r1", "r2")]
+    parts[0].count("received").value += 2
+    parts[1].count("received", link="laser").value += 3
+    whole.count("received").value += 5
+    assert [each.total("received") for each in (whole, *parts)] == [10, 2, 3]
+    assert parts[0].count("received") is whole.count("received", robot="r1")
+    assert list(parts[1]) == [("received", (("link", "laser"), ("robot", "r2")), 3)]

@@ -28,18 +28,27 @@ class Metrics:
 
     def __init__(self) -> None:
         self._counts: dict[tuple[str, Labels], Count] = {}
+        self._own: dict[str, str] = {}
+
+    def labelled(self, **labels: str) -> Metrics:
+        """Return a part of this registry: all its counters have these labels too."""
+        part = Metrics()
+        part._counts, part._own = self._counts, {**self._own, **labels}
+        return part
 
     def count(self, name: str, **labels: str) -> Count:
         """Return the counter of this name and these labels; make it on first use."""
-        return self._counts.setdefault((name, tuple(sorted(labels.items()))), Count())
+        return self._counts.setdefault((name, tuple(sorted({**self._own, **labels}.items()))), Count())
 
     def total(self, name: str) -> int:
         """Sum a counter over all its labels."""
-        return sum(count.value for (own, _), count in self._counts.items() if own == name)
+        return sum(value for own, _, value in self if own == name)
 
     def __iter__(self) -> Iterator[tuple[str, Labels, int]]:
+        own = set(self._own.items())
         for (name, labels), count in sorted(self._counts.items(), key=lambda item: item[0]):
-            yield name, labels, count.value
+            if own.issubset(labels):
+                yield name, labels, count.value
 
     def exposition(self) -> str:
         """Write all counters in the Prometheus text format, version 0.0.4."""

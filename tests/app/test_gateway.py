@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -17,9 +18,11 @@ from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway, until_signal
+from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.bus import Bus, Handle
 from zbridge.bus.fake import FakeBus
-from zbridge.errors import ConfigError
+from zbridge.errors import BusError, ConfigError
+from zbridge.metrics import Metrics
 
 SOON_S = 5.0
 NOWHERE = {"protocol": "tcpudp", "connect": ["tcp://127.0.0.1:1"]}
@@ -204,3 +207,22 @@ async def test_work_that_ends_by_itself_is_not_waited_for_any_longer_and_work_th
         await until_signal(work())
     with pytest.raises(OSError, match="no bus"):
         await until_signal(work(OSError("no bus")))
+
+
+@jumping
+async def test_a_bus_that_does_not_open_is_tried_again_at_other_times_and_with_more_time(monkeypatch) -> None:
+    tried: list[tuple[float, float]] = []
+    loop, bus = asyncio.get_running_loop(), FakeBus("1")
+
+    async def open_bus(*_: object, within_s: float, **__: object) -> Bus:
+        tried.append((loop.time(), within_s))
+        if len(tried) < 30:
+            raise BusError("Timeout!")
+        return bus
+
+    monkeypatch.setattr("zbridge.app.joining.open_bus", open_bus)
+    assert await join_bus(plan({"robot": {"name": "r1"}, "device": NOWHERE}), Metrics()) is bus
+    assert [within_s for _, within_s in tried[:4]] == [1.0, 2.0, 4.0, 4.0]
+    pauses = [after - before for (before, _), (after, _) in itertools.pairwise(tried)]
+    assert 0.5 * RETRY_S <= min(pauses) < 0.9 * RETRY_S
+    assert 1.1 * RETRY_S < max(pauses) <= 1.5 * RETRY_S

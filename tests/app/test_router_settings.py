@@ -86,7 +86,9 @@ def test_without_listen_there_is_a_default(folder: Path) -> None:
 
 
 def test_with_tls_members_show_certificates_and_rules_hold(folder: Path) -> None:
-    plan = plan_router(load_router(written(folder, WITH_TLS + "roles = 'roles.toml'\n[limits]\nsessions = 7")))
+    plan = plan_router(
+        load_router(written(folder, WITH_TLS + "roles = 'roles.toml'\n[limits]\nsessions = 7\npending = 3"))
+    )
     values = zenoh_values(plan)
     assert plan.roles == LAB
     for key in ("enable_mtls", "verify_name_on_connect", "close_link_on_expiration"):
@@ -96,7 +98,7 @@ def test_with_tls_members_show_certificates_and_rules_hold(folder: Path) -> None
     assert values["scouting/gossip/enabled"] is values["scouting/multicast/enabled"] is False
     assert values["adminspace"]["permissions"] == {"read": True, "write": False}
     assert values["access_control"]["default_permission"] == "deny"
-    assert values["transport/unicast/max_sessions"] == 7
+    assert (values["transport/unicast/max_sessions"], values["transport/unicast/accept_pending"]) == (7, 3)
 
 
 def test_zenoh_takes_the_configuration_by_paths_and_as_a_file(folder: Path) -> None:

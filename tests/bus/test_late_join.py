@@ -8,7 +8,7 @@ import pytest
 
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Answer
-from zbridge.bus.late_join import ASK_AFTER_S, LateJoin
+from zbridge.bus.late_join import ASK_AFTER_S, ASKED_AT_ONCE, LateJoin
 from zbridge.errors import BusError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import gateways_of, of_robot
@@ -139,3 +139,27 @@ async def test_a_closed_joiner_is_told_nothing_more(monkeypatch) -> None:
 def test_whose_gateway_and_which_keys_an_expression_means(key_expr: str, gateways: str, one_robots: str) -> None:
     assert gateways_of(key_expr) == gateways
     assert of_robot(key_expr, "fleet", "r7") == one_robots
+
+
+async def test_many_robots_that_come_back_at_once_are_asked_a_few_at_a_time_and_all(monkeypatch) -> None:
+    scene = Scene(monkeypatch, "fleet/*/status")
+    asking, most, count = 0, 0, 10 * ASKED_AT_ONCE
+    ask = scene.bus.ask
+
+    async def counted(key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
+        nonlocal asking, most
+        asking += 1
+        most = max(most, asking)
+        try:
+            return await ask(key_expr)
+        finally:
+            asking -= 1
+
+    monkeypatch.setattr(scene.bus, "ask", counted)
+    for number in range(count):
+        scene.gateway.publisher(f"fleet/r{number}/status", topics.STATUS).put(b"%d" % number)
+        scene.gateway.announce(f"fleet/r{number}/@alive/gateway")
+    scene.join()
+    await asyncio.sleep(LONG_S)
+    assert sorted(map(int, scene.seen)) == list(range(count))
+    assert most == ASKED_AT_ONCE

@@ -276,3 +276,55 @@ async def test_what_is_too_large_for_its_key_is_dropped_before_anybody_is_called
     finally:
         await asyncio.to_thread(sender.close)
         await gateway.close()
+
+
+async def test_keys_that_are_gathered_share_a_queryable_and_are_answered_each_by_its_own(bus: ZenohBus) -> None:
+    gathered = bus.gather("fleet/r1/@rpc/**")
+    for name in ("map", "control/acquire/*", "control/renew"):
+        bus.answer(f"fleet/r1/@rpc/{name}", lambda question, name=name: question.answer(name.encode()))  # type: ignore[misc]
+    other = bus.answer("fleet/r2/@rpc/map", lambda question: question.answer(b"of r2"))
+    for asked, answers in {
+        "map": {"map": b"map"},
+        "control/acquire/ann": {"control/acquire/ann": b"control/acquire/*"},
+        "control/acquire/a/b": {},
+        "control/acquire/*": {"control/acquire/*": b"control/acquire/*"},
+        "control/*": {"control/renew": b"control/renew"},
+        "pose": {},
+        "**": {name: name.encode() for name in ("map", "control/renew")} | {"**": b"control/acquire/*"},
+    }.items():
+        replies = await bus.ask(f"fleet/r1/@rpc/{asked}", timeout_s=SOON_S)  # returns with the last reply
+        assert {reply.key.removeprefix("fleet/r1/@rpc/"): reply.payload for reply in replies} == answers, asked
+    assert {reply.payload for reply in await bus.ask("fleet/*/@rpc/map")} == {b"map", b"of r2"}
+    other.close()
+    gathered.close()
+
+
+async def test_a_gathered_key_that_is_closed_is_answered_no_more_and_the_last_takes_the_queryable_back(bus) -> None:
+    bus.gather("fleet/r1/@rpc/**")
+    handles = [bus.answer(f"fleet/r1/@rpc/{name}", lambda question: question.answer(b"")) for name in ("map", "pose")]
+    handles[0].close()
+    assert await bus.ask("fleet/r1/@rpc/map") == []
+    assert len(await bus.ask("fleet/r1/@rpc/pose")) == 1
+    (gathered,) = bus._answers._gathered
+    assert gathered._queryable is not None
+    handles[1].close()
+    assert gathered._queryable is None
+
+
+async def test_buses_that_share_a_session_close_alone_and_serve_each_others_commands(bus: ZenohBus) -> None:
+    seen, metrics = Seen(), Metrics()
+    shares = [bus.share(metrics.labelled(robot=name)) for name in ("r1", "r2")]
+    for name, share in zip(("r1", "r2"), shares, strict=True):
+        share.subscribe(f"fleet/{name}/@cmd/**", lambda sample: seen.take(sample.key), lane=lambda *_: Lane.COMMAND)
+    assert {share.zid for share in shares} == {bus.zid}
+    bus.publisher("fleet/r2/@cmd/drive", topics.CMD_DRIVE).put(b"1")
+    await seen.until(lambda: len(seen) == 1)
+    waiting = shares[1]._inbox.source(lambda item: seen.take(item))
+    waiting.put("urgent", Lane.COMMAND)
+    shares[0].attend()  # in the middle of long work for r1
+    assert seen[-1] == "urgent"
+    assert await shares[0].close()
+    shares[0].attend()
+    bus.publisher("fleet/r2/@cmd/stop", topics.CMD_STOP).put(b"2")
+    await seen.until(lambda: len(seen) == 3)
+    assert len(bus._inboxes) == 2

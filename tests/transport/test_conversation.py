@@ -12,6 +12,7 @@ from zbridge.errors import NotReady
 from zbridge.metrics import Count
 from zbridge.protocol.session import LINGER_S, State
 from zbridge.transport.conversation import Conversation
+from zbridge.transport.fair_share import BURST_S, FairShare
 from zbridge.transport.fake import FakeLink
 
 pytestmark = pytest.mark.jumping
@@ -250,3 +251,54 @@ async def test_a_fault_of_the_protocol_ends_the_session_and_its_link_with_the_pl
     (record,) = caplog.records
     assert record.exc_info is not None
     assert re.search(FAULT, record.getMessage())
+
+
+class Slow(Rig):
+    """A rig whose receiver takes ``work_s`` for what each read brings."""
+
+    def __init__(self, part: float) -> None:
+        self.work_s = 0.0
+        self.surplus = Count()
+        super().__init__(share=FairShare(part), surplus=self.surplus, clock=self._time)
+        self.spent_s = 0.0
+        self.conversation._deliver = self._deliver
+
+    def _time(self) -> float:
+        return self.loop.time() + getattr(self, "spent_s", 0.0)
+
+    def _deliver(self, messages: list[Any]) -> None:
+        self.happened.append(messages)
+        self.spent_s += self.work_s
+
+
+async def test_who_sends_more_than_its_share_allows_is_not_read_and_its_datagrams_are_dropped_meanwhile() -> None:
+    slow = Slow(0.25)
+    slow.begin()
+    slow.work_s = BURST_S + 0.01
+    slow.conversation.received(b"\x01a")
+    assert slow.link.paused
+    slow.conversation.received_datagram(b"\x01b")
+    assert (slow.surplus.value, slow.happened) == (1, [[b"a"]])
+    await asyncio.sleep(0.03)
+    assert slow.link.paused
+    await asyncio.sleep(0.02)
+    assert not slow.link.paused, "0.01 s over a share of a quarter: 0.04 s of rest"
+
+
+async def test_a_rest_ends_no_pause_that_the_bus_asked_for_and_the_bus_ends_no_rest() -> None:
+    slow = Slow(0.25)
+    slow.begin()
+    slow.work_s = BURST_S + 0.01
+    slow.conversation.received(b"\x01a")
+    slow.conversation.pause()
+    await asyncio.sleep(0.1)
+    assert slow.link.paused
+    slow.conversation.resume()
+    assert not slow.link.paused
+    slow.conversation.received(b"\x01a")
+    slow.conversation.pause()
+    slow.conversation.resume()
+    assert slow.link.paused
+    slow.conversation.abandon()
+    await asyncio.sleep(1.0)
+    assert slow.link.closed

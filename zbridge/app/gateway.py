@@ -15,8 +15,11 @@ import secrets
 import signal
 import time
 from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from zbridge.app.config import Plan
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
@@ -40,6 +43,8 @@ from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
+from zbridge.transport import connect
+from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -50,21 +55,31 @@ _NAMED = 3
 _RIVALS = "rivals"
 
 
+class Neighbourhood(msgspec.Struct, frozen=True):
+    """What a gateway shares with others of its process.
+
+    part: of the processor, that its robot may use for long. buffer: where all links of the loop read.
+    """
+
+    part: float
+    buffer: bytearray
+
+
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this process, shared by all parts.
+    metrics, sessions, conditions: of this gateway, shared by all parts.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, metrics: Metrics | None = None) -> None:
         self._plan = plan
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
-        self.metrics = Metrics()
+        self.metrics = metrics or Metrics()
         self.sessions = SessionTable()
         self.conditions = Conditions()
-        self._own: str | None = None
+        self._own = own_name(plan.config.bus.tls)
         """The name in our certificate."""
         self._process = "gateway"
         """The name of this process on the bus, while it does not serve the robot."""
@@ -74,21 +89,29 @@ class Gateway:
 
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
-        self._own = own_name(self._plan.config.bus.tls)
         with self._audit() as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
                 try:
-                    await self._run(bus, audit)
+                    async with contextlib.AsyncExitStack() as stack:
+                        if self._plan.metrics is not None:
+                            await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+                        await self._run(bus, audit, None)
                 except CertificateEnded as error:
                     log.error("%s", error)
                 finally:
                     self.left = await bus.close()
 
-    async def _run(self, bus: Bus, audit: Audit) -> None:
+    async def run_on(self, bus: Bus, neighbourhood: Neighbourhood | None = None) -> None:
+        """Do the same on a bus, and beside metrics, that somebody else opens and closes.
+
+        neighbourhood: None where the process serves this robot only.
+        """
+        with self._audit() as audit:
+            await self._run(bus, audit, neighbourhood)
+
+    async def _run(self, bus: Bus, audit: Audit, neighbourhood: Neighbourhood | None) -> None:
         async with contextlib.AsyncExitStack() as stack:
-            if self._plan.metrics is not None:
-                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
             names = listener_names(self._plan.listeners, self._own, bus.zid)
             self._process = process_name(names, self._own, bus.zid) if names else "gateway"
             robot = RobotSubscription(bus, self._keys, self.metrics)
@@ -103,15 +126,16 @@ class Gateway:
             if certificate is not None:
                 work.append(watch_certificate(certificate, bus, self.conditions))
             if self._plan.device is not None:
-                work.append(self._robot(bus, audit, self._plan.device))
+                work.append(self._robot(bus, audit, self._plan.device, neighbourhood))
             else:
                 stack.callback(self._show_sessions(bus, self._process).close)
             await together(*work)
 
-    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
+    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> None:
         """Serve the robot whenever no other gateway does."""
         ownership = Ownership(bus, self._keys)
         try:
+            bus.gather(self._keys.key("@rpc/**"))
             while True:
                 shown = self._show_sessions(bus, self._process) if self._plan.listeners else None
                 await ownership.take()
@@ -119,7 +143,7 @@ class Gateway:
                     shown.close()
                 shown = self._show_sessions(bus, "gateway")
                 try:
-                    await self._serve(ownership, self._device(bus, audit, plan))
+                    await self._serve(ownership, self._device(bus, audit, plan, neighbourhood))
                 finally:
                     shown.close()
         finally:
@@ -165,7 +189,7 @@ class Gateway:
 
         return tell
 
-    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> Device:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -181,6 +205,8 @@ class Gateway:
             audit=audit,
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
+            share=FairShare(neighbourhood.part) if neighbourhood is not None else None,
+            connect=partial(connect, buffer=neighbourhood.buffer) if neighbourhood is not None else connect,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 

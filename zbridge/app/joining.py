@@ -13,7 +13,7 @@ from collections.abc import Callable
 from datetime import datetime
 
 from zbridge.app.config import Plan
-from zbridge.bus import Bus, open_bus
+from zbridge.bus import OPEN_S, Bus, open_bus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import ends_soon, utc_now
 from zbridge.control.conditions import Conditions
@@ -25,6 +25,8 @@ log = logging.getLogger("zbridge.app.gateway")
 
 RETRY_S = 1.0
 """Seconds between attempts to open the bus, while no router is there."""
+OPEN_MOST_S = 4.0
+"""Longest time that an attempt is given; a process that ends waits for the attempt."""
 RARELY_S = 60.0
 """Longest time between two attempts after refusals: each costs the router, and with it everybody, 0.1 s."""
 LOOK_S = 3600.0
@@ -57,21 +59,30 @@ class Pauses:
         """Return the seconds to wait after this error."""
         if not isinstance(error, BusRefused):
             self._refused = 0
-            return RETRY_S
+            return RETRY_S * (0.5 + self._chance())
         self._refused = min(self._refused + 1, 16)
         longest = min(2.0 * RETRY_S * 2.0**self._refused, RARELY_S)
         return longest * (0.5 + 0.5 * self._chance())
 
 
 async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
-    """Open the bus; try again until that succeeds, rarely where the router refuses."""
-    robot, pauses = plan.config.robot, Pauses()
+    """Open the bus; try again until that succeeds, rarely where the router refuses.
+
+    A thousand others may wait for the same router: attempts are given more time, and come at other times than theirs.
+    """
+    robot, pauses, within_s = plan.config.robot, Pauses(), OPEN_S
     while True:
         try:
             return await open_bus(
-                plan.config.bus, metrics, bounds=topics.size_bounds(), realm=robot.realm, robot=robot.name
+                plan.config.bus,
+                metrics,
+                bounds=topics.size_bounds(),
+                within_s=within_s,
+                realm=robot.realm,
+                robot=robot.name,
             )
         except BusError as error:
+            within_s = min(2 * within_s, OPEN_MOST_S)
             pause = pauses.after(error)
             log.warning("no bus: %s; next attempt in %.2g s", error, pause)
             await asyncio.sleep(pause)

@@ -35,11 +35,13 @@ _HEADROOM_BYTES = 65_536
 class RouterLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[limits]``: what one member may ask of the router.
 
-    sessions: connections at a time. message_bytes: of payload and attachment, where no smaller bound holds. stops_hz:
+    sessions: connections at a time; pending: connections that are being opened at a time, as after a restart, when all
+    members come at once. message_bytes: of payload and attachment, where no smaller bound holds. stops_hz:
     stops a second of one member to one robot. opening_s: how long somebody who connects may take.
     """
 
-    sessions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 1000
+    sessions: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 2000
+    pending: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 500
     message_bytes: Annotated[int, msgspec.Meta(ge=65_536, le=2**30)] = MESSAGE_BYTES
     stops_hz: Annotated[float, msgspec.Meta(ge=200.0)] = STOPS_HZ
     opening_s: Annotated[float, msgspec.Meta(ge=0.5, le=60.0)] = 5.0
@@ -107,6 +109,7 @@ def zenoh_values(plan: RouterPlan) -> dict[str, Any]:
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
         "transport/link/rx/max_message_size": limits.message_bytes + _HEADROOM_BYTES,
         "transport/unicast/max_sessions": limits.sessions,
+        "transport/unicast/accept_pending": limits.pending,
         "transport/unicast/accept_timeout": int(1000 * limits.opening_s),
         "low_pass_filter": low_pass_filter(settings.realm, limits.message_bytes),
     }

@@ -28,7 +28,11 @@ from zbridge.bus.interface import (
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
+OPEN_S = 1.0
+"""Longest time one attempt to open a client session takes."""
+
 __all__ = [
+    "OPEN_S",
     "Answer",
     "Batch",
     "Bus",
@@ -54,10 +58,11 @@ async def open_bus(
     *,
     wait_for_peers: bool = False,
     bounds: SizeBounds = (),
+    within_s: float = OPEN_S,
     realm: str | None = None,
     robot: str | None = None,
 ) -> Bus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
 
     The error says which case it is, where that can be found within three more seconds; it is BusRefused where trying
     again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
@@ -66,7 +71,15 @@ async def open_bus(
     """
     from zbridge.bus.zenoh import open_zenoh
 
-    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds, realm=realm, robot=robot)
+    return await open_zenoh(
+        settings,
+        metrics,
+        wait_for_peers=wait_for_peers,
+        bounds=bounds,
+        within_s=within_s,
+        realm=realm,
+        robot=robot,
+    )
 
 
 async def open_router(

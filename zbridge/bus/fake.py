@@ -14,6 +14,7 @@ import msgspec
 from zbridge.bus.interface import Answer, Batch, Handle, IncomingQuery, Lane, Publisher, Sample, Sort
 from zbridge.errors import Refused
 from zbridge.fleet.topics import Topic, is_concrete
+from zbridge.metrics import Metrics
 
 H = TypeVar("H", bound=Handle)
 
@@ -95,6 +96,14 @@ class FakeBus:
 
     # The interface
 
+    def share(self, metrics: Metrics) -> FakeBus:
+        shared = self.join(self._zid)
+        shared._connected = self._connected
+        return shared
+
+    def gather(self, key_expr: str) -> Handle:
+        return _FakeHandle(lambda: None)
+
     def publisher(self, key: str, topic: Topic) -> Publisher:
         return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
 
@@ -168,7 +177,7 @@ class FakeBus:
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
-        if any(matches(key_expr, key) for key_expr, _ in self._shared.subscribers):
+        if any(meet(key_expr, key) for key_expr, _ in self._shared.subscribers):
             asyncio.get_running_loop().call_soon(listened, True)
         return publisher
 

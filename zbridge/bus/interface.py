@@ -10,6 +10,7 @@ import msgspec
 
 from zbridge.errors import BusError, ConfigError, Refused
 from zbridge.fleet.topics import Topic
+from zbridge.metrics import Metrics
 
 Connection = Annotated[str, msgspec.Meta(pattern=r"^(tcp|udp|tls|quic|ws|unixsock-stream|serial|vsock)/[^ ]+$")]
 """Where Zenoh listens or connects: ``tcp/127.0.0.1:7447``."""
@@ -160,6 +161,12 @@ class Bus(Protocol):
     def zid(self) -> str:
         """The id of this session on the bus."""
 
+    def share(self, metrics: Metrics) -> Bus:
+        """Return a bus on the same session for one robot, with queues, bounds and declarations of its own.
+
+        Its ``close`` takes back what was declared on it, and leaves the session to the others.
+        """
+
     def publisher(self, key: str, topic: Topic) -> Publisher:
         """Declare that ``key`` will be written."""
 
@@ -187,6 +194,12 @@ class Bus(Protocol):
 
     def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
         """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
+
+    def gather(self, key_expr: str) -> Handle:
+        """Declare one queryable, ``key_expr`` (``.../**``), for all keys below it that are answered from now on.
+
+        Whoever may answer for one of the keys only, as access rules say, must not gather.
+        """
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""

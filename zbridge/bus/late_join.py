@@ -4,7 +4,8 @@ Theory of operation. Live values come by a plain subscription. The last values a
 of a robot's gateway is there: at the begin, and again whenever it comes back, since what was published while the two
 could not reach each other is lost. The token may arrive before the way for the question is there: a question without an
 answer is put again, a few times. A value that came live while its robot was being asked is newer than the answer;
-one that was on its way meanwhile comes twice.
+one that was on its way meanwhile comes twice. Where the bus comes back, many robots' tokens come at once, and many
+joiners see them: so few robots are asked at a time, and each joiner begins at another moment.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import random
 from collections.abc import Callable
 
 from zbridge.bus.interface import Bus, Sample
@@ -22,8 +24,12 @@ log = logging.getLogger("zbridge.bus")
 
 ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
 """Seconds before each question."""
-ASKED_AT_ONCE = 1024
-"""Robots that are asked at the same time."""
+JITTER_S = 0.1
+"""Most seconds by which the questions to a robot begin later where others are asked already."""
+ASKED_AT_ONCE = 32
+"""Robots that are asked at the same time; the others wait."""
+ROBOTS = 20_000
+"""Robots that are asked, or wait to be asked."""
 LIVE_KEYS = 4096
 """Keys of a robot that are noted as live while it is asked."""
 
@@ -37,6 +43,7 @@ class LateJoin:
         self._handler = handler
         self.closed = False
         self._asking: dict[str, asyncio.Task[None]] = {}
+        self._room = asyncio.Semaphore(ASKED_AT_ONCE)
         self._live: dict[str, set[str]] = {}
         """By the robot that is asked, the keys that came live since."""
         self._subscription = bus.subscribe(key_expr, self._take)
@@ -69,15 +76,19 @@ class LateJoin:
         asked = self._asking.pop(robot, None)
         if asked is not None:
             asked.cancel()
-        if alive and len(self._asking) < ASKED_AT_ONCE:
+        if alive and len(self._asking) < ROBOTS:
             self._asking[robot] = asyncio.get_running_loop().create_task(self._ask(realm, robot))
 
     async def _ask(self, realm: str, robot: str) -> None:
         live = self._live[robot] = set()
+        if len(self._asking) > 1:
+            await asyncio.sleep(JITTER_S * random.random())
         try:
             for after_s in ASK_AFTER_S:
                 await asyncio.sleep(after_s)
-                if await self._asked_once(realm, robot, live):
+                async with self._room:
+                    answered = await self._asked_once(realm, robot, live)
+                if answered:
                     break
         finally:
             if self._live.get(robot) is live:

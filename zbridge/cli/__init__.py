@@ -13,12 +13,14 @@ import gc
 import logging
 import os
 import sys
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
 from zbridge.app.member import check_member
+from zbridge.app.together import Together
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
@@ -27,7 +29,7 @@ def main() -> None:
     """Run the command line; print a ZbridgeError as one line on stderr."""
     try:
         match sys.argv[1:]:
-            case ["run", file] if not file.startswith("-"):
+            case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
                 run_gateway(Path(file))
             case _:
                 from zbridge.cli.app import app
@@ -68,6 +70,31 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, t
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
+        logging.shutdown()
+        os._exit(0)
+
+
+def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = False) -> None:
+    """Run the gateways of several configurations in this process until SIGTERM or SIGINT.
+
+    A faulty file is reported, and the others run.
+    """
+    set_up_log(verbose=verbose)
+    plans, faults = [], []
+    for file in files:
+        try:
+            plans.append((file, load(file)))
+        except ConfigError as error:
+            faults.append(error)
+            logging.getLogger("zbridge.cli").error("%s", error)
+    if not plans:
+        raise faults[0]
+    require_different_robots(plans)
+    require_one_bus(plans)
+    gc.freeze()
+    together = Together({plan.config.robot.name: plan for _, plan in plans}, host)
+    run_loop(until_signal(together.run()))
+    if not together.left:
         logging.shutdown()
         os._exit(0)
 

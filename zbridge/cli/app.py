@@ -9,9 +9,10 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
+from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.bus.tls.files import TLS_VARIABLE, ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, run_gateway, run_loop, set_up_log
+from zbridge.cli import certs, give_up, run_gateway, run_loop, run_together, set_up_log
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
@@ -29,6 +30,9 @@ app = typer.Typer(
 app.add_typer(certs.app, name="certs")
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
+Files = Annotated[
+    list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
+]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
 Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
 Connect = Annotated[
@@ -59,9 +63,29 @@ FileTls = Annotated[
 
 
 @app.command()
-def run(file: File, tls: FileTls = None, verbose: Verbose = False) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT."""
-    run_gateway(file, verbose=verbose, tls=tls)
+def run(
+    files: Files,
+    together: Annotated[
+        bool, typer.Option("--together", help="several robots in one process, as host.toml of a directory may say")
+    ] = False,
+    tls: FileTls = None,
+    verbose: Verbose = False,
+) -> None:
+    """Run a gateway in the foreground until SIGTERM or SIGINT; or several, in one process."""
+    if len(files) == 1 and files[0].is_dir():
+        host, directory = load_host(files[0]), files[0]
+        files = robot_files(directory)
+        if not files:
+            give_up(2, f"{directory}: no robot files (*.toml)")
+        if not (together or host.together):
+            give_up(2, f"{directory}: expected [host] together = true in host.toml, or --together")
+        run_together(files, host, verbose=verbose)
+    elif len(files) == 1 and not together:
+        run_gateway(files[0], verbose=verbose, tls=tls)
+    elif together:
+        run_together(files, HostSettings(together=True), verbose=verbose)
+    else:
+        give_up(2, "give one file, or a directory, or --together for several robots in one process")
 
 
 @app.command()

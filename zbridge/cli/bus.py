@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import math
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -35,6 +36,8 @@ _CELL = 200
 """Characters of a cell of a table, at most."""
 _MESSAGE = 20_000
 """Characters of a message that is printed as text, at most."""
+_SUMMED_UP = 20
+"""Robots from which on a line below the table counts them."""
 _DEPTH = 32
 """Levels of nested maps and arrays that are printed."""
 
@@ -62,6 +65,8 @@ async def list_robots(settings: BusSettings, realm: str, *, as_json: bool) -> No
             console.print(to_json({"robot": name, **fields}))
     elif robots:
         console.print(_robot_table(robots))
+        if len(robots) >= _SUMMED_UP:
+            console.print(_summary(robots))
     else:
         finding = await why_not(settings) if settings.tls is None else None  # the router may speak TLS
         more = f": {shown(finding.text)}" if finding is not None and finding.refused else ""
@@ -128,6 +133,12 @@ def _robot_table(robots: dict[str, Status | None]) -> Table:
             cells = (name, status.state, *agreed, status.reason or "")
         table.add_row(*map(cell, cells))
     return table
+
+
+def _summary(robots: dict[str, Status | None]) -> str:
+    """Count robots by state: ``1000 robots: 998 established, 2 offline``."""
+    counts = Counter("without status" if status is None else status.state for status in robots.values())
+    return f"{len(robots)} robots: " + ", ".join(f"{count} {state}" for state, count in counts.most_common())
 
 
 async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) -> None:

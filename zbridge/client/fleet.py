@@ -11,6 +11,7 @@ from typing import Any
 from zbridge.bus import Bus, Sample
 from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import Feed, StateFeed, reader
+from zbridge.client.settled import settled
 from zbridge.errors import BusError, Malformed, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -38,6 +39,8 @@ from zbridge.fleet.messages import (
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
 
+STOPPED_AT_ONCE = 64
+"""Robots whose confirmation of a stop is waited for at a time."""
 CONFIRM_S = 2.0
 """Longest wait for the confirmation of a stop, seconds."""
 ANSWER_S = 5.0
@@ -67,18 +70,36 @@ class Fleet:
         return Robot(self._bus, KeySpace(self.realm, name), self.name)
 
     async def robots(self) -> dict[str, Status | None]:
-        """Return the robots that have a gateway or a status, by name; None for a robot without a status."""
-        tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
-        robots: dict[str, Status | None] = {split[1]: None for key in tokens if (split := split_key(key))}
+        """Return the robots that have a gateway or a status, by name; None for a robot without a status.
+
+        While gateways come to the bus, or come back, an answer may be partial: it is asked for again until two in a row
+        name the same robots with a status each, within three seconds.
+        """
+        robots = await settled(self._look, lambda seen: seen.keys() if all(seen.values()) else None)
+        return dict(sorted(robots.items()))
+
+    async def _look(self) -> dict[str, Status | None]:
+        robots: dict[str, Status | None] = dict.fromkeys(await self._gateways())
         for answer in await self._bus.ask(f"{self.realm}/*/{topics.STATUS.path}"):
             split = split_key(answer.key)
             if split is not None and answer.error is None:
                 with contextlib.suppress(PayloadError):
                     robots[split[1]] = payloads.decode(Status, answer.payload)
-        return dict(sorted(robots.items()))
+        return robots
+
+    async def _gateways(self) -> set[str]:
+        tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
+        return {split[1] for key in tokens if (split := split_key(key))}
 
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
-        """Return the session tables by robot and process: peers, their states, and what was not translated."""
+        """Return the session tables by robot and process: peers, their states, and what was not translated.
+
+        Asked for again as :meth:`robots` is.
+        """
+        tables = await settled(self._look_at_sessions, lambda seen: seen.keys())
+        return dict(sorted(tables.items()))
+
+    async def _look_at_sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         tables: dict[tuple[str, str], tuple[SessionEntry, ...]] = {}
         for answer in await self._bus.ask(f"{self.realm}/*/@rpc/sessions/*"):
             split = split_key(answer.key)
@@ -86,22 +107,31 @@ class Fleet:
                 with contextlib.suppress(PayloadError):
                     who = split[2].rpartition("/")[2]
                     tables[split[1], who] = payloads.decode(Sessions, answer.payload).sessions
-        return dict(sorted(tables.items()))
+        return tables
 
     async def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
-        """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed."""
-        if names is None:
-            tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
-            names = {split[1] for key in tokens if (split := split_key(key)) and is_name(split[1])}
-        names = [names] if isinstance(names, str) else sorted(names)
-        return dict(zip(names, await asyncio.gather(*map(self._stop_one, names)), strict=True))
+        """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed.
 
-    async def _stop_one(self, name: str) -> Refused | BusError | None:
-        try:
-            await self[name].stop()
-        except (Refused, BusError) as error:
-            return error
-        return None
+        All are stopped by one message at once, before each is stopped, and asked for its confirmation, by name.
+        """
+        if names is None:
+            everybody = KeySpace(self.realm, "*").key(topics.CMD_STOP.path)
+            with contextlib.closing(self._bus.publisher(everybody, topics.CMD_STOP)) as stop:
+                stop.put(payloads.encode(Stop()))
+                with contextlib.suppress(BusError):
+                    await self._bus.flush()
+            names = filter(is_name, await settled(self._gateways, lambda seen: seen))
+        names = [names] if isinstance(names, str) else sorted(names)
+        room = asyncio.Semaphore(STOPPED_AT_ONCE)
+        return dict(zip(names, await asyncio.gather(*(self._stop_one(name, room) for name in names)), strict=True))
+
+    async def _stop_one(self, name: str, room: asyncio.Semaphore) -> Refused | BusError | None:
+        async with room:
+            try:
+                await self[name].stop()
+            except (Refused, BusError) as error:
+                return error
+            return None
 
 
 class ControlFeed(StateFeed[Control]):

@@ -19,6 +19,7 @@ from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.session import Session, State, Tap
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.transport import Conversation
+from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.link")
 
@@ -49,6 +50,10 @@ class Hooks(msgspec.Struct, frozen=True):
     clock: Callable[[], float]
     before: Callable[[], object] = lambda: None
     """Called before a frame is written: a stop may have to be written first."""
+    share: FairShare | None = None
+    """Of the processor, where the process serves other robots too."""
+    surplus: Count | None = None
+    """Counts datagrams beyond the share."""
     stalled: Callable[[bool], object] = lambda stalled: None
     """Called when the link stops taking bytes (True), and when it takes them again (False)."""
 
@@ -169,6 +174,8 @@ class Connection:
             clock=hooks.clock,
             before=hooks.before,
             stalled=hooks.stalled,
+            share=hooks.share,
+            surplus=hooks.surplus,
         )
         self._set_state("connecting", None)
         self.conversation = conversation

@@ -37,6 +37,7 @@ from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
 from zbridge.transport import connect
+from zbridge.transport.fair_share import FairShare
 
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
@@ -65,12 +66,15 @@ class Device:
         limits: MotionLimits | None = None,
         conditions: Conditions | None = None,
         idle_stop_s: float = IDLE_STOP_S,
+        share: FairShare | None = None,
         connect: Connect = connect,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
+        """Begin. share: of the processor, where the process serves other robots too."""
         loop = asyncio.get_running_loop()
         clock, conditions = clock or loop.time, conditions or Conditions()
+        self._share = share
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
@@ -102,6 +106,8 @@ class Device:
             foreign=context.metrics.count("foreign_datagrams"),
             clock=context.clock,
             before=self._enforcer.keep_time,
+            share=self._share,
+            surplus=context.metrics.count("datagrams_over_share"),
             stalled=partial(presence.stalled, name),
         )
 

@@ -23,6 +23,7 @@ import asyncio
 import contextlib
 import logging
 import math
+import random
 import time
 from collections.abc import Callable
 from enum import StrEnum
@@ -148,7 +149,7 @@ class Ownership:
                 async with asyncio.timeout(WATCH_S):
                     await self._came.wait()
             self._came.clear()
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(random.uniform(1.0, 4.0) * LOOK_S)  # all gateways of a router find their bus at once
             with contextlib.suppress(BusError):
                 serving = {zid: claim for zid, claim in (await self._claims()).items() if claim.held_s}
                 if has():

@@ -11,13 +11,14 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from zbridge.bus import Handle
+from zbridge.bus import Handle, Publisher
 from zbridge.control.context import RobotContext
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.protocol.plugin import Translate
 from zbridge.robot.connection import Connection, Links
+from zbridge.robot.on_demand import Listened, OnDemand
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries
 
@@ -50,10 +51,21 @@ class Telemetry:
     def serve(self) -> list[Handle]:
         """Publish on demand what is only published while somebody listens; read again when the bus is relieved."""
         self._bus.on_relief(self._links.resume)
-        for connection in self._links:
-            for direction in ("in", "out"):
-                self._watch_frames(connection, direction)
-        return [self._watch_listeners(topic) for topic in self._context.robot.on_demand]
+        keys = self._context.keys
+        frames = {
+            keys.key(f"@wire/{connection.name}/{direction}"): self._show_frames(connection, direction)
+            for connection in self._links
+            for direction in ("in", "out")
+        }
+        families: dict[str, dict[str, Listened]] = {keys.key("@wire/**"): frames}
+        for topic in self._context.robot.on_demand:
+            family, _, _ = topic.path.rpartition("/")
+            asked = families.setdefault(keys.key(f"{family}/*" if family else topic.path), {})
+            asked[keys.key(topic.path)] = self._tell_robot(topic)
+        opened = [OnDemand(self._bus, key_expr, listened) for key_expr, listened in families.items()]
+        for each in opened:
+            each.open()
+        return list(opened)
 
     def deliver(self, messages: list[Any]) -> None:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
@@ -94,19 +106,18 @@ class Telemetry:
         translate = self._translators[kind] = self._context.robot.translator(kind)
         return translate
 
-    def _watch_frames(self, connection: Connection, direction: str) -> None:
+    def _show_frames(self, connection: Connection, direction: str) -> Listened:
         """Publish the raw frames of one direction while somebody listens."""
 
-        def listened(anybody: bool) -> None:
+        def listened(publisher: Publisher, anybody: bool) -> None:
             connection.watch(direction, publisher.put if anybody else None)
 
-        key = self._context.keys.key(f"@wire/{connection.name}/{direction}")
-        publisher = self._bus.frames(key, listened)
+        return listened
 
-    def _watch_listeners(self, topic: Topic) -> Handle:
+    def _tell_robot(self, topic: Topic) -> Listened:
         """Tell the robot whether anybody listens to a topic."""
 
-        def changed(anybody: bool) -> None:
+        def listened(_: Publisher, anybody: bool) -> None:
             try:
                 self._context.robot.listened(topic, anybody)
                 self._context.pump()
@@ -114,4 +125,4 @@ class Telemetry:
                 if not isinstance(error, Refused):
                     self._context.faults.note(topic.path, error)
 
-        return self._bus.watch_listeners(self._context.keys.key(topic.path), changed)
+        return listened

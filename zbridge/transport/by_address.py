@@ -7,8 +7,11 @@ from zbridge.transport import serial, tcp
 from zbridge.transport.link import Link, Receiver
 
 
-async def connect(address: DeviceAddress, receiver: Receiver) -> Link:
-    """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason where that is not possible."""
+async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray | None = None) -> Link:
+    """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason where that is not possible.
+
+    buffer: where reads from sockets go, which links of one loop may share.
+    """
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
-    return await tcp.connect(address, receiver)
+    return await tcp.connect(address, receiver, buffer)

@@ -16,6 +16,7 @@ from typing import Any, Concatenate, ParamSpec
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
 from zbridge.protocol.session import Datagram, Session, State
+from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import STALLED_S, Link
 
 log = logging.getLogger("zbridge.link")
@@ -53,6 +54,8 @@ class Conversation:
     all is acknowledged, before the next write.
     ``refused`` is told which datagrams in the peer's name did not come from the peer.
     ``may_warn(kind)`` says whether a warning of this kind may be logged now.
+    ``share``: of a processor; who sends more than can be worked off within it is not read meanwhile, and its datagrams
+    are dropped and counted by ``surplus``.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
@@ -71,6 +74,8 @@ class Conversation:
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
         stalled: Callable[[bool], object] = lambda stalled: None,
+        share: FairShare | None = None,
+        surplus: Count | None = None,
     ) -> None:
         self.session = session
         self._before = before
@@ -92,6 +97,11 @@ class Conversation:
         self._refused = refused
         self._may_warn = may_warn
         self._malformed_logged = 0
+        self._share = share
+        self._surplus = surplus or Count()
+        self._rests: asyncio.TimerHandle | None = None
+        """Set while nothing is read because the share is used up."""
+        self._paused = False
 
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
@@ -105,16 +115,25 @@ class Conversation:
 
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
+        begun = self._clock()
         try:
-            self._hand_on(self.session.receive(data, self._clock()))
+            self._hand_on(self.session.receive(data, begun))
             self._pump()
         except Exception as error:
             self._fault(error)
+        if self._share is not None:
+            self._rest(self._share, begun)
 
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        self._hand_on(self.session.receive_datagram(datagram, self._clock()))
+        begun = self._clock()
+        if self._rests is not None:
+            self._surplus.value += 1
+            return
+        self._hand_on(self.session.receive_datagram(datagram, begun))
+        if self._share is not None:
+            self._rest(self._share, begun)
 
     def claims(self, datagram: bytes, port: int) -> bool:
         """Ask the session whether this datagram is from its peer."""
@@ -228,13 +247,28 @@ class Conversation:
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
+        self._paused = True
         if self._link is not None:
             self._link.pause()
 
     def resume(self) -> None:
         """Read again."""
-        if self._link is not None:
+        self._paused = False
+        if self._link is not None and self._rests is None:
             self._link.resume()
+
+    def _rest(self, share: FairShare, begun: float) -> None:
+        """Read nothing while the share is used up."""
+        now = self._clock()
+        rest_s = share.spent(now - begun, now)
+        if rest_s and self._rests is None and self._link is not None:
+            self._link.pause()
+            self._rests = self._loop.call_later(rest_s, self._rested)
+
+    def _rested(self) -> None:
+        self._rests = None
+        if not self._paused:
+            self.resume()
 
     @_then_pump
     def _tick(self) -> None:
@@ -277,6 +311,9 @@ class Conversation:
 
     def _end(self) -> None:
         self._set_timer(None)
+        if self._rests is not None:
+            self._rests.cancel()
+            self._rests = None
         link, self._link = self._link, None
         if link is not None:
             link.close()

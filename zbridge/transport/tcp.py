@@ -27,6 +27,8 @@ log = logging.getLogger("zbridge.link")
 
 READ_BYTES = 64 * 1024
 """Most bytes taken from a robot's socket before the loop serves others."""
+SHARED_READ_BYTES = 4 * 1024
+"""The same where the loop serves other robots too."""
 CLIENT_READ_BYTES = 4096
 """The same for an accepted peer: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
@@ -55,14 +57,22 @@ CONNECT_S = 5.0
 class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
-    ``buffer``: where reads of an accepted peer go. Reads are copied at once, so all links of a loop may share it.
+    ``buffer``: where reads go, :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links of a
+    loop may share it. ``accepted``: by a listener.
     """
 
-    def __init__(self, receiver: Receiver, hub: DatagramHub | None = None, buffer: bytearray | None = None) -> None:
+    def __init__(
+        self,
+        receiver: Receiver,
+        hub: DatagramHub | None = None,
+        buffer: bytearray | None = None,
+        *,
+        accepted: bool = False,
+    ) -> None:
         self.peer = ""
         self._backlog: Backlog | None = None
         self._hub = hub
-        self._accepted = buffer is not None
+        self._accepted = accepted
         self._datagrams: DatagramSocket | None = None
         self._receiver = receiver
         self._transport: asyncio.Transport | None = None
@@ -259,12 +269,15 @@ def _queued(sock: socket.socket) -> int:
     return queued
 
 
-async def connect(address: Address, receiver: Receiver) -> TcpLink:
-    """Connect within :data:`CONNECT_S`, or raise LinkError with the reason."""
+async def connect(address: Address, receiver: Receiver, buffer: bytearray | None = None) -> TcpLink:
+    """Connect within :data:`CONNECT_S`, or raise LinkError with the reason. buffer: where reads go; links may share it.
+
+    Reads are as large as the buffer at most.
+    """
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(CONNECT_S):
-            _, link = await loop.create_connection(lambda: TcpLink(receiver), address.host, address.port)
+            _, link = await loop.create_connection(lambda: TcpLink(receiver, buffer=buffer), address.host, address.port)
     except TimeoutError as error:
         raise LinkError(f"{address}: no answer within {CONNECT_S:g} s") from error
     except (OSError, UnicodeError) as error:
@@ -292,7 +305,9 @@ async def listen(
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
-            server = await loop.create_server(lambda: TcpLink(make(), hub, buffer), address.host, address.port)
+            server = await loop.create_server(
+                lambda: TcpLink(make(), hub, buffer, accepted=True), address.host, address.port
+            )
             await stack.enter_async_context(server)
             host, port = server.sockets[0].getsockname()[:2]
             if hub is not None:

@@ -45,6 +45,24 @@ class Declared:
             _undeclare_soon(entity)
 
 
+class Undo:
+    """A handle that undoes something once."""
+
+    def __init__(self, undo: Callable[[], object]) -> None:
+        self._undo: Callable[[], object] | None = undo
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was undone."""
+        return self._undo is None
+
+    def close(self) -> None:
+        """Undo it; idempotent."""
+        undo, self._undo = self._undo, None
+        if undo is not None:
+            undo()
+
+
 def _undeclare_soon(entity: Any) -> None:
     """Undeclare an entity, here within 2 ms or else by a thread of its own within :data:`UNDECLARE_S`."""
     for attempt in range(_TRIES_AT_ONCE):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import random
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -17,16 +18,21 @@ from zbridge.fleet.topics import SizeBounds
 
 PATIENCE_US = 20_000
 """Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
-OPEN_S = 1.0
-"""Longest time one attempt to open a client session takes."""
+RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
+"""Milliseconds between attempts to connect to a router that was lost: first, at most, and by what they grow."""
 _INGRESS = ("ingress",)
 _BOUNDED = ("put", "delete", "query")
 _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 """The place in Zenoh's source at the end of its error texts; cut off."""
 
 
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
-    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
+def zenoh_config(
+    settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = (), within_s: float = 1.0
+) -> zenoh.Config:
+    """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses.
+
+    within_s: longest time an attempt to open a client session takes.
+    """
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
         "connect/endpoints": settings.connect,
@@ -41,11 +47,19 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
         values["listen/endpoints"] = settings.listen
     if bounds:
         values["low_pass_filter"] = _size_filters(bounds)
+    if settings.connect:
+        values["connect/retry"] = _retry()
     if settings.effective_mode == "client":
-        values["connect/timeout_ms"] = int(OPEN_S * 1000)
+        values["connect/timeout_ms"] = int(within_s * 1000)
     if settings.tls is not None:
         values |= _secure_values(settings.tls)
     return write_config(values)
+
+
+def _retry() -> dict[str, float]:
+    """Choose the times between attempts to connect, another for each session: a thousand may have lost one router."""
+    first_ms, most_ms = random.randint(*RETRY_FIRST_MS), random.randint(*RETRY_MOST_MS)
+    return {"period_init_ms": first_ms, "period_max_ms": most_ms, "period_increase_factor": RETRY_FACTOR}
 
 
 def write_config(values: Mapping[str, Any]) -> zenoh.Config:

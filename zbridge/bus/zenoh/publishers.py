@@ -65,8 +65,9 @@ class Publishers:
 class PlainPublisher(Declared):
     """Writes a key directly, or by a writer thread where a full queue blocks."""
 
-    def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None) -> None:
-        super().__init__(publisher)
+    def __init__(self, key: str, publisher: zenoh.Publisher, writer: Writer | None, *watches: Any) -> None:
+        """Begin. watches: what is undeclared with the publisher."""
+        super().__init__(*watches, publisher)
         self.key = key
         self._put = publisher.put
         self._writer = writer

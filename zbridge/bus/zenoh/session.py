@@ -16,6 +16,8 @@ from zbridge.bus.late_join import LateJoin
 from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
+from zbridge.bus.zenoh.alive import AliveWatches, Changed
+from zbridge.bus.zenoh.answers import Answers
 from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
@@ -50,11 +52,12 @@ async def open_zenoh(
     *,
     wait_for_peers: bool = False,
     bounds: SizeBounds = (),
+    within_s: float = 1.0,
     realm: str | None = None,
     robot: str | None = None,
 ) -> ZenohBus:
-    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second)."""
-    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds)
+    """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
+    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s)
     session = await open_or_say_why(config, settings)
     bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
     certificate = own_certificate(settings.tls)
@@ -77,10 +80,19 @@ class ZenohBus:
         metrics: Metrics,
         *,
         stream: str = "drop",
+        beside: ZenohBus | None = None,
     ) -> None:
+        """Begin. beside: a bus whose session this one shares and does not end."""
         self._session = session
         self._loop = loop
+        self._stream = stream
+        self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
+        self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
+        """Of all that share the session: what is urgent to one of them is served with all."""
+        self._inboxes.append(self._inbox)
+        self._answers = Answers(session)
+        self._alive = AliveWatches(loop, self._declare_alive)
         self._replies_dropped = metrics.count("bus_replies_dropped")
         self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
@@ -99,6 +111,13 @@ class ZenohBus:
     def zid(self) -> str:
         """The id of the Zenoh session."""
         return str(self._session.zid())
+
+    def share(self, metrics: Metrics) -> ZenohBus:
+        """Return a bus on the same session for one robot, with queues, bounds, threads and declarations of its own.
+
+        Its ``close`` takes back what was declared on it, and leaves the session to the others.
+        """
+        return ZenohBus(self._session, self._loop, metrics, stream=self._stream, beside=self)
 
     def publisher(self, key: str, topic: Topic) -> Publisher:
         """Declare that ``key`` will be written."""
@@ -137,7 +156,11 @@ class ZenohBus:
         store = query_callback(
             rate_limited(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
         )
-        return self._keep(Declared(self._session.declare_queryable(key, store)))
+        return self._keep(self._answers.add(key, store))
+
+    def gather(self, key_expr: str) -> Handle:
+        """Declare one queryable, ``key_expr``, for all keys below it that are answered from now on."""
+        return self._answers.gather(key_expr)
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
@@ -159,7 +182,8 @@ class ZenohBus:
 
     def attend(self) -> None:
         """Serve the stops and the holder's commands that wait. To be called in the middle of long work."""
-        self._inbox.attend()
+        for inbox in self._inboxes:
+            inbox.attend()
 
     def announce(self, key: str) -> Handle:
         """Declare a liveliness token."""
@@ -174,9 +198,12 @@ class ZenohBus:
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Handle:
         """Call ``handler`` with every liveliness token that exists or appears (True) or disappears (False)."""
+        return self._keep(self._alive.add(key_expr, handler))
+
+    def _declare_alive(self, key_expr: str, handler: Changed) -> Handle:
         store = lane_callback(Lane.STOP, self._inbox.source(lambda change: handler(*change), read_change))
         watch = self._session.liveliness().declare_subscriber(key_expr, threadless(store), history=True)
-        return self._keep(Declared(watch))
+        return Declared(watch)
 
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded).
@@ -208,8 +235,8 @@ class ZenohBus:
         def changed(status: zenoh.MatchingStatus) -> None:
             loop.call_soon_threadsafe(listened, status.matching)
 
-        self._keep(Declared(plain.declare_matching_listener(threadless(changed))))
-        return self._keep(PlainPublisher(key, plain, None))
+        watch = plain.declare_matching_listener(threadless(changed))
+        return self._keep(PlainPublisher(key, plain, None, watch))
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""
@@ -227,6 +254,8 @@ class ZenohBus:
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""
         handles, self._handles = self._handles, []
+        if self._inbox in self._inboxes:
+            self._inboxes.remove(self._inbox)
         left = threading.Event()
 
         def leave() -> None:
@@ -245,7 +274,7 @@ class ZenohBus:
         with contextlib.suppress(zenoh.ZError):
             for handle in reversed(handles):
                 handle.close()
-        if not self._session.is_closed():
+        if not (self._shares or self._session.is_closed()):
             self._session.close()  # type: ignore[no-untyped-call]
 
     def _relieve(self) -> None:

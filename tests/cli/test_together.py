@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from zbridge import cli
+from zbridge.app.host import HostSettings
+from zbridge.app.together import Together
+from zbridge.errors import ConfigError
+
+ROBOT = '[robot]\nname = "{}"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:1"]\n{}'
+HOST = HostSettings(together=True)
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
+    """The robots that were to be served, instead of serving them."""
+    served: list[set[str]] = []
+
+    def run_loop(work: Coroutine[Any, Any, Any]) -> None:
+        work.close()
+
+    async def run(self: Together) -> None:
+        """Never awaited."""
+
+    def until_signal(work: Coroutine[Any, Any, None]) -> Coroutine[Any, Any, None]:
+        return work
+
+    made = Together.__init__
+
+    def init(self: Together, plans: dict[str, Any], host: HostSettings) -> None:
+        made(self, plans, host)
+        served.append(set(plans))
+
+    monkeypatch.setattr(cli, "run_loop", run_loop)
+    monkeypatch.setattr(cli, "until_signal", until_signal)
+    monkeypatch.setattr(Together, "__init__", init)
+    monkeypatch.setattr("zbridge.cli.gc.freeze", lambda: None)
+    return served
+
+
+def written(folder: Path, **files: str) -> list[Path]:
+    for name, text in files.items():
+        (folder / f"{name}.toml").write_text(text)
+    return [folder / f"{name}.toml" for name in files]
+
+
+def test_a_faulty_file_is_reported_and_the_other_robots_run(tmp_path: Path, served, caplog) -> None:
+    cli.run_together(written(tmp_path, a=ROBOT.format("r1", ""), b="[robto]", c=ROBOT.format("r3", "")), HOST)
+    assert served == [{"r1", "r3"}]
+    assert "b.toml: robto = {}: unknown key" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"a": "[robto]"}, "a.toml: robto = {}: unknown key"),
+        (
+            {"a": ROBOT.format("r1", ""), "b": ROBOT.format("r1", "")},
+            "b.toml: robot.name = 'r1': expected another name",
+        ),
+        (
+            {"a": ROBOT.format("r1", ""), "b": ROBOT.format("r2", '[bus]\nconnect = ["tcp/127.0.0.1:1"]')},
+            "b.toml: bus: expected the same as in",
+        ),
+    ],
+    ids=["no robot is left", "one robot twice", "two buses"],
+)
+def test_what_cannot_run_together_is_refused(tmp_path: Path, served, files: dict[str, str], said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        cli.run_together(written(tmp_path, **files), HOST)
+    assert said in str(error.value)
+    assert served == []

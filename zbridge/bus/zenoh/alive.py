@@ -1,0 +1,89 @@
+"""Watches of liveliness tokens: all who watch the same key expression share one declaration on a session.
+
+A watcher that comes later is told at once of the tokens that the others were told of.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from functools import partial
+
+from zbridge.bus.interface import Handle
+from zbridge.bus.zenoh.declared import Undo
+
+log = logging.getLogger("zbridge.bus")
+
+Changed = Callable[[str, bool], None]
+"""Called with the key of a token that is there (True) or has gone (False)."""
+
+
+class AliveWatches:
+    """The watches of one session. All calls belong on the event loop's thread.
+
+    declare: subscribes to an expression's tokens, those that exist included.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, declare: Callable[[str, Changed], Handle]) -> None:
+        self._loop = loop
+        self._declare = declare
+        self._watches: dict[str, _Watch] = {}
+
+    def __repr__(self) -> str:
+        return f"<AliveWatches {sorted(self._watches)}>"
+
+    def add(self, key_expr: str, handler: Changed) -> Handle:
+        """Call ``handler`` with every token that exists, appears or disappears."""
+        watch = self._watches.get(key_expr)
+        if watch is None:
+            watch = self._watches[key_expr] = _Watch()
+            watch.handle = self._declare(key_expr, watch.changed)
+        watcher = _Watcher(handler)
+        watch.watchers.append(watcher)
+        if watch.tokens:
+            self._loop.call_soon(watcher.greet, watch.tokens)
+        return Undo(partial(self._remove, key_expr, watch, watcher))
+
+    def _remove(self, key_expr: str, watch: _Watch, watcher: _Watcher) -> None:
+        watcher.gone = True
+        watch.watchers.remove(watcher)
+        if not watch.watchers and watch.handle is not None:
+            watch.handle.close()
+            del self._watches[key_expr]
+
+
+class _Watcher:
+    def __init__(self, handler: Changed) -> None:
+        self._handler = handler
+        self._told: set[str] = set()
+        self.gone = False
+
+    def greet(self, tokens: set[str]) -> None:
+        """Tell of the tokens that are there, and that it was not told of yet."""
+        for key in tuple(tokens):
+            if key not in self._told:
+                self.tell(key, True)
+
+    def tell(self, key: str, alive: bool) -> None:
+        if self.gone:
+            return
+        (self._told.add if alive else self._told.discard)(key)
+        try:
+            self._handler(key, alive)
+        except Exception:
+            log.exception("a handler failed")
+
+
+class _Watch:
+    """The tokens of one expression, and who watches them."""
+
+    def __init__(self) -> None:
+        self.handle: Handle | None = None
+        self.tokens: set[str] = set()
+        self.watchers: list[_Watcher] = []
+
+    def changed(self, key: str, alive: bool) -> None:
+        (self.tokens.add if alive else self.tokens.discard)(key)
+        for watcher in tuple(self.watchers):
+            watcher.tell(key, alive)

@@ -15,7 +15,7 @@ from tests.simulated import simulated
 from zbridge.app import Gateway, plan
 from zbridge.bus import BusSettings
 from zbridge.bus.zenoh import ZenohBus, zenoh_config
-from zbridge.bus.zenoh.session import open_session
+from zbridge.bus.zenoh.opening import open_session
 from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery
 from zbridge.metrics import Metrics

@@ -68,7 +68,7 @@ async def together(monkeypatch: pytest.MonkeyPatch, host: HostSettings | None = 
     async def open_bus(*_: object, **__: object) -> Bus:
         return bus
 
-    monkeypatch.setattr("zbridge.app.gateway.open_bus", open_bus)
+    monkeypatch.setattr("zbridge.app.joining.open_bus", open_bus)
     served = Together({name: planned(name) for name in NAMES}, host or HostSettings(together=True))
     running = asyncio.create_task(served.run())
     await asyncio.sleep(0.5)

@@ -191,6 +191,9 @@ class AlfRobot(Robot):
     def stop(self, now: float, until: float) -> None:
         self._send(self._neutral(), now, urgent=True)
 
+    def stop_frames(self) -> tuple[bytes, ...]:
+        return (self._session.encode(self._neutral()),) if self._session is not None else ()
+
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"an ALF vehicle cannot be asked for its {topic.path}")
 

@@ -193,6 +193,12 @@ class Wc2EcRobot(Robot):
             for device in self._table.motors(ROTATIONAL):
                 self._set_motor(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
+    def stop_frames(self) -> tuple[bytes, ...]:
+        if self._dialect is not Dialect.DEPLOYED:
+            return ()
+        session, motors = self._connected(), self._table.motors(ROTATIONAL)
+        return tuple(session.encode(SetValue(device.type, device.number, 0.0)) for device in motors)
+
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"a Webots robot cannot be asked for its {topic.path}")
 

@@ -34,6 +34,7 @@ from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
+from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
 
@@ -53,11 +54,12 @@ _RIVALS = "rivals"
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this process, shared by all parts.
+    metrics, sessions, conditions: of this process, shared by all parts. observer: is told of the robot's links.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, observer: Observer | None = None) -> None:
         self._plan = plan
+        self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
@@ -176,6 +178,7 @@ class Gateway:
             audit=audit,
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
+            observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 

@@ -76,6 +76,13 @@ class Robot(ABC):
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
+    def stop_frames(self) -> tuple[bytes, ...]:
+        """Give the frames of a stop as the driving session would write them now; change nothing.
+
+        Somebody else writes them if this process dies. Empty: nobody can stop the robot then.
+        """
+        return ()
+
     @abstractmethod
     def ask(self, topic: Topic) -> None:
         """Ask the robot for what it publishes on ``topic``; raise Refused if it cannot be asked."""

@@ -18,7 +18,7 @@ from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.session import Session, State, Tap
 from zbridge.protocol.session_table import Backoff, SessionTable
-from zbridge.transport import Conversation
+from zbridge.transport import Conversation, Link
 
 log = logging.getLogger("zbridge.link")
 
@@ -51,6 +51,8 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called before a frame is written: a stop may have to be written first."""
     stalled: Callable[[bool], object] = lambda stalled: None
     """Called when the link stops taking bytes (True), and when it takes them again (False)."""
+    linked: Callable[[Link, bool], object] = lambda link, up: None
+    """Called when a link is up (True), and when it is gone (False)."""
 
 
 class Links:
@@ -169,6 +171,7 @@ class Connection:
             clock=hooks.clock,
             before=hooks.before,
             stalled=hooks.stalled,
+            linked=hooks.linked,
         )
         self._set_state("connecting", None)
         self.conversation = conversation

@@ -28,10 +28,11 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Robot
-from zbridge.protocol.session import Session
+from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connect, Connection, Hooks, Links
+from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
@@ -66,11 +67,13 @@ class Device:
         conditions: Conditions | None = None,
         idle_stop_s: float = IDLE_STOP_S,
         connect: Connect = connect,
+        observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         loop = asyncio.get_running_loop()
         clock, conditions = clock or loop.time, conditions or Conditions()
+        self._observer = observer or Nobody()
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
@@ -79,6 +82,7 @@ class Device:
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)
         self._enforcer = Enforcer(context, authority, self._standstill, audit, limits)
+        self._enforcer.settled = self._observer.changed
         self._leases = LeaseServer(context, self._enforcer)
         self._commands = Commands(context, self._enforcer)
         self._queries = Queries(context, self._commands, pending)
@@ -95,7 +99,7 @@ class Device:
             session=partial(self._session, name, str(address)),
             deliver=self._telemetry.deliver,
             session_changed=presence.session_changed,
-            state_changed=presence.publish_status,
+            state_changed=self._state_changed,
             connect=connect,
             manager=sessions,
             malformed=context.metrics.count("malformed"),
@@ -103,6 +107,7 @@ class Device:
             clock=context.clock,
             before=self._enforcer.keep_time,
             stalled=partial(presence.stalled, name),
+            linked=partial(self._observer.linked, name),
         )
 
     def __repr__(self) -> str:
@@ -114,6 +119,7 @@ class Device:
         self._presence.publish_status()
         self._enforcer.report()
         self._standstill.begin()
+        self._observer.began(self)
         declared = [
             *self._leases.serve(),
             context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
@@ -134,6 +140,33 @@ class Device:
     def reached(self) -> bool:
         """Whether the robot was ever reached."""
         return self._presence.reached
+
+    def last_stop(self) -> LastStop:
+        """Give what stops the robot now; see :class:`LastStop`."""
+        authority, session, state = self._enforcer.authority, self._context.robot.driving, self._links.first.state
+        driven = authority.driven or authority.moving
+        if session is None or session.state is not State.ESTABLISHED:
+            return LastStop(driven, state=state)
+        try:
+            frames = self._context.robot.stop_frames()
+        except Refused:
+            frames = ()
+        except Exception as error:
+            self._context.faults.note("stop", error)
+            frames = ()
+        stop = tuple(StopFrame(bytes(frame), type(frame) is Datagram) for frame in frames)
+        return LastStop(driven, stop, session.outbox.gap_s, state)
+
+    def boundary(self, name: str) -> Boundary:
+        """Give where the stream of a link stands; see :class:`Boundary`."""
+        conversation = next((each.conversation for each in self._links if each.name == name), None)
+        if conversation is None:
+            return Boundary(outgoing=False, incoming=False)
+        return Boundary(not conversation.stalled, conversation.session.between_frames)
+
+    def _state_changed(self) -> None:
+        self._presence.publish_status()
+        self._observer.changed()
 
     def refuse(self, command: str, refusal: Refused, who: str) -> None:
         """Show on ``control`` what was refused to somebody."""
@@ -169,6 +202,7 @@ class Device:
         self._presence.publish_status()
         self._standstill.close()
         self._enforcer.close()
+        self._observer.ended()
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 await self._context.bus.flush()

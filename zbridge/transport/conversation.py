@@ -53,6 +53,7 @@ class Conversation:
     all is acknowledged, before the next write.
     ``refused`` is told which datagrams in the peer's name did not come from the peer.
     ``may_warn(kind)`` says whether a warning of this kind may be logged now.
+    ``linked`` is called with the link and True when the link is up, and False when it is gone.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
@@ -71,8 +72,11 @@ class Conversation:
         clock: Callable[[], float] | None = None,
         before: Callable[[], object] = lambda: None,
         stalled: Callable[[bool], object] = lambda stalled: None,
+        linked: Callable[[Link, bool], object] = lambda link, up: None,
     ) -> None:
         self.session = session
+        self._linked = linked
+        self._observed: Link | None = None
         self._before = before
         self._on_stall = stalled
         self.blocked = False
@@ -99,7 +103,8 @@ class Conversation:
     @_then_pump
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
-        self._link = link
+        self._link = self._observed = link
+        self._linked(link, True)
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -155,7 +160,9 @@ class Conversation:
     @_then_pump
     def lost(self, reason: str) -> None:
         """End: the link is gone."""
-        self._link = None
+        if self._observed is not None:
+            self._linked(self._observed, False)
+        self._link = self._observed = None
         self.session.lost(reason)
 
     def pump(self) -> None:

@@ -8,6 +8,7 @@ class FakeLink:
 
     def __init__(self, peer: str = "tcp://robot.test:1") -> None:
         self.peer = peer
+        self.descriptors: tuple[int, ...] = ()
         self.ready = True
         self.silent_s = 0.0
         self.unacknowledged_s = 0.0

@@ -49,6 +49,10 @@ class Link(Protocol):
     peer: str
 
     @property
+    def descriptors(self) -> tuple[int, ...]:
+        """File descriptors: of the stream, then of the datagrams where there are any. Empty while there is no link."""
+
+    @property
     def ready(self) -> bool:
         """Whether the link takes a write now; if not, :meth:`Receiver.writable` is called when it does."""
 

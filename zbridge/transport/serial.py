@@ -59,6 +59,11 @@ class SerialLink:
         self._receiver.attached(self)
 
     @property
+    def descriptors(self) -> tuple[int, ...]:
+        """The line's file descriptor."""
+        return (self._fd,) if self._open else ()
+
+    @property
     def ready(self) -> bool:
         """Whether the driver takes what is written."""
         return self._open and self._close_by is None and not self._unwritten

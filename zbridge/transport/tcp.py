@@ -73,6 +73,15 @@ class TcpLink(asyncio.BufferedProtocol):
         return f"<TcpLink {self.peer or 'unconnected'}>"
 
     @property
+    def descriptors(self) -> tuple[int, ...]:
+        """File descriptors of the stream, and of our own socket for datagrams where there is one."""
+        if self._transport is None:
+            return ()
+        stream: int = self._transport.get_extra_info("socket").fileno()
+        datagrams = self._datagrams.fileno() if self._datagrams is not None else -1
+        return tuple(number for number in (stream, datagrams) if number >= 0)
+
+    @property
     def ready(self) -> bool:
         """Whether the kernel took all that was written."""
         return self._transport is not None and not self._held_back

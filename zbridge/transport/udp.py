@@ -45,6 +45,10 @@ class _DatagramReader:
         self._socket = sock
         self._loop.add_reader(sock.fileno(), self._read)
 
+    def fileno(self) -> int:
+        """Give the socket's file descriptor; -1 while it is closed."""
+        return self._socket.fileno() if self._socket is not None else -1
+
     def drain(self) -> None:
         """Read all datagrams that wait."""
         self._read(_DRAINED)

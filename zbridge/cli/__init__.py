@@ -15,18 +15,21 @@ import os
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
+
+if TYPE_CHECKING:  # loaded where there is a supervisor only
+    from zbridge.app.supervisor.child import Reporter
 
 
 def main() -> None:
     """Run the command line; print a ZbridgeError as one line on stderr."""
     try:
         match sys.argv[1:]:
-            case ["run", file] if not file.startswith("-"):
+            case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
                 run_gateway(Path(file))
             case _:
                 from zbridge.cli.app import app
@@ -48,18 +51,27 @@ def run_only(protocol: str) -> None:
         give_up(2, error)
 
 
-def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -> None:
-    """Run the gateway of a configuration until SIGTERM or SIGINT."""
-    set_up_log(verbose=verbose)
+def run_gateway(
+    file: Path, *, only: str | None = None, verbose: bool = False, reporter: Reporter | None = None
+) -> None:
+    """Run the gateway of a configuration until SIGTERM or SIGINT; ``reporter``: tells its supervisor, if it has one."""
+    if reporter is None:
+        set_up_log(verbose=verbose)
     plan = load(file)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
-    gateway = Gateway(plan)
+    gateway = Gateway(plan, reporter)
+
+    async def work() -> None:
+        if reporter is not None:
+            reporter.begin()
+        await until_signal(gateway.run())
+
     try:
-        run_loop(until_signal(gateway.run()))
+        run_loop(work())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
@@ -76,10 +88,11 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
     return uvloop.run(work)
 
 
-def set_up_log(*, verbose: bool, level: int = logging.INFO) -> None:
-    """Log to stderr from ``level`` on; ``verbose`` logs every frame."""
+def set_up_log(*, verbose: bool, level: int = logging.INFO, robot: str = "") -> None:
+    """Log to stderr from ``level`` on; ``verbose`` logs every frame. ``robot``: stands in every line, if given."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(LineFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    whose = f"{robot.replace('%', '%%')}: " if robot else ""
+    handler.setFormatter(LineFormatter(f"%(asctime)s %(levelname)-7s {whose}%(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if verbose else level, handlers=[handler])
 
 

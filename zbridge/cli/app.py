@@ -38,9 +38,20 @@ Connect = Annotated[
 
 
 @app.command()
-def run(file: File, verbose: Verbose = False) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT."""
-    run_gateway(file, verbose=verbose)
+def run(
+    files: Annotated[
+        list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
+    ],
+    watch: Annotated[bool, typer.Option("--watch", help="follow files that come, change or go")] = False,
+    verbose: Verbose = False,
+) -> None:
+    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each."""
+    if len(files) == 1 and not files[0].is_dir() and not watch:
+        run_gateway(files[0], verbose=verbose)
+        return
+    from zbridge.cli.supervise import supervise
+
+    supervise(tuple(files), watch=watch, verbose=verbose)
 
 
 @app.command()

@@ -141,10 +141,19 @@ class Device:
         """Whether the robot was ever reached."""
         return self._presence.reached
 
+    @property
+    def driven(self) -> bool:
+        """Whether a program drives the robot, or told it to move by itself."""
+        return self._enforcer.authority.driven or self._enforcer.authority.moving
+
+    @property
+    def state(self) -> str:
+        """The state of the robot, as on ``status``."""
+        return self._links.first.state
+
     def last_stop(self) -> LastStop:
         """Give what stops the robot now; see :class:`LastStop`."""
-        authority, session, state = self._enforcer.authority, self._context.robot.driving, self._links.first.state
-        driven = authority.driven or authority.moving
+        session, driven, state = self._context.robot.driving, self.driven, self.state
         if session is None or session.state is not State.ESTABLISHED:
             return LastStop(driven, state=state)
         try:

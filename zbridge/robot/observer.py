@@ -45,6 +45,14 @@ class Boundary(msgspec.Struct, frozen=True):
 class Observed(Protocol):
     """A device, as an observer sees it."""
 
+    @property
+    def driven(self) -> bool:
+        """Whether a program drives the robot, or told it to move by itself."""
+
+    @property
+    def state(self) -> str:
+        """The state of the robot, as on ``status``."""
+
     def last_stop(self) -> LastStop:
         """Give what stops the robot now."""
 

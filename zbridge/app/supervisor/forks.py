@@ -12,8 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import zbridge
-from zbridge.app.supervisor.installation import Stamp
+from zbridge.app.supervisor.installation import HOME, Stamp
 from zbridge.app.supervisor.messages import Fork, Forked, Message, Ready
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.errors import NotReady
@@ -192,5 +191,5 @@ async def _started(command: Sequence[str], stamp: Stamp) -> _Server:
 
 def fork_server_command() -> list[str]:
     """Give the command that starts a fork server of the installed code; its last argument is still missing."""
-    here = Path(zbridge.__file__).parents[1] == Path.cwd()
+    here = Path.cwd() == HOME.parent  # the folder is searched for modules then
     return [sys.executable, *([] if here else ["-P"]), "-m", "zbridge.cli.fork_server"]

@@ -8,9 +8,10 @@ import time
 from importlib.util import find_spec
 from pathlib import Path
 
-import zbridge
 from zbridge.protocol.plugin import GROUP
 
+HOME = Path(__file__).parents[2]
+"""The folder of zbridge's code."""
 SETTLED_S = 2.0
 """Seconds for which nothing must have changed: an installer writes file after file."""
 
@@ -43,7 +44,7 @@ class Stamp:
 
 def _files() -> list[Path]:
     """List the code of zbridge and of the protocols, and the names of what is installed beside it."""
-    roots = {Path(zbridge.__file__).parent, *_protocol_packages()}
+    roots = {HOME, *_protocol_packages()}
     sources = [path for root in roots for path in root.rglob("*.py")]
     return sorted({*sources, *(path for folder in sys.path for path in Path(folder).glob("*.dist-info"))})
 

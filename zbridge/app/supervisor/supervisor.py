@@ -64,6 +64,7 @@ class Supervisor:
         self._timer: asyncio.TimerHandle | None = None
         self._told: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
+        self._all_started = False
         self._is_ready = False
 
     def __repr__(self) -> str:
@@ -85,6 +86,8 @@ class Supervisor:
                 self._run(task)
             self._look_at_hearts()
             await self._apply(compare({}, files), first=True)
+            self._all_started = True
+            self._state_changed()
             await asyncio.Event().wait()
         finally:
             await asyncio.shield(self._end())
@@ -216,7 +219,7 @@ class Supervisor:
         self._told = None
         self._systemd.tell(f"STATUS={self.status}")
         beaten = all(runner.process is not None and runner.process.heart.beats for runner in self._runners.values())
-        if beaten and not self._is_ready:
+        if beaten and self._all_started and not self._is_ready:
             self._is_ready = True
             log.info("ready: %s", self.status)
             self._systemd.tell("READY=1")

@@ -3,9 +3,9 @@
     python -m tests.e2e.crashes                       # all robots and ways, 30 times each; about ten minutes
     python -m tests.e2e.crashes --times 3 --robots alf --ways killed --out crashes.jsonl
 
-One supervisor (``zbridge run DIR``) runs all gateways. Each repetition has a fragile robot of its own, in a process that
-tells its commanded motion (:mod:`tests.e2e.fragile`), a robot file that comes while the supervisor runs, and a driver on
-the bus. When the robot moves, its gateway
+One supervisor (``zbridge run DIR``) runs all gateways. Each repetition has a fragile robot of its own, in a process
+that tells its commanded motion (:mod:`tests.e2e.fragile`), a robot file that comes while the supervisor runs, and a
+driver on the bus. When the robot moves, its gateway
 
 hung: blocks its event loop for good;
 frozen: is stopped (SIGSTOP);

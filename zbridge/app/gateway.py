@@ -66,6 +66,8 @@ class Gateway:
         self.metrics = Metrics()
         self.sessions = SessionTable()
         self.conditions = Conditions()
+        self._on_the_bus = False
+        self._device_served: Device | None = None
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
@@ -82,7 +84,8 @@ class Gateway:
     async def _run(self, bus: Bus, audit: Audit) -> None:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
-                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
+                stack.callback(bus.watch_connected(self._on_bus).close)
+                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics, self.missing))
             robot = RobotSubscription(bus, self._keys, self.metrics)
             work: list[Coroutine[Any, Any, None]] = [
                 Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
@@ -96,6 +99,17 @@ class Gateway:
             else:
                 stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
             await together(*work)
+
+    def missing(self) -> tuple[str, ...]:
+        """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
+        reasons = [] if self._on_the_bus else ["no bus"]
+        if self._plan.device is not None:
+            state = self._device_served.state if self._device_served is not None else "served by another gateway"
+            reasons += [f"robot {state}"] * (state != "established")
+        return tuple(reasons)
+
+    def _on_bus(self, connected: bool) -> None:
+        self._on_the_bus = connected
 
     def _listener_names(self, bus: Bus) -> list[str]:
         """Return the names of the listeners on the bus: as configured, else unique by the id of the bus session."""
@@ -132,6 +146,7 @@ class Gateway:
 
     async def _serve(self, ownership: Ownership, device: Device) -> None:
         """Serve the robot until another gateway has to take it."""
+        self._device_served = device
         serving = asyncio.ensure_future(device.run())
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
@@ -143,6 +158,7 @@ class Gateway:
             for task in (serving, watching):
                 task.cancel()
             await asyncio.shield(asyncio.gather(serving, watching, return_exceptions=True))
+            self._device_served = None
             self.conditions.set(_RIVALS, None)
 
     def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:

@@ -205,6 +205,24 @@ def ls(
 
 
 @app.command()
+def health(
+    robot: Annotated[str, typer.Argument(help="the robot's name; without it: all robots", show_default=False)] = "",
+    connect: Connect = [],
+    realm: Realm = "fleet",
+    json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
+    from zbridge.cli.health import report_health
+
+    set_up_log(verbose=False, level=logging.CRITICAL)
+    if robot:
+        check_name("ROBOT", robot)
+    code = run_loop(report_health(bus_settings(connect), realm, robot or None, as_json=json))
+    if code:
+        raise typer.Exit(code)
+
+
+@app.command()
 def echo(
     key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
     connect: Connect = [],

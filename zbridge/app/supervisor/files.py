@@ -121,11 +121,10 @@ class Follower:
         shown = {file.path: file.content for file in seen}
         steady = [file for file in seen if not twice or self._shown.get(file.path) == file.content]
         waiting = {path: running[path] for path in shown if path in running and path not in {f.path for f in steady}}
-        just_gone = {
-            path: file for path, file in running.items() if twice and path not in shown and path in self._shown
-        }
+        if twice:
+            waiting |= {path: file for path, file in running.items() if path in self._shown and path not in shown}
         self._shown = shown
-        changes = compare(running, [*steady, *waiting.values(), *just_gone.values()])
+        changes = compare(running, [*steady, *waiting.values()])
         return msgspec.structs.replace(changes, faulty=tuple(self._new_faults(changes.faulty)))
 
     def _again(self, path: Path, running: RobotFile | None) -> RobotFile:

@@ -5,6 +5,7 @@ Never waits: a message that finds no room is not sent. A message holds at most :
 
 from __future__ import annotations
 
+import array
 import os
 import socket
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from zbridge.app.supervisor.messages import Message
 MESSAGE_BYTES = 64 * 1024
 DESCRIPTORS = 4
 """Most file descriptors of one message."""
+_DESCRIPTOR = array.array("i")
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(Message).decode
 
@@ -67,11 +69,15 @@ class Post:
         cannot be read; its descriptors are closed.
         """
         try:
-            data, descriptors, _, _ = socket.recv_fds(self._socket, MESSAGE_BYTES, DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
+            # socket.recv_fds ignores its flags in Python 3.11.
+            data, sent, _, _ = self._socket.recvmsg(
+                MESSAGE_BYTES, socket.CMSG_LEN(DESCRIPTORS * _DESCRIPTOR.itemsize), socket.MSG_CMSG_CLOEXEC
+            )
         except ConnectionError:
             return None
         if not data:
             return None
+        descriptors = _descriptors(sent)
         try:
             return _decode(data), descriptors
         except msgspec.MsgspecError as error:
@@ -81,6 +87,14 @@ class Post:
     def close(self) -> None:
         """Close this end; idempotent."""
         self._socket.close()
+
+
+def _descriptors(sent: Sequence[tuple[int, int, bytes]]) -> list[int]:
+    found = array.array("i")
+    for level, kind, data in sent:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+            found.frombytes(data[: len(data) - len(data) % found.itemsize])
+    return list(found)
 
 
 def close_all(descriptors: Sequence[int]) -> None:

@@ -59,6 +59,14 @@ class Reporter:
         self._loop.add_reader(self._post.fileno(), self._hear)
         self._beat()
 
+    def close(self) -> None:
+        """Tell nothing more; idempotent. The supervisor sees the end of the process."""
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._post.fileno() >= 0:
+            self._loop.remove_reader(self._post.fileno())
+            self._post.close()
+
     async def start_successor(self, far_end: socket.socket) -> None:
         """Ask for a process that takes over from ``far_end``; raise NotReady with the reason if none is started."""
         self._answer = self._loop.create_future()

@@ -39,13 +39,17 @@ class _Server:
         for name in _NOT_INHERITED:
             environment.pop(name, None)
         with far:
-            self._process = subprocess.Popen(
-                [*command, str(far.fileno())],
-                pass_fds=[far.fileno()],
-                stdin=subprocess.DEVNULL,
-                env=environment,
-                start_new_session=True,
-            )
+            try:
+                self._process = subprocess.Popen(
+                    [*command, str(far.fileno())],
+                    pass_fds=[far.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=environment,
+                    start_new_session=True,
+                )
+            except OSError:
+                self._post.close()
+                raise
         self.alive = True
         asyncio.get_running_loop().add_reader(self._post.fileno(), self._hear)
 

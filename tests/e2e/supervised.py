@@ -29,14 +29,21 @@ FORKS = "forks"
 class Supervised:
     """A running supervisor: ``zbridge run FOLDER``, or that of this module (``hangs``). Its log goes to a file."""
 
-    def __init__(self, stack: contextlib.ExitStack, folder: Path, *more: str, hangs: bool = False) -> None:
+    def __init__(
+        self,
+        stack: contextlib.ExitStack,
+        folder: Path,
+        *more: str,
+        hangs: bool = False,
+        environment: dict[str, str] | None = None,
+    ) -> None:
         self.folder = folder
         self._log = folder.with_suffix(".log")
         command = (
             module("supervised", folder) if hangs else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
         )
         with self._log.open("ab") as log:
-            self.process = subprocess.Popen(command, stdout=log, stderr=log, text=True, cwd=ROOT)
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, text=True, cwd=ROOT, env=environment)
         stack.callback(end, self.process)
 
     @property

@@ -14,13 +14,13 @@ def test_systemd_is_told_where_it_asked_for_it(tmp_path: Path, abstract: bool) -
     name = f"@{tmp_path}/notify" if abstract else str(tmp_path / "notify")
     with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as systemd:
         systemd.bind("\0" + name[1:] if abstract else name)
-        Systemd({"NOTIFY_SOCKET": name}).tell("READY=1", "STATUS=8 robots")
+        assert Systemd({"NOTIFY_SOCKET": name}).tell("READY=1", "STATUS=8 robots")
         assert systemd.recv(100) == b"READY=1\nSTATUS=8 robots"
 
 
 def test_nobody_is_told_where_nobody_asked(tmp_path: Path) -> None:
-    Systemd({}).tell("READY=1")
-    Systemd({"NOTIFY_SOCKET": str(tmp_path / "gone")}).tell("READY=1")
+    assert Systemd({}).tell("READY=1")
+    assert not Systemd({"NOTIFY_SOCKET": str(tmp_path / "gone")}).tell("READY=1")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 from collections.abc import Mapping
@@ -21,9 +20,13 @@ class Systemd:
     def __repr__(self) -> str:
         return f"<Systemd {self._address or 'absent'}>"
 
-    def tell(self, *lines: str) -> None:
-        """Send lines such as ``READY=1`` and ``STATUS=8 robots``."""
+    def tell(self, *lines: str) -> bool:
+        """Send lines such as ``READY=1`` and ``STATUS=8 robots``; False if they found no room."""
         if self._address:
-            with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
-                end.setblocking(False)
-                end.sendto("\n".join(lines).encode(), self._address)
+            try:
+                with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+                    end.setblocking(False)
+                    end.sendto("\n".join(lines).encode(), self._address)
+            except OSError:
+                return False
+        return True

@@ -36,6 +36,8 @@ LATE_S = 0.05
 """A timer that fires so much later was held up by the machine."""
 STATUS_S = 1.0
 """Least time between two status lines."""
+READY_S = 0.2
+"""The same until the service is ready."""
 FORKED_S = 5.0
 """Seconds between two attempts to start a fork server."""
 JITTER = 0.5
@@ -213,16 +215,18 @@ class Supervisor:
 
     def _state_changed(self) -> None:
         if self._told is None:
-            self._told = asyncio.get_running_loop().call_later(STATUS_S if self._is_ready else 0.0, self._tell)
+            delay_s = STATUS_S if self._is_ready else READY_S
+            self._told = asyncio.get_running_loop().call_later(delay_s, self._tell)
 
     def _tell(self) -> None:
         self._told = None
-        self._systemd.tell(f"STATUS={self.status}")
         beaten = all(runner.process is not None and runner.process.heart.beats for runner in self._runners.values())
-        if beaten and self._all_started and not self._is_ready:
+        ready = ("READY=1",) if beaten and self._all_started and not self._is_ready else ()
+        if not self._systemd.tell(*ready, f"STATUS={self.status}"):
+            self._state_changed()  # again, later
+        elif ready:
             self._is_ready = True
             log.info("ready: %s", self.status)
-            self._systemd.tell("READY=1")
 
     @property
     def status(self) -> str:

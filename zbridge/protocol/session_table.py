@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Any
+from typing import Any, ClassVar
 
 from zbridge.fleet.messages import SessionEntry
+from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Session
 
 REMEMBERED = 32
@@ -35,8 +36,10 @@ class Backoff:
         self._next_s = self._first_s
 
 
-class ClientIds:
+class ClientIds(Kept):
     """The ids that a robot gives its clients: the lowest free one; a released id is not given again for ``quiet_s``."""
+
+    kept: ClassVar[dict[str, Any]] = {"_free_at": dict[int, float]}
 
     def __init__(self, ids: range, quiet_s: float) -> None:
         self._quiet_s = quiet_s

@@ -19,8 +19,11 @@ from typing import cast
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address
+from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
-from zbridge.transport.link import STALLED_S, Receiver
+from zbridge.transport.door import Door
+from zbridge.transport.link import NOBODY, STALLED_S, Receiver
+from zbridge.transport.parcel import Parcel
 from zbridge.transport.udp import DatagramHub, DatagramSocket
 
 log = logging.getLogger("zbridge.link")
@@ -56,10 +59,18 @@ class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
     ``buffer``: where reads of an accepted peer go. Reads are copied at once, so all links of a loop may share it.
+    ``given_udp``: the socket for datagrams to a robot, where another process handed the connection over.
     """
 
-    def __init__(self, receiver: Receiver, hub: DatagramHub | None = None, buffer: bytearray | None = None) -> None:
+    def __init__(
+        self,
+        receiver: Receiver,
+        hub: DatagramHub | None = None,
+        buffer: bytearray | None = None,
+        given_udp: socket.socket | None = None,
+    ) -> None:
         self.peer = ""
+        self._given_udp = given_udp
         self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = buffer is not None
@@ -140,6 +151,35 @@ class TcpLink(asyncio.BufferedProtocol):
         if self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
 
+    @property
+    def stays(self) -> str | None:
+        """Why this connection cannot be handed over: a tls connection has keys that no other process knows."""
+        tls = self._transport is not None and self._transport.get_extra_info("ssl_object") is not None
+        return "a tls connection cannot be handed over" if tls else None
+
+    def hold(self) -> None:
+        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`go_on`."""
+        self.pause()
+        if self._datagrams is not None:
+            self._datagrams.hold()
+
+    def go_on(self) -> None:
+        """Read again, after :meth:`hold`."""
+        self.resume()
+        if self._datagrams is not None:
+            self._datagrams.go_on()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the sockets into a parcel. What the kernel has is sent by the kernel."""
+        assert self._transport is not None
+        udp = parcel.put(self._datagrams.fileno()) if self._datagrams is not None else None
+        return {"tcp": parcel.put(self._transport.get_extra_info("socket").fileno()), "udp": udp}
+
+    def release(self) -> None:
+        """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
+        self._receiver = NOBODY
+        self.abort()
+
     def close(self) -> None:
         """Close the connection after what was written, within :data:`CLOSE_S`; idempotent."""
         transport = self._transport
@@ -171,6 +211,8 @@ class TcpLink(asyncio.BufferedProtocol):
         else:
             _bound_retries(sock)
             self._backlog = _new_backlog(sock)
+            if self._given_udp is not None:
+                self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp)
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
@@ -242,7 +284,10 @@ def _new_backlog(sock: socket.socket) -> Backlog | None:
             _unwatched_warned = True
             log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
         return None
-    return Backlog()
+    backlog = Backlog()
+    if unsent := _queued(sock):  # of the process that had the connection before
+        backlog.written(unsent, time.monotonic())
+    return backlog
 
 
 def _outstanding(transport: asyncio.Transport) -> int:
@@ -272,26 +317,37 @@ async def connect(address: Address, receiver: Receiver) -> TcpLink:
     return link
 
 
+async def take_over(given: Exported, parcel: Parcel, receiver: Receiver) -> TcpLink:
+    """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError."""
+    sock = socket.socket(fileno=parcel.take(given.get("tcp")))
+    sock.setblocking(False)
+    udp = socket.socket(fileno=parcel.take(given["udp"])) if given.get("udp") is not None else None
+    loop = asyncio.get_running_loop()
+    _, link = await loop.create_connection(lambda: TcpLink(receiver, given_udp=udp), sock=sock)
+    return link
+
+
 @contextlib.asynccontextmanager
 async def listen(
-    address: Address, receiver: Callable[[], Receiver], *, datagrams: bool = False, foreign: Count | None = None
+    address: Address,
+    receiver: Callable[[], Receiver],
+    *,
+    datagrams: bool = False,
+    foreign: Count | None = None,
+    door: Door | None = None,
 ) -> AsyncIterator[Address]:
     """Accept peers, each with a receiver of its own; give the address that is bound, with its port.
 
-    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. Raise LinkError if
-    the address cannot be bound.
+    ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. ``door``: keeps
+    the sockets, for who shuts it or hands them over. Raise LinkError if the address cannot be bound.
     """
-    loop = asyncio.get_running_loop()
+    door = door or Door()
     hub = DatagramHub(foreign or Count()) if datagrams else None
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
-            server = await loop.create_server(lambda: TcpLink(receiver(), hub, buffer), address.host, address.port)
-            await stack.enter_async_context(server)
-            host, port = server.sockets[0].getsockname()[:2]
-            if hub is not None:
-                hub.open(host, port)
-                stack.callback(hub.close)
+            stack.callback(door.close)
+            bound = await door.bind(address, receiver, lambda each: TcpLink(each, hub, buffer), hub)
         except OSError as error:
             raise LinkError(f"{address}: {error.strerror or error}") from error
-        yield Address(host, port)
+        yield bound

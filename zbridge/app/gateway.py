@@ -13,29 +13,38 @@ import logging
 import math
 import secrets
 import signal
+import socket
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from zbridge.app.config import Plan
+from zbridge.app.handover import Incoming, Outgoing, Part, Successor
+from zbridge.app.handover.claim import ClaimPart
+from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
+from zbridge.control.gate import NameGate
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import BusError, Held
+from zbridge.errors import BusError, Held, NotReady, Refused, Unsupported, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Sessions
+from zbridge.fleet.messages import Query, Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
+from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -53,11 +62,24 @@ _RIVALS = "rivals"
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this process, shared by all parts.
+    metrics, sessions, conditions: of this process, shared by all parts. predecessor: the channel to a gateway that
+    hands everything over. successor: starts the process to which this gateway can be handed over.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(
+        self, plan: Plan, *, predecessor: socket.socket | None = None, successor: Successor | None = None
+    ) -> None:
         self._plan = plan
+        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self._successor = successor
+        self._parts: list[Part] = []
+        """What a successor would be handed."""
+        self._device: Device | None = None
+        self._claim: ClaimPart | None = None
+        self._metrics_sockets: list[socket.socket] = []
+        self._restarts = asyncio.Lock()
+        self.gone = asyncio.Event()
+        """Set when a successor serves everything."""
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
@@ -69,23 +91,30 @@ class Gateway:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
-        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
+        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
+
+        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        """
         with self._audit() as audit:
             bus = await self._open_bus()
             try:
                 await self._run(bus, audit)
+            except Exception as error:
+                if self._incoming is not None and not self._incoming.begun.is_set():
+                    self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))
+                raise
             finally:
                 self.left = await bus.close()
 
     async def _run(self, bus: Bus, audit: Audit) -> None:
+        if self._incoming is not None:
+            await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
-            if self._plan.metrics is not None:
-                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
             robot = RobotSubscription(bus, self._keys, self.metrics)
-            work: list[Coroutine[Any, Any, None]] = [
-                Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
-                for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
-            ]
+            listeners = self._listeners(bus, robot)
+            taken = self._incoming.taken if self._incoming is not None else None
+            work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
+            self._parts = [listener.handover for listener in listeners]
             if work:
                 robot.open()
                 stack.callback(robot.close)
@@ -93,7 +122,99 @@ class Gateway:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
                 stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
-            await together(*work)
+            if self._plan.metrics is not None:
+                work.append(self._serve_metrics(self._plan.metrics))
+            await until(self.gone, together(*work))
+
+    async def _serve_metrics(self, address: Address) -> None:
+        """Serve the counters; first of all wait until a predecessor has let go."""
+        given = []
+        if self._incoming is not None:
+            await self._incoming.begun.wait()
+            given = [socket.socket(fileno=self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
+        async with serve_metrics(address, self.metrics, given) as self._metrics_sockets:
+            await asyncio.Event().wait()
+
+    def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
+        plans, incoming = self._plan.listeners, self._incoming
+        given = incoming.given.listeners if incoming is not None else (None,) * len(plans)
+        parcel = incoming.parcel if incoming is not None else None
+        return [
+            Listener(
+                plan,
+                plan.settings.name or (each["name"] if each is not None else name),
+                robot,
+                self.sessions,
+                self.metrics,
+                time.monotonic,
+                (each, parcel) if each is not None and parcel is not None else None,
+            )
+            for plan, name, each in zip(plans, self._listener_names(bus), given, strict=True)
+        ]
+
+    # A restart
+
+    async def restart(self) -> int:
+        """Hand everything to a successor; return its process. Raise Refused with the reason: all is as before then.
+
+        After this the caller must set :attr:`gone`.
+        """
+        if self._successor is None:
+            raise Unsupported("nothing starts a successor of this process")
+        if self._plan.config.bus.listen:
+            raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
+        if self._restarts.locked() or self.gone.is_set() or not self._begun:
+            raise NotReady("a restart is under way")
+        async with self._restarts:
+            began = time.monotonic()
+            parts: list[Part] = [part for part in (*self._parts, self._device, self._claim) if part is not None]
+            pid = await Outgoing(self._successor, parts, self._describe).run()
+            log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
+            return pid
+
+    async def restart_and_go(self) -> None:
+        """Restart, and end :meth:`run`; log the reason where that is refused."""
+        with contextlib.suppress(Refused):
+            await self.restart()
+            self.gone.set()
+
+    @property
+    def _begun(self) -> bool:
+        return self._incoming is None or self._incoming.begun.is_set()
+
+    def _describe(self, parcel: Parcel) -> Given:
+        given = Given(
+            VERSION,
+            self._plan.setup,
+            0,
+            claim=self._claim.hand_over(parcel) if self._claim is not None else None,
+            device=self._device.hand_over(parcel) if self._device is not None else None,
+            listeners=tuple(part.hand_over(parcel) for part in self._parts),
+            metrics=tuple(parcel.put(sock.fileno()) for sock in self._metrics_sockets),
+        )
+        return msgspec.structs.replace(given, descriptors=len(parcel))
+
+    def _answer_restarts(self, bus: Bus) -> Handle:
+        """Restart for whoever the access rules let ask, and answer when that is done."""
+        tasks: set[asyncio.Task[None]] = set()
+
+        async def restart(question: IncomingQuery) -> None:
+            try:
+                await self.restart()
+            except Refused as refusal:
+                question.refuse(refusal)
+                return
+            question.answer(payloads.encode(Query()))
+            with contextlib.suppress(BusError):
+                await bus.flush()
+            self.gone.set()
+
+        def take(question: IncomingQuery) -> None:
+            task = asyncio.ensure_future(restart(question))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
+
+        return bus.answer(self._keys.key(topics.RPC_RESTART("*").path), take, lane=NameGate(time.monotonic))
 
     def _listener_names(self, bus: Bus) -> list[str]:
         """Return the names of the listeners on the bus: as configured, else unique by the id of the bus session."""
@@ -105,20 +226,40 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        ownership = Ownership(bus, self._keys)
+        ownership, incoming = Ownership(bus, self._keys), self._incoming
+        self._claim = ClaimPart(ownership)
         try:
+            if incoming is not None:
+                given = incoming.given
+                if given.device is not None and given.claim:
+                    ownership.inherit(given.claim)
+                    device = self._make_device(bus, audit, plan)
+                    await device.take_over(given.device, incoming.parcel)
+                    await self._serve_shown(bus, ownership, device, incoming.taken)
+                elif not self._parts:
+                    await incoming.finish()
+                await incoming.begun.wait()
             while True:
                 shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
                 await ownership.take()
                 if shown is not None:
                     shown.close()
-                shown = self._show_sessions(bus, "gateway")
-                try:
-                    await self._serve(ownership, self._device(bus, audit, plan))
-                finally:
-                    shown.close()
+                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan))
         finally:
             ownership.release()
+
+    async def _serve_shown(
+        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
+    ) -> None:
+        """Serve the robot, show the sessions as the gateway's, and answer who asks for a restart."""
+        handles = (self._show_sessions(bus, "gateway"), self._answer_restarts(bus))
+        self._device = device
+        try:
+            await self._serve(ownership, device, begin)
+        finally:
+            self._device = None
+            for handle in handles:
+                handle.close()
 
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer queries for the session table of this process; ``who`` names the process."""
@@ -128,9 +269,9 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, ownership: Ownership, device: Device) -> None:
+    async def _serve(self, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None) -> None:
         """Serve the robot until another gateway has to take it."""
-        serving = asyncio.ensure_future(device.run())
+        serving = asyncio.ensure_future(device.run(begin))
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
@@ -160,7 +301,7 @@ class Gateway:
 
         return tell
 
-    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -230,8 +371,26 @@ async def together(*work: Coroutine[Any, Any, None]) -> None:
         await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
-async def until_signal(work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended."""
+async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
+    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(event.wait()))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until_signal(
+    work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
+) -> None:
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended.
+
+    ``on``: what to run, by signal, while the coroutine runs.
+    """
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []
@@ -242,7 +401,16 @@ async def until_signal(work: Coroutine[Any, Any, None]) -> None:
             task.cancel()
         asked.append(number)
 
+    beside: set[asyncio.Task[None]] = set()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end, number)
+    for other, begin in (on or {}).items():
+        loop.add_signal_handler(other, _start_beside, begin, beside)
     with contextlib.suppress(asyncio.CancelledError):
         await task
+
+
+def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:
+    task = asyncio.ensure_future(begin())
+    tasks.add(task)
+    task.add_done_callback(tasks.discard)

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
@@ -23,22 +23,26 @@ _REQUEST_BYTES = 8192
 
 
 @contextlib.asynccontextmanager
-async def serve_metrics(address: Address, metrics: Metrics) -> AsyncIterator[None]:
+async def serve_metrics(
+    address: Address, metrics: Metrics, given: Sequence[socket.socket] = ()
+) -> AsyncIterator[list[socket.socket]]:
     """Serve ``GET /metrics`` while the context lasts. An address in use is logged as an error and otherwise ignored.
+
+    Gives the sockets at which it listens; ``given``: those of another process, in place of new ones.
 
     Connections are accepted only while fewer than CLIENTS are served: a server of asyncio accepts all at once and
     starves the rest of the process meanwhile.
     """
     try:
-        sockets = await _listen(address)
+        sockets = list(given) or await _listen(address)
     except OSError as error:
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
-        yield
+        yield []
         return
     room = asyncio.Semaphore(CLIENTS)
     tasks = [asyncio.create_task(_accept(each, room, metrics)) for each in sockets]
     try:
-        yield
+        yield sockets
     finally:
         for task in tasks:
             task.cancel()

@@ -87,10 +87,13 @@ class Answer(msgspec.Struct, frozen=True):
 
 
 class Publisher(Protocol):
-    """Writes one key. last: the last value, where the key keeps one."""
+    """Writes one key."""
 
     key: str
-    last: bytes | None
+
+    @property
+    def last(self) -> bytes | None:
+        """The last value, where the key keeps it."""
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         """Publish with the key's delivery, without blocking; False asks to pause the source."""

@@ -12,12 +12,15 @@ import asyncio
 import gc
 import logging
 import os
+import signal
+import socket
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.handover import Spawn
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
@@ -28,6 +31,8 @@ def main() -> None:
         match sys.argv[1:]:
             case ["run", file] if not file.startswith("-"):
                 run_gateway(Path(file))
+            case ["run", file, "--take-over", descriptor] if not file.startswith("-"):
+                run_gateway(Path(file), take_over=int(descriptor))
             case _:
                 from zbridge.cli.app import app
 
@@ -48,8 +53,11 @@ def run_only(protocol: str) -> None:
         give_up(2, error)
 
 
-def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -> None:
-    """Run the gateway of a configuration until SIGTERM or SIGINT."""
+def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, take_over: int | None = None) -> None:
+    """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
+
+    take_over: the descriptor of the channel to the gateway that hands everything over to this process.
+    """
     set_up_log(verbose=verbose)
     plan = load(file)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
@@ -57,11 +65,15 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False) -
         if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
-    gateway = Gateway(plan)
+    predecessor = socket.socket(fileno=take_over) if take_over is not None else None
+    successor = Spawn(file, verbose=verbose)
+    gateway = Gateway(plan, predecessor=predecessor, successor=successor)
     try:
-        run_loop(until_signal(gateway.run()))
+        run_loop(until_signal(gateway.run(), {signal.SIGUSR2: gateway.restart_and_go}))
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
+    if gateway.gone.is_set():
+        successor.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)

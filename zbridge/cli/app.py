@@ -38,9 +38,13 @@ Connect = Annotated[
 
 
 @app.command()
-def run(file: File, verbose: Verbose = False) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT."""
-    run_gateway(file, verbose=verbose)
+def run(
+    file: File,
+    verbose: Verbose = False,
+    take_over: Annotated[int, typer.Option("--take-over", help="descriptor of a gateway that goes", hidden=True)] = -1,
+) -> None:
+    """Run a gateway in the foreground until SIGTERM or SIGINT; SIGUSR2 restarts it under way."""
+    run_gateway(file, verbose=verbose, take_over=take_over if take_over >= 0 else None)
 
 
 @app.command()

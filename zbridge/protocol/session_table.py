@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Collection
 from typing import Any, ClassVar
 
 from zbridge.fleet.messages import SessionEntry
@@ -56,6 +57,12 @@ class ClientIds(Kept):
                 self._free_at[client_id] = math.inf
                 return client_id
         return None
+
+    def keep(self, client_ids: Collection[int], now: float) -> None:
+        """Take back all ids but these: their clients are gone."""
+        for client_id, free_at in self._free_at.items():
+            if free_at == math.inf and client_id not in client_ids:
+                self.release(client_id, now)
 
     def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
         """Take an id back. ``rests`` False: the client never used it, so it is free at once."""

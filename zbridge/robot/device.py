@@ -115,7 +115,7 @@ class Device:
     def __repr__(self) -> str:
         return f"<Device {self._context.keys.robot} {self._links.first.state}>"
 
-    async def run(self, begin: Awaitable[None] | None = None) -> None:
+    async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
 
         Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
@@ -125,8 +125,8 @@ class Device:
             self._show()
         self._declare()
         if begin is not None:
-            await begin
-            self.go_on()
+            await begin()
+            await self.go_on()
             self._show()
         self._standstill.begin()
         async with asyncio.TaskGroup() as tasks:
@@ -145,13 +145,17 @@ class Device:
         self._enforcer.report()
 
     def _declare(self) -> None:
+        self._listen()
+        self._declared = [self._context.bus.watch_connected(self._on_bus), *self._telemetry.serve()]
+
+    def _listen(self) -> None:
+        """Take commands and queries from the bus; idempotent."""
         context = self._context
-        self._commanded = [
+        self._commanded = self._commanded or [
             *self._leases.serve(),
             context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
             *self._queries.serve(),
         ]
-        self._declared = [context.bus.watch_connected(self._on_bus), *self._telemetry.serve()]
 
     @property
     def reached(self) -> bool:
@@ -199,6 +203,9 @@ class Device:
                 raise NotReady("; ".join(f"{each.name}: {each.stays}" for each in self._links if each.stays))
             await asyncio.sleep(_LOOK_S)
 
+    async def shut(self) -> None:
+        """Do nothing: nobody is accepted here."""
+
     def hold(self) -> None:
         """Read and write nothing from now on."""
         for connection in self._links:
@@ -223,8 +230,9 @@ class Device:
         if session is not None and session.state is State.ESTABLISHED:
             self._presence.resume(session)
 
-    def go_on(self) -> None:
+    async def go_on(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""
+        self._listen()
         self._commands.refuse_all(None)
         self._leases.refuse_all(None)
         for connection in self._links:
@@ -232,10 +240,11 @@ class Device:
 
     def withdraw(self) -> None:
         """Take no commands and queries from the bus any more: another process does."""
-        for handle in self._commanded:
+        handles, self._commanded = self._commanded, []
+        for handle in handles:
             handle.close()
 
-    def release(self) -> None:
+    async def release(self) -> None:
         """Give the links up and end :meth:`run`; the robot notices nothing."""
         self._released.set()
         self._standstill.close()

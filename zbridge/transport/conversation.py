@@ -244,6 +244,11 @@ class Conversation:
     # A restart
 
     @property
+    def link(self) -> Link | None:
+        """The connection; None before there is one, and after it."""
+        return self._link
+
+    @property
     def stays(self) -> str | None:
         """Why the conversation cannot be handed to another process now; None where it can."""
         link = self._link

@@ -95,7 +95,7 @@ class Link(Protocol):
         """Put what the connection consists of into a parcel, and describe it; the link must be held and ``ready``."""
 
     def release(self) -> None:
-        """Give up the own end of a connection that another process has now: the peer and the receiver notice nothing."""
+        """Give up a connection that another process has now: neither the peer nor the receiver notices."""
 
     def close(self) -> None:
         """Close the connection after what was written; idempotent."""

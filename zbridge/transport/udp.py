@@ -101,9 +101,7 @@ class _DatagramReader:
 class DatagramSocket(_DatagramReader):
     """A UDP socket to one robot: hears the address and port of the robot, and counts everything else."""
 
-    def __init__(
-        self, transport: asyncio.Transport, receiver: Receiver, given: socket.socket | None = None
-    ) -> None:
+    def __init__(self, transport: asyncio.Transport, receiver: Receiver, given: socket.socket | None = None) -> None:
         """``given``: the socket of another process, that was held."""
         super().__init__()
         self._receiver = receiver

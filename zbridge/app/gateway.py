@@ -19,23 +19,18 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from zbridge.app.config import Plan
-from zbridge.app.handover import Incoming, Outgoing, Part, Successor
-from zbridge.app.handover.claim import ClaimPart
-from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
-from zbridge.control.gate import NameGate
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import BusError, Held, NotReady, Refused, Unsupported, ZbridgeError, describe
+from zbridge.errors import BusError, Held, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Query, Sessions
+from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
@@ -44,7 +39,6 @@ from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
-from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -70,17 +64,10 @@ class Gateway:
         self, plan: Plan, *, predecessor: socket.socket | None = None, successor: Successor | None = None
     ) -> None:
         self._plan = plan
-        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
-        self._successor = successor
-        self._parts: list[Part] = []
-        """What a successor would be handed."""
-        self._device: Device | None = None
-        self._claim: ClaimPart | None = None
-        self._metrics_sockets: list[socket.socket] = []
-        self._restarts = asyncio.Lock()
-        self.gone = asyncio.Event()
-        """Set when a successor serves everything."""
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
+        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self.restarts = Restarts(plan, self._keys, self._incoming, successor)
+        """What a successor would be handed, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
@@ -114,7 +101,7 @@ class Gateway:
             listeners = self._listeners(bus, robot)
             taken = self._incoming.taken if self._incoming is not None else None
             work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
-            self._parts = [listener.handover for listener in listeners]
+            self.restarts.listeners = [listener.handover for listener in listeners]
             if work:
                 robot.open()
                 stack.callback(robot.close)
@@ -124,7 +111,7 @@ class Gateway:
                 stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
             if self._plan.metrics is not None:
                 work.append(self._serve_metrics(self._plan.metrics))
-            await until(self.gone, together(*work))
+            await until(self.restarts.gone, together(*work))
 
     async def _serve_metrics(self, address: Address) -> None:
         """Serve the counters; first of all wait until a predecessor has let go."""
@@ -132,7 +119,7 @@ class Gateway:
         if self._incoming is not None:
             await self._incoming.begun.wait()
             given = [socket.socket(fileno=self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
-        async with serve_metrics(address, self.metrics, given) as self._metrics_sockets:
+        async with serve_metrics(address, self.metrics, given) as self.restarts.metrics_sockets:
             await asyncio.Event().wait()
 
     def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
@@ -152,70 +139,6 @@ class Gateway:
             for plan, name, each in zip(plans, self._listener_names(bus), given, strict=True)
         ]
 
-    # A restart
-
-    async def restart(self) -> int:
-        """Hand everything to a successor; return its process. Raise Refused with the reason: all is as before then.
-
-        After this the caller must set :attr:`gone`.
-        """
-        if self._successor is None:
-            raise Unsupported("nothing starts a successor of this process")
-        if self._plan.config.bus.listen:
-            raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
-        if self._restarts.locked() or self.gone.is_set() or not self._begun:
-            raise NotReady("a restart is under way")
-        async with self._restarts:
-            began = time.monotonic()
-            parts: list[Part] = [part for part in (*self._parts, self._device, self._claim) if part is not None]
-            pid = await Outgoing(self._successor, parts, self._describe).run()
-            log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
-            return pid
-
-    async def restart_and_go(self) -> None:
-        """Restart, and end :meth:`run`; log the reason where that is refused."""
-        with contextlib.suppress(Refused):
-            await self.restart()
-            self.gone.set()
-
-    @property
-    def _begun(self) -> bool:
-        return self._incoming is None or self._incoming.begun.is_set()
-
-    def _describe(self, parcel: Parcel) -> Given:
-        given = Given(
-            VERSION,
-            self._plan.setup,
-            0,
-            claim=self._claim.hand_over(parcel) if self._claim is not None else None,
-            device=self._device.hand_over(parcel) if self._device is not None else None,
-            listeners=tuple(part.hand_over(parcel) for part in self._parts),
-            metrics=tuple(parcel.put(sock.fileno()) for sock in self._metrics_sockets),
-        )
-        return msgspec.structs.replace(given, descriptors=len(parcel))
-
-    def _answer_restarts(self, bus: Bus) -> Handle:
-        """Restart for whoever the access rules let ask, and answer when that is done."""
-        tasks: set[asyncio.Task[None]] = set()
-
-        async def restart(question: IncomingQuery) -> None:
-            try:
-                await self.restart()
-            except Refused as refusal:
-                question.refuse(refusal)
-                return
-            question.answer(payloads.encode(Query()))
-            with contextlib.suppress(BusError):
-                await bus.flush()
-            self.gone.set()
-
-        def take(question: IncomingQuery) -> None:
-            task = asyncio.ensure_future(restart(question))
-            tasks.add(task)
-            task.add_done_callback(tasks.discard)
-
-        return bus.answer(self._keys.key(topics.RPC_RESTART("*").path), take, lane=NameGate(time.monotonic))
-
     def _listener_names(self, bus: Bus) -> list[str]:
         """Return the names of the listeners on the bus: as configured, else unique by the id of the bus session."""
         names: list[str] = []
@@ -227,7 +150,7 @@ class Gateway:
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         ownership, incoming = Ownership(bus, self._keys), self._incoming
-        self._claim = ClaimPart(ownership)
+        self.restarts.claim = ClaimPart(ownership)
         try:
             if incoming is not None:
                 given = incoming.given
@@ -236,7 +159,7 @@ class Gateway:
                     device = self._make_device(bus, audit, plan)
                     await device.take_over(given.device, incoming.parcel)
                     await self._serve_shown(bus, ownership, device, incoming.taken)
-                elif not self._parts:
+                elif not incoming.given.listeners:
                     await incoming.finish()
                 await incoming.begun.wait()
             while True:
@@ -252,12 +175,12 @@ class Gateway:
         self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
     ) -> None:
         """Serve the robot, show the sessions as the gateway's, and answer who asks for a restart."""
-        handles = (self._show_sessions(bus, "gateway"), self._answer_restarts(bus))
-        self._device = device
+        handles = (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
+        self.restarts.device = device
         try:
             await self._serve(ownership, device, begin)
         finally:
-            self._device = None
+            self.restarts.device = None
             for handle in handles:
                 handle.close()
 

@@ -1,9 +1,10 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, restart,
+certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe`` and
-``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or
-configuration.
+``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe``,
+``restart`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong
+arguments or configuration.
 """
 
 from __future__ import annotations
@@ -69,10 +70,10 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, t
     successor = Spawn(file, verbose=verbose)
     gateway = Gateway(plan, predecessor=predecessor, successor=successor)
     try:
-        run_loop(until_signal(gateway.run(), {signal.SIGUSR2: gateway.restart_and_go}))
+        run_loop(until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart}))
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
-    if gateway.gone.is_set():
+    if gateway.restarts.gone.is_set():
         successor.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()

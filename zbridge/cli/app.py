@@ -248,6 +248,26 @@ def stop(
         raise typer.Exit(1)
 
 
+@app.command()
+def restart(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
+    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    who: Annotated[str, typer.Option(help="the name of your certificate; user@host by default")] = "",
+    connect: Connect = [],
+    realm: Realm = "fleet",
+) -> None:
+    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
+    from zbridge.cli.restart import restart as ask
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    if bool(robot) == everything:
+        give_up(2, "name one ROBOT, or give --all")
+    if robot:
+        check_name("ROBOT", robot)
+    if not run_loop(ask(bus_settings(connect), realm, robot or None, who=who or None)):
+        raise typer.Exit(1)
+
+
 def check_name(argument: str, name: str) -> None:
     """End the process with exit code 2 if ``name`` cannot be a robot's name."""
     if not is_name(name):

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import logging
 import socket
 import struct
-import termios
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import cast
@@ -24,6 +22,7 @@ from zbridge.transport.backlog import Backlog
 from zbridge.transport.door import Door
 from zbridge.transport.link import NOBODY, STALLED_S, Receiver
 from zbridge.transport.parcel import Parcel
+from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
 from zbridge.transport.udp import DatagramHub, DatagramSocket
 
 log = logging.getLogger("zbridge.link")
@@ -34,19 +33,10 @@ CLIENT_READ_BYTES = 4096
 """The same for an accepted peer: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
-KEEPALIVE_S = 1
-"""Seconds of silence after which the kernel asks an accepted peer for a sign of life."""
 GIVE_UP_S = 60.0
 """Seconds without acknowledgement after which a robot's connection ends: long, for a deployed robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
 """The same for an accepted peer."""
-_RETRY_MOST_S = 1.0
-"""Longest time between two retransmissions of the kernel to a robot."""
-_TCP_RTO_MAX_MS = 44
-"""Linux 6.15 and newer; Python has no name for it yet."""
-_OUTSTANDING = struct.Struct("=i")
-_SIOCOUTQ = termios.TIOCOUTQ
-"""The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
 _TCP_INFO = struct.Struct("=24xI28xI")
 """Two fields of Linux's tcp_info: unacknowledged segments, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
@@ -138,7 +128,7 @@ class TcpLink(asyncio.BufferedProtocol):
             return 0.0
         now = time.monotonic()
         if now - backlog.since > STALLED_S:
-            backlog.settle(_outstanding(transport))
+            backlog.settle(outstanding(transport))
         return now - backlog.since if backlog.since is not None else 0.0
 
     def pause(self) -> None:
@@ -204,13 +194,13 @@ class TcpLink(asyncio.BufferedProtocol):
             return
         self.peer = str(Address(*peer[:2]))
         sock = transport.get_extra_info("socket")
-        _tune(sock, CLIENT_GIVE_UP_S if self._accepted else GIVE_UP_S)
+        tune(sock, CLIENT_GIVE_UP_S if self._accepted else GIVE_UP_S)
         if self._accepted:
-            _keep_alive(sock)
+            keep_alive(sock)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         else:
-            _bound_retries(sock)
-            self._backlog = _new_backlog(sock)
+            bound_retries(sock)
+            self._backlog = new_backlog(sock)
             if self._given_udp is not None:
                 self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp)
         if self._hub is not None:
@@ -243,65 +233,6 @@ class TcpLink(asyncio.BufferedProtocol):
         if self._hub is not None:
             self._hub.remove(self)
         self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
-
-
-def _tune(sock: socket.socket, give_up_s: float) -> None:
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (
-        ("TCP_KEEPIDLE", 5),
-        ("TCP_KEEPINTVL", 2),
-        ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", round(give_up_s * 1000)),
-    ):
-        if hasattr(socket, option):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def _keep_alive(sock: socket.socket) -> None:
-    """Ask a silent peer for a sign of life every second; ``_tune`` says when the connection ends."""
-    for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
-        if hasattr(socket, option):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def _bound_retries(sock: socket.socket) -> None:
-    """Bound the time between retransmissions by :data:`_RETRY_MOST_S`, where the kernel can."""
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(_RETRY_MOST_S * 1000))
-
-
-_unwatched_warned = False
-
-
-def _new_backlog(sock: socket.socket) -> Backlog | None:
-    """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
-    global _unwatched_warned
-    try:
-        _queued(sock)
-    except OSError:
-        if not _unwatched_warned:
-            _unwatched_warned = True
-            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
-        return None
-    backlog = Backlog()
-    if unsent := _queued(sock):  # of the process that had the connection before
-        backlog.written(unsent, time.monotonic())
-    return backlog
-
-
-def _outstanding(transport: asyncio.Transport) -> int:
-    """Count the unacknowledged bytes: the kernel's and the transport's own."""
-    queued = 0
-    with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
-        queued = _queued(transport.get_extra_info("socket"))
-    return queued + transport.get_write_buffer_size()
-
-
-def _queued(sock: socket.socket) -> int:
-    """Count the unacknowledged bytes of the kernel; raise OSError where the platform does not tell."""
-    queued: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
-    return queued
 
 
 async def connect(address: Address, receiver: Receiver) -> TcpLink:

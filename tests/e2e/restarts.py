@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import os
 import random
 import re
@@ -236,10 +237,18 @@ class Restarted:
         """End the process that serves now in order; give the whole log."""
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGTERM)
-            until(lambda: not Path(f"/proc/{self.pid}").exists(), what="the end of the last gateway")
+            until(lambda: ended(self.pid), what="the end of the last gateway")
         assert self.gateway.process.wait(10) == 0, self.gateway.log
         assert "Traceback" not in self.gateway.log, self.gateway.log
         return self.gateway.log
+
+
+def ended(pid: int) -> bool:
+    """Tell whether a process that is not our child has ended; nobody may have waited for it yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return True
 
 
 @dataclass
@@ -268,7 +277,7 @@ class Judgement(Finding):
 def restart(protocol: str, times: int) -> Judgement:
     """Restart a gateway under traffic, with motion before."""
     judgement = Judgement(protocol=protocol, times=times)
-    with contextlib.ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         bench = Bench(Path(folder), stack)
         robot = stack.enter_context(contextlib.closing(ROBOTS[protocol]()))
         gateway = Restarted(bench, bench.gateway(device(robot.port, protocol, robot.options)))
@@ -310,8 +319,7 @@ def _once(bench: Bench, robot: Numbered, gateway: Restarted, key: str, pool: Thr
         time.sleep(DRIVE_S)
     assert not robot.moving, "moved by a lease that had ended"
     times = [sample["at"] for sample in fleet.seen[key] if sample["at"] > began - 0.1]
-    gap_s = max(later - earlier for earlier, later in zip(times, times[1:], strict=False))
-    return gap_s
+    return max(later - earlier for earlier, later in itertools.pairwise(times))
 
 
 def _account(judgement: Judgement, bench: Bench, robot: Numbered, key: str) -> None:
@@ -323,11 +331,9 @@ def _account(judgement: Judgement, bench: Bench, robot: Numbered, key: str) -> N
     judgement.connections, judgement.sent = robot.connections, robot.sent - numbers[0]
     judgement.lost = judgement.sent - len(set(numbers))
     judgement.doubled = len(numbers) - len(set(numbers))
-    judgement.disordered = sum(later < earlier for earlier, later in zip(numbers, numbers[1:], strict=False))
+    judgement.disordered = sum(later < earlier for earlier, later in itertools.pairwise(numbers))
     if judgement.lost or judgement.doubled or judgement.disordered:
-        judgement.faults.append(
-            f"{judgement.lost} lost, {judgement.doubled} doubled, {judgement.disordered} disordered"
-        )
+        judgement.faults.append("packets were lost, doubled or out of order")
 
 
 def main() -> Iterator[Judgement]:

@@ -67,7 +67,7 @@ class Restarts:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        return bus.answer(self._keys.key(topics.RPC_RESTART("*").path), take, lane=NameGate(time.monotonic))
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(time.monotonic))
 
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:

@@ -14,6 +14,7 @@ ZbridgeError
 │   └── TooFast      ... because commands come faster than allowed                   rate
 ├── LinkError        an address is not valid, or a connection cannot be made
 ├── BusError         the bus cannot be opened, or a query has no answer
+├── HandoverError    a restarted gateway cannot take over what the one before it hands over
 └── ConfigError      a configuration cannot be used
 """
 
@@ -144,6 +145,10 @@ class LinkError(ZbridgeError):
 
 class BusError(ZbridgeError):
     """The bus cannot be opened, or a query on it has no answer."""
+
+
+class HandoverError(ZbridgeError):
+    """A restarted gateway cannot take over what the one before it hands over, or got nothing."""
 
 
 class ConfigError(ZbridgeError):

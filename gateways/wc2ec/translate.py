@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -67,6 +67,8 @@ def _interpolation(table: tuple[tuple[float, float], ...]) -> Callable[[float], 
 class Wc2EcRobot(Robot):
     """One Webots robot, seen from its external controller."""
 
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"_table": Table, "_ring": BearingScan | None}
     link_names = ("robot",)
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:

@@ -138,6 +138,10 @@ class Fleet:
             self._leases.pop(robot).close()
         self._leases[robot] = Lease(self.session, robot, how, {"who": who, **wishes})
 
+    def get_within(self, key: str, timeout_s: float) -> list[Any]:
+        """Plain get that may take its time."""
+        return ask(self.session, key, timeout_s=timeout_s)
+
     def put(self, path: str, payload: bytes = b"", **fields: Any) -> None:
         payload = payload or packed(fields)
         robot, _, command = path.partition("/@cmd/")

@@ -13,25 +13,28 @@ import logging
 import math
 import secrets
 import signal
+import socket
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from zbridge.app.config import Plan
+from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery, open_bus
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import BusError, Held
+from zbridge.errors import BusError, Held, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.observer import Observer
@@ -55,12 +58,24 @@ class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
     metrics, sessions, conditions: of this process, shared by all parts. observer: is told of the robot's links.
+    predecessor: the channel to a gateway that hands everything over. successor: starts the process to which this
+    gateway can be handed over.
     """
 
-    def __init__(self, plan: Plan, observer: Observer | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        *,
+        observer: Observer | None = None,
+        predecessor: socket.socket | None = None,
+        successor: Successor | None = None,
+    ) -> None:
         self._plan = plan
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
+        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self.restarts = Restarts(plan, self._keys, self._incoming, successor)
+        """What a successor would be handed, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
@@ -73,24 +88,32 @@ class Gateway:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
-        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
+        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
+
+        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        """
         with self._audit() as audit:
             bus = await self._open_bus()
             try:
                 await self._run(bus, audit)
+            except Exception as error:
+                if self._incoming is not None and not self._incoming.begun.is_set():
+                    self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))
+                raise
             finally:
                 self.left = await bus.close()
 
     async def _run(self, bus: Bus, audit: Audit) -> None:
+        if self._incoming is not None:
+            await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 stack.callback(bus.watch_connected(self._on_bus).close)
-                await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics, self.missing))
             robot = RobotSubscription(bus, self._keys, self.metrics)
-            work: list[Coroutine[Any, Any, None]] = [
-                Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
-                for listener, name in zip(self._plan.listeners, self._listener_names(bus), strict=True)
-            ]
+            listeners = self._listeners(bus, robot)
+            taken = self._incoming.taken if self._incoming is not None else None
+            work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
+            self.restarts.listeners = [listener.handover for listener in listeners]
             if work:
                 robot.open()
                 stack.callback(robot.close)
@@ -98,7 +121,35 @@ class Gateway:
                 work.append(self._robot(bus, audit, self._plan.device))
             else:
                 stack.callback(self._show_sessions(bus, f"hq.{bus.zid}").close)
-            await together(*work)
+            if self._plan.metrics is not None:
+                work.append(self._serve_metrics(self._plan.metrics))
+            await until(self.restarts.gone, together(*work))
+
+    async def _serve_metrics(self, address: Address) -> None:
+        """Serve the counters; first of all wait until a predecessor has let go."""
+        given = []
+        if self._incoming is not None:
+            await self._incoming.begun.wait()
+            given = [socket.socket(fileno=self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
+        async with serve_metrics(address, self.metrics, self.missing, given) as self.restarts.metrics_sockets:
+            await asyncio.Event().wait()
+
+    def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
+        plans, incoming = self._plan.listeners, self._incoming
+        given = incoming.given.listeners if incoming is not None else (None,) * len(plans)
+        parcel = incoming.parcel if incoming is not None else None
+        return [
+            Listener(
+                plan,
+                plan.settings.name or (each["name"] if each is not None else name),
+                robot,
+                self.sessions,
+                self.metrics,
+                time.monotonic,
+                (each, parcel) if each is not None and parcel is not None else None,
+            )
+            for plan, name, each in zip(plans, self._listener_names(bus), given, strict=True)
+        ]
 
     def missing(self) -> tuple[str, ...]:
         """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
@@ -121,20 +172,40 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        ownership = Ownership(bus, self._keys)
+        ownership, incoming = Ownership(bus, self._keys), self._incoming
+        self.restarts.claim = ClaimPart(ownership)
         try:
+            if incoming is not None:
+                given = incoming.given
+                if given.device is not None and given.claim:
+                    ownership.inherit(given.claim)
+                    device = self._make_device(bus, audit, plan)
+                    await device.take_over(given.device, incoming.parcel)
+                    await self._serve_shown(bus, ownership, device, incoming.taken)
+                elif not incoming.given.listeners:
+                    await incoming.finish()
+                await incoming.begun.wait()
             while True:
                 shown = self._show_sessions(bus, f"hq.{bus.zid}") if self._plan.listeners else None
                 await ownership.take()
                 if shown is not None:
                     shown.close()
-                shown = self._show_sessions(bus, "gateway")
-                try:
-                    await self._serve(ownership, self._device(bus, audit, plan))
-                finally:
-                    shown.close()
+                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan))
         finally:
             ownership.release()
+
+    async def _serve_shown(
+        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
+    ) -> None:
+        """Serve the robot, show the sessions as the gateway's, and answer who asks for a restart."""
+        handles = (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
+        self.restarts.device = device
+        try:
+            await self._serve(ownership, device, begin)
+        finally:
+            self.restarts.device = None
+            for handle in handles:
+                handle.close()
 
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer queries for the session table of this process; ``who`` names the process."""
@@ -144,10 +215,10 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, ownership: Ownership, device: Device) -> None:
+    async def _serve(self, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None) -> None:
         """Serve the robot until another gateway has to take it."""
         self._device_served = device
-        serving = asyncio.ensure_future(device.run())
+        serving = asyncio.ensure_future(device.run(begin))
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
@@ -178,7 +249,7 @@ class Gateway:
 
         return tell
 
-    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -249,8 +320,26 @@ async def together(*work: Coroutine[Any, Any, None]) -> None:
         await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
-async def until_signal(work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended."""
+async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
+    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(event.wait()))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until_signal(
+    work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
+) -> None:
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended.
+
+    ``on``: what to run, by signal, while the coroutine runs.
+    """
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []
@@ -261,7 +350,16 @@ async def until_signal(work: Coroutine[Any, Any, None]) -> None:
             task.cancel()
         asked.append(number)
 
+    beside: set[asyncio.Task[None]] = set()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end, number)
+    for other, begin in (on or {}).items():
+        loop.add_signal_handler(other, _start_beside, begin, beside)
     with contextlib.suppress(asyncio.CancelledError):
         await task
+
+
+def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:
+    task = asyncio.ensure_future(begin())
+    tasks.add(task)
+    task.add_done_callback(tasks.discard)

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
@@ -30,23 +30,27 @@ Missing = Callable[[], tuple[str, ...]]
 
 
 @contextlib.asynccontextmanager
-async def serve_metrics(address: Address, metrics: Metrics, missing: Missing = lambda: ()) -> AsyncIterator[None]:
+async def serve_metrics(
+    address: Address, metrics: Metrics, missing: Missing = lambda: (), given: Sequence[socket.socket] = ()
+) -> AsyncIterator[list[socket.socket]]:
     """Serve ``GET /metrics``, ``/healthz`` and ``/readyz`` while the context lasts.
 
-    An address in use is logged as an error and otherwise ignored.
+    Gives the sockets at which it listens; ``given``: those of another process, in place of new ones. An address in use
+    is logged as an error and otherwise ignored.
+
     Connections are accepted only while fewer than CLIENTS are served: a server of asyncio accepts all at once and
     starves the rest of the process meanwhile.
     """
     try:
-        sockets = await _listen(address)
+        sockets = list(given) or await _listen(address)
     except OSError as error:
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
-        yield
+        yield []
         return
     room = asyncio.Semaphore(CLIENTS)
     tasks = [asyncio.create_task(_accept(each, room, metrics, missing)) for each in sockets]
     try:
-        yield
+        yield sockets
     finally:
         for task in tasks:
             task.cancel()

@@ -95,7 +95,9 @@ class FakeBus:
 
     # The interface
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        if last is not None:
+            self._shared.last[key] = last
         return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
 
     def put_all(self, batch: Batch) -> bool:
@@ -225,6 +227,10 @@ class _FakePublisher(_FakeHandle):
         self.key = key
         self._shared = shared
         self._keeps_last = keeps_last
+
+    @property
+    def last(self) -> bytes | None:
+        return self._shared.last.get(self.key)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         sample = Sample(self.key, payload, attachment)

@@ -91,6 +91,10 @@ class Publisher(Protocol):
 
     key: str
 
+    @property
+    def last(self) -> bytes | None:
+        """The last value, where the key keeps it."""
+
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         """Publish with the key's delivery, without blocking; False asks to pause the source."""
 
@@ -135,8 +139,8 @@ class Bus(Protocol):
     def zid(self) -> str:
         """The id of this session on the bus."""
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
-        """Declare that ``key`` will be written."""
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
 
     def put_all(self, batch: Batch) -> bool:
         """Publish stream messages in order; False asks to pause the source until the relief handler is called.

@@ -1,9 +1,10 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, restart,
+certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe`` and
-``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong arguments or
-configuration.
+``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe``,
+``restart`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong
+arguments or configuration.
 """
 
 from __future__ import annotations
@@ -12,12 +13,15 @@ import asyncio
 import gc
 import logging
 import os
+import signal
+import socket
 import sys
 from collections.abc import Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.handover import Spawn
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
 
@@ -31,6 +35,8 @@ def main() -> None:
         match sys.argv[1:]:
             case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
                 run_gateway(Path(file))
+            case ["run", file, "--take-over", descriptor] if not file.startswith("-"):
+                run_gateway(Path(file), take_over=int(descriptor))
             case _:
                 from zbridge.cli.app import app
 
@@ -52,9 +58,18 @@ def run_only(protocol: str) -> None:
 
 
 def run_gateway(
-    file: Path, *, only: str | None = None, verbose: bool = False, reporter: Reporter | None = None
+    file: Path,
+    *,
+    only: str | None = None,
+    verbose: bool = False,
+    take_over: int | None = None,
+    reporter: Reporter | None = None,
 ) -> None:
-    """Run the gateway of a configuration until SIGTERM or SIGINT; ``reporter``: tells its supervisor, if it has one."""
+    """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
+
+    take_over: the descriptor of the channel to the gateway that hands everything over to this process. reporter: tells
+    the supervisor, where there is one, which also starts the successor then.
+    """
     if reporter is None:
         set_up_log(verbose=verbose)
     plan = load(file)
@@ -63,17 +78,25 @@ def run_gateway(
         if only is not None and part.protocol.name != only:
             raise ConfigError(f"{file}: {key}.protocol = {part.protocol.name!r}: expected {only!r}")
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
-    gateway = Gateway(plan, reporter)
+    predecessor = socket.socket(fileno=take_over) if take_over is not None else None
+    spawn = Spawn(file, verbose=verbose)
+    successor = reporter.start_successor if reporter is not None else spawn
+    gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
 
     async def work() -> None:
         if reporter is not None:
             reporter.begin()
-        await until_signal(gateway.run())
+        await until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart})
 
     try:
         run_loop(work())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
+    if gateway.restarts.gone.is_set():
+        if reporter is not None:
+            reporter.succeeded()
+        else:
+            spawn.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)

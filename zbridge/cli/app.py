@@ -44,10 +44,14 @@ def run(
     ],
     watch: Annotated[bool, typer.Option("--watch", help="follow files that come, change or go")] = False,
     verbose: Verbose = False,
+    take_over: Annotated[int, typer.Option("--take-over", help="descriptor of a gateway that goes", hidden=True)] = -1,
 ) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each."""
+    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each.
+
+    SIGUSR2 restarts a gateway under way.
+    """
     if len(files) == 1 and not files[0].is_dir() and not watch:
-        run_gateway(files[0], verbose=verbose)
+        run_gateway(files[0], verbose=verbose, take_over=take_over if take_over >= 0 else None)
         return
     from zbridge.cli.supervise import supervise
 
@@ -270,6 +274,26 @@ def stop(
     if robot:
         check_name("ROBOT", robot)
     if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def restart(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
+    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    who: Annotated[str, typer.Option(help="the name of your certificate; user@host by default")] = "",
+    connect: Connect = [],
+    realm: Realm = "fleet",
+) -> None:
+    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
+    from zbridge.cli.restart import restart as ask
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    if bool(robot) == everything:
+        give_up(2, "name one ROBOT, or give --all")
+    if robot:
+        check_name("ROBOT", robot)
+    if not run_loop(ask(bus_settings(connect), realm, robot or None, who=who or None)):
         raise typer.Exit(1)
 
 

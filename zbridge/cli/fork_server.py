@@ -9,7 +9,7 @@ from zbridge.app.supervisor.child import Reporter
 from zbridge.app.supervisor.fork_server import Birth, serve
 from zbridge.app.supervisor.post import Post
 from zbridge.cli import give_up, run_gateway, set_up_log
-from zbridge.errors import ConfigError
+from zbridge.errors import ConfigError, ZbridgeError
 
 
 def main() -> None:
@@ -22,12 +22,17 @@ def run(birth: Birth) -> int:
     request = birth.request
     set_up_log(verbose=request.verbose, robot=request.robot)
     try:
-        run_gateway(Path(request.file), verbose=request.verbose, reporter=Reporter(Post.inherited(birth.post)))
-    except ConfigError as error:
+        run_gateway(
+            Path(request.file),
+            verbose=request.verbose,
+            take_over=birth.take_over if birth.take_over >= 0 else None,
+            reporter=Reporter(Post.inherited(birth.post), hands_over=True),
+        )
+    except ZbridgeError as error:
         try:
             give_up(2, error)
         except SystemExit:
-            return 2
+            return 2 if isinstance(error, ConfigError) else 1
     return 0
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
@@ -23,10 +23,11 @@ from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
-from zbridge.errors import BusError, Refused
+from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Robot
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_table import SessionTable
@@ -37,7 +38,7 @@ from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport import connect
+from zbridge.transport import Parcel, connect
 
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
@@ -46,6 +47,8 @@ LEAVE_S = 0.7
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
+_LOOK_S = 0.005
+"""Seconds between two looks whether the links can be handed over."""
 
 
 class Device:
@@ -72,6 +75,10 @@ class Device:
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         loop = asyncio.get_running_loop()
+        self._protocol = protocol
+        self._released = asyncio.Event()
+        self._commanded: list[Handle] = []
+        self._declared: list[Handle] = []
         clock, conditions = clock or loop.time, conditions or Conditions()
         self._observer = observer or Nobody()
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
@@ -113,28 +120,48 @@ class Device:
     def __repr__(self) -> str:
         return f"<Device {self._context.keys.robot} {self._links.first.state}>"
 
-    async def run(self) -> None:
-        """Serve the robot until cancelled; then stop it if it moves, and take leave of it."""
-        context = self._context
-        self._presence.publish_status()
-        self._enforcer.report()
+    async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
+        """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
+
+        Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
+        declared; until then nothing is read, written or published.
+        """
+        if begin is None:
+            self._show()
+        self._declare()
+        if begin is not None:
+            await begin()
+            await self.go_on()
+            self._show()
         self._standstill.begin()
         self._observer.began(self)
-        declared = [
+        async with asyncio.TaskGroup() as tasks:
+            work = [tasks.create_task(self._beat())]
+            work += [tasks.create_task(connection.run()) for connection in self._links]
+            try:
+                await self._released.wait()
+            finally:  # the links' tasks still run: the group ends them only after this
+                if not self._released.is_set():
+                    await asyncio.shield(self._shut_down())
+                for task in work:
+                    task.cancel()
+
+    def _show(self) -> None:
+        self._presence.publish_status()
+        self._enforcer.report()
+
+    def _declare(self) -> None:
+        self._listen()
+        self._declared = [self._context.bus.watch_connected(self._on_bus), *self._telemetry.serve()]
+
+    def _listen(self) -> None:
+        """Take commands and queries from the bus; idempotent."""
+        context = self._context
+        self._commanded = self._commanded or [
             *self._leases.serve(),
             context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
-            context.bus.watch_connected(self._on_bus),
             *self._queries.serve(),
-            *self._telemetry.serve(),
         ]
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._beat())
-            for connection in self._links:
-                tasks.create_task(connection.run())
-            try:
-                await asyncio.Event().wait()
-            finally:  # the links' tasks still run: the group ends them only after this
-                await asyncio.shield(self._shut_down(declared))
 
     @property
     def reached(self) -> bool:
@@ -199,7 +226,76 @@ class Device:
             self._presence.publish_status()
             self._enforcer.beat()
 
-    async def _shut_down(self, declared: list[Handle]) -> None:
+    # A restart: another process takes the robot over
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        """Stop the robot, end the lease and take no commands; wait until the links can be handed over.
+
+        Raises Refused with the reason where that takes longer than ``within_s``; :meth:`go_on` takes it all back.
+        """
+        if not self._context.robot.hands_over:
+            raise Unsupported(f"protocol {self._protocol} does not hand its sessions over")
+        self._commands.refuse_all(reason)
+        self._leases.refuse_all(reason)
+        self._enforcer.stop(reason)
+        self._context.pump()
+        until = self._context.clock() + within_s
+        while any(connection.stays for connection in self._links):
+            if self._context.clock() >= until:
+                raise NotReady("; ".join(f"{each.name}: {each.stays}" for each in self._links if each.stays))
+            await asyncio.sleep(_LOOK_S)
+
+    async def shut(self) -> None:
+        """Do nothing: nobody is accepted here."""
+
+    def hold(self) -> None:
+        """Read and write nothing from now on."""
+        for connection in self._links:
+            connection.hold()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the links into a parcel; describe them, the robot, and what was published. To be called while held."""
+        return {
+            "links": [connection.hand_over(parcel) for connection in self._links],
+            "robot": self._context.robot.export(),
+            "published": self._publishers.export(),
+        }
+
+    async def take_over(self, given: Exported, parcel: Parcel) -> None:
+        """Hold what another process handed over; raise ProtocolError, OSError. Call :meth:`run` with ``begin`` then."""
+        self._publishers.restore(given["published"])
+        for connection, link in zip(self._links, given["links"], strict=True):
+            await connection.take_over(link, parcel)
+        if any(given["links"]):
+            self._context.robot.restore(given["robot"])
+        session = self._context.robot.driving
+        if session is not None and session.state is State.ESTABLISHED:
+            self._presence.resume(session)
+
+    async def go_on(self) -> None:
+        """Read, write and take commands: again, or for the first time with what was taken over."""
+        self._listen()
+        self._commands.refuse_all(None)
+        self._leases.refuse_all(None)
+        for connection in self._links:
+            connection.go_on()
+
+    def withdraw(self) -> None:
+        """Take no commands and queries from the bus any more: another process does."""
+        handles, self._commanded = self._commanded, []
+        for handle in handles:
+            handle.close()
+
+    async def release(self) -> None:
+        """Give the links up and end :meth:`run`; the robot notices nothing."""
+        self._released.set()
+        self._standstill.close()
+        self._enforcer.close()
+        self._context.conditions.changed = lambda: None
+        for connection in self._links:
+            connection.release()
+
+    async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._presence.leave()
         self._commands.refuse_all(_LEAVING)
@@ -216,6 +312,6 @@ class Device:
             async with asyncio.timeout(FLUSH_S):
                 await self._context.bus.flush()
         self._context.conditions.changed = lambda: None
-        for handle in declared:
+        for handle in (*self._commanded, *self._declared):
             handle.close()
         self._publishers.close()

@@ -33,6 +33,7 @@ import msgspec
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.errors import BusError
 from zbridge.fleet.topics import KeySpace
+from zbridge.protocol.kept import Exported
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -112,6 +113,8 @@ class Ownership:
         self._was_connected = False
         self._came = asyncio.Event()
         self._watch: Handle | None = None
+        self.hands_over = False
+        """Whether a successor announces the same claim now: it is no rival."""
 
     def __repr__(self) -> str:
         return f"<Ownership {self._keys.robot} {'held' if self._held_since is not None else 'not held'}>"
@@ -149,6 +152,8 @@ class Ownership:
                     await self._came.wait()
             self._came.clear()
             await asyncio.sleep(LOOK_S)
+            if self.hands_over:
+                continue
             with contextlib.suppress(BusError):
                 serving = {zid: claim for zid, claim in (await self._claims()).items() if claim.held_s}
                 if has():
@@ -157,6 +162,17 @@ class Ownership:
                     log.error("another gateway served %s before this one: leaving it alone", self._keys.robot)
                     return
                 tell(tuple(serving))
+
+    def export(self) -> Exported | None:
+        """Write the claim for a successor of this gateway; None where the robot is not owned."""
+        return None if self._held_since is None else {"since": self._held_since, "has": self._has()}
+
+    def inherit(self, claim: Exported) -> None:
+        """Own the robot as the gateway before did, without waiting until it goes; called instead of :meth:`take`."""
+        self._announce()
+        self._held_since, has = float(claim["since"]), bool(claim["has"])
+        self._has = lambda: has
+        self._state = State.KEEPING if has else State.OWNING
 
     def release(self) -> None:
         """Withdraw the claim; idempotent."""

@@ -58,6 +58,10 @@ class Presence:
         """Whether the robot was ever reached."""
         return self._greeted is not None
 
+    def resume(self, session: Session[Any]) -> None:
+        """Take a session for greeted: another process established it."""
+        self._greeted, self._busy, self._doubtful = session, session.busy, session.doubtful
+
     def leave(self) -> None:
         """Note that the gateway takes leave of the robot: the end of its session holds nothing back."""
         self._leaving = True

@@ -15,8 +15,10 @@ from typing import Any, Concatenate, ParamSpec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.link import STALLED_S, Link
+from zbridge.transport.parcel import Parcel
 
 log = logging.getLogger("zbridge.link")
 
@@ -77,6 +79,8 @@ class Conversation:
         self.session = session
         self._linked = linked
         self._observed: Link | None = None
+        self.held = False
+        """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
         self._before = before
         self._on_stall = stalled
         self.blocked = False
@@ -105,6 +109,8 @@ class Conversation:
         """Begin: the link is up."""
         self._link = self._observed = link
         self._linked(link, True)
+        if self.held:
+            link.hold()
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -177,6 +183,8 @@ class Conversation:
         self.pump()
 
     def _pump(self) -> None:
+        if self.held:
+            return
         session, link = self.session, self._link
         outbox = session.outbox
         if session.drops_source and link is not None:
@@ -237,8 +245,50 @@ class Conversation:
 
     def resume(self) -> None:
         """Read again."""
-        if self._link is not None:
+        if self._link is not None and not self.held:
             self._link.resume()
+
+    # A restart
+
+    @property
+    def link(self) -> Link | None:
+        """The connection; None before there is one, and after it."""
+        return self._link
+
+    @property
+    def stays(self) -> str | None:
+        """Why the conversation cannot be handed to another process now; None where it can."""
+        link = self._link
+        if link is None or self.session.over:
+            return "the connection is not up"
+        return link.stays or (None if link.ready else "the peer takes nothing")
+
+    def hold(self) -> None:
+        """Read and write nothing, and run no timer, until :meth:`go_on`."""
+        self.held = True
+        self._set_timer(None)
+        if self._link is not None:
+            self._link.hold()
+
+    def go_on(self) -> None:
+        """Go on where :meth:`hold` interrupted: this process has the connection."""
+        self.held = False
+        if self._link is not None:
+            self._link.go_on()
+        self.pump()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the connection of a held conversation into a parcel; describe it and the session."""
+        assert self._link is not None
+        return {"session": self.session.export(), "link": self._link.hand_over(parcel)}
+
+    def release(self) -> None:
+        """Forget the connection, which another process has now: the peer notices nothing."""
+        self.held = True
+        self._set_timer(None)
+        link, self._link = self._link, None
+        if link is not None:
+            link.release()
 
     @_then_pump
     def _tick(self) -> None:

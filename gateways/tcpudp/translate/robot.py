@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 from gateways.tcpudp.messages import (
     PACKETS,
@@ -61,6 +61,14 @@ _NOTHING = Outcome()
 
 class TcpUdpRobot(Robot):
     """One robot of the TCP/UDP package protocol, seen from its HQ."""
+
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {
+        "_chosen": str | None,
+        "_rests_until": float,
+        "_paired_until": float,
+        "_telemetry": TelemetryTranslator,
+    }
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options

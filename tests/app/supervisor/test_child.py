@@ -11,7 +11,7 @@ from zbridge.app.supervisor import child
 from zbridge.app.supervisor.child import Reporter
 from zbridge.app.supervisor.messages import Beat, Closed, Message, Opened, Started, Succeeded, WantSuccessor
 from zbridge.app.supervisor.post import Post, close_all
-from zbridge.errors import NotReady
+from zbridge.errors import HandoverError
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.transport.fake import FakeLink
 
@@ -174,10 +174,10 @@ async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -
         asking = asyncio.ensure_future(scene.reporter.start_successor(far))
         await scene.soon()
         scene.post.send(Started("a faulty file"))
-        with pytest.raises(NotReady, match="a faulty file"):
+        with pytest.raises(HandoverError, match="a faulty file"):
             await asking
         monkeypatch.setattr(child, "ANSWER_S", 0.01)
-        with pytest.raises(NotReady, match="no successor within"):
+        with pytest.raises(HandoverError, match="no successor within"):
             await scene.reporter.start_successor(far)
 
 

@@ -16,7 +16,7 @@ import socket
 
 from zbridge.app.supervisor.messages import Beat, Closed, Opened, Started, Succeeded, WantSuccessor
 from zbridge.app.supervisor.post import Post, close_all
-from zbridge.errors import NotReady
+from zbridge.errors import HandoverError
 from zbridge.robot.observer import LastStop, Observed
 from zbridge.transport import Link
 
@@ -68,19 +68,19 @@ class Reporter:
             self._post.close()
 
     async def start_successor(self, far_end: socket.socket) -> None:
-        """Ask for a process that takes over from ``far_end``; raise NotReady with the reason if none is started."""
+        """Ask for a process that takes over from ``far_end``; raise HandoverError if none is started."""
         self._answer = self._loop.create_future()
         if not self._post.send(WantSuccessor(), [far_end.fileno()]):
-            raise NotReady("the supervisor does not listen")
+            raise HandoverError("the supervisor does not listen")
         try:
             async with asyncio.timeout(ANSWER_S):
                 started = await self._answer
         except TimeoutError:
-            raise NotReady(f"the supervisor started no successor within {ANSWER_S:g} s") from None
+            raise HandoverError(f"the supervisor started no successor within {ANSWER_S:g} s") from None
         finally:
             self._answer = None
         if started.reason is not None:
-            raise NotReady(started.reason)
+            raise HandoverError(started.reason)
 
     def succeeded(self) -> None:
         """Tell that the successor has taken over: this process is not to be started again."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import os
 import socket
 import subprocess
@@ -21,6 +22,8 @@ log = logging.getLogger("zbridge.app.supervisor")
 
 READY_S = 60.0
 """Longest time in which a fork server imports everything."""
+LOOK_S = 2.0
+"""Least time between two looks at the installation, which take 25 ms, for the sake of forks."""
 FORK_S = 10.0
 """Longest time for one fork."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -123,6 +126,7 @@ class Forks:
         self._refused: Stamp | None = None
         """The installation whose fork server did not start."""
         self._leaving: list[_Server] = []
+        self._looked_at = -math.inf
         self._turn = asyncio.Lock()
 
     def __repr__(self) -> str:
@@ -139,8 +143,10 @@ class Forks:
         post: the gateway's end. take_over: descriptor of the socket by which it takes over.
         """
         descriptors = [post.fileno()] if take_over is None else [post.fileno(), take_over]
+        loop = asyncio.get_running_loop()
         async with self._turn:
-            await self._renew()
+            if self._server is None or not self._server.alive or loop.time() >= self._looked_at + LOOK_S:
+                await self._renew()
             assert self._server is not None
             return await self._server.fork(request, descriptors)
 
@@ -153,6 +159,7 @@ class Forks:
             await self._renew()
 
     async def _renew(self) -> None:
+        self._looked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
         old, stamp = self._server, Stamp()
         if old is not None and old.alive:

@@ -117,19 +117,15 @@ class Runner:
         while (process := self.process) is not None:
             how = await process.ended()
             successor, self._successor = self._successor, None
-            if process.succeeded and successor is not None:
-                process.close()
-                self.process = successor
-                log.info("%s: process %d has taken over", self.file.robot, successor.pid)
-                continue
-            self.process = None
-            if how is not None and not (process.told_to_end and not len(process.duplicates)):
+            self.process = successor
+            if process.succeeded or (process.told_to_end and not len(process.duplicates)):
+                how = None
+            if how is not None:
                 log.error("%s: process %d %s", self.file.robot, process.pid, how)
                 await self._stop_robot(process)
             process.close()
-            if successor is not None:
-                await self._end(successor)
-                successor.close()
+            if successor is not None:  # one that has not taken over ends by itself
+                log.info("%s: process %d serves it now", self.file.robot, successor.pid)
 
     async def _stop_robot(self, process: GatewayProcess) -> None:
         """Write the stop that the process deposited last."""

@@ -152,9 +152,9 @@ class ZenohBus:
         """The id of the Zenoh session."""
         return str(self._session.zid())
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
-        """Declare that ``key`` will be written."""
-        return self._keep(self._publishers.make(key, topic))
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
+        return self._keep(self._publishers.make(key, topic, last))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
         """Call ``handler`` when a paused source may go on."""

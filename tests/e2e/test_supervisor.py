@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 from collections.abc import Iterator
@@ -80,11 +81,17 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     (host.folder / "twice.toml").unlink()
     host.write(5, more="[control]\nlease_s = 2.0\n")
     host.reload("r5.toml: has changed")
-    until(lambda: host.connections == [1, 1, 1, 2, 1, 2, 1, 1], what="the restart of one robot")
+    until(lambda: re.search(r"r5: process \d+ serves it now", supervisor.log), 20, "the restart of one gateway")
+    assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1], "its robot noticed nothing"
+    assert fleet.state("r5") == "established"
 
     (host.folder / "r7.toml").unlink()
     host.reload("is gone")
     until(lambda: host.robots[7].ended, what="the end of one gateway")
+
+    os.kill(supervisor.gateway("r0"), signal.SIGUSR2)
+    until(lambda: re.search(r"r0: process \d+ serves it now", supervisor.log), 20, "the restart of another one")
+    assert host.connections[0] == 1
     stopped = [len(robot.packets(STOP)) for robot in host.robots]
     supervisor.process.send_signal(signal.SIGTERM)
     host.bench.ended_within(supervisor.process, 5.0)

@@ -23,6 +23,7 @@ import itertools
 import json
 import os
 import random
+import re
 import signal
 import statistics
 import sys
@@ -64,6 +65,8 @@ class Outcome:
     robot: str
     way: str
     rest_s: float | None = None
+    kept: bool = False
+    """Whether the robot saw one connection all the time: the next process went on with it."""
     faults: list[str] = field(default_factory=list)
 
     @property
@@ -120,11 +123,18 @@ def _measure(scene: Scene, stack: contextlib.ExitStack, outcome: Outcome, name: 
     os.kill(pid, WAYS[outcome.way])
     outcome.rest_s = _rest(robot, crashed)
     scene.supervisor.gateway(name, not_pid=pid)
+    until(lambda: _goes_on(scene, name), LINE_S, "the next process")
     robot.part.say("end")
     until(lambda: robot.report, 5, "the robot's report")
     outcome.faults += charges(robot.report["violations"], LIMIT_S)  # which excuses commands that are too rare
+    outcome.kept = not any("connection" in event or "left" in event for event in robot.report["events"])
     if robot.report["moving"]:
         outcome.faults.append("the robot moves at the end")
+
+
+def _goes_on(scene: Scene, name: str) -> bool:
+    log = scene.supervisor.log
+    return re.search(rf"{name}: (process \d+ goes on with|next process in)", log) is not None
 
 
 def _rest(robot: MovingRobot, since: float) -> float | None:
@@ -170,8 +180,8 @@ def measure(
 
 def table(outcomes: list[Outcome]) -> Iterator[str]:
     """Write the results as the rows of a Markdown table."""
-    yield "| robot | gateway | times | at rest within 1.5 s | median s | worst s | faults |"
-    yield "|---|---|---:|---:|---:|---:|---|"
+    yield "| robot | gateway | times | at rest within 1.5 s | median s | worst s | connection kept | faults |"
+    yield "|---|---|---:|---:|---:|---:|---:|---|"
     for robot, way in sorted({(outcome.robot, outcome.way) for outcome in outcomes}):
         mine = [outcome for outcome in outcomes if (outcome.robot, outcome.way) == (robot, way)]
         times = [outcome.rest_s for outcome in mine if outcome.rest_s is not None]
@@ -179,7 +189,9 @@ def table(outcomes: list[Outcome]) -> Iterator[str]:
         median, worst = (f"{of(times):.2f}" if times else "-" for of in (statistics.median, max))
         faults = sorted({fault.split(":")[0] for outcome in mine for fault in outcome.faults})
         worst = worst if len(times) == len(mine) else "never"
-        yield f"| {robot} | {way} | {len(mine)} | {within} | {median} | {worst} | {'; '.join(faults) or '-'} |"
+        kept = sum(outcome.kept for outcome in mine)
+        told = f"{len(mine)} | {within} | {median} | {worst} | {kept} | {'; '.join(faults) or '-'}"
+        yield f"| {robot} | {way} | {told} |"
 
 
 def _parsed() -> Any:

@@ -85,6 +85,7 @@ def run_gateway(
 
     async def work() -> None:
         if reporter is not None:
+            reporter.keep = gateway.restarts.keep
             reporter.begin()
         await until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart})
 

@@ -159,6 +159,11 @@ class Outbox(Kept):
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
 
+    def forget(self) -> None:
+        """Drop every frame that waits, and every repetition."""
+        for place in (self._queue, self._urgent, self._exempt, self._slots):
+            place.clear()
+
     def clear(self, slot: str) -> None:
         """Empty ``slot``."""
         self._slots.pop(slot, None)

@@ -54,6 +54,8 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called when the link stops taking bytes (True), and when it takes them again (False)."""
     linked: Callable[[Link, bool], object] = lambda link, up: None
     """Called when a link is up (True), and when it is gone (False)."""
+    read: Callable[[], object] = lambda: None
+    """Called when the bytes of a read have been handled."""
 
 
 class Links:
@@ -242,6 +244,7 @@ class Connection:
             before=hooks.before,
             stalled=hooks.stalled,
             linked=hooks.linked,
+            read=hooks.read,
         )
 
     def _on_session(self, session: Session[Any]) -> None:

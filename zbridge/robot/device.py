@@ -46,7 +46,10 @@ LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
+KEPT_BYTES = 2048
+"""Largest published value that is kept for the case that this process dies."""
 _LEAVING = "gateway stopped"
+_CRASHED = "crashed"
 _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
@@ -115,6 +118,7 @@ class Device:
             before=self._enforcer.keep_time,
             stalled=partial(presence.stalled, name),
             linked=partial(self._observer.linked, name),
+            read=partial(self._observer.read, name),
         )
 
     def __repr__(self) -> str:
@@ -255,11 +259,25 @@ class Device:
 
     def hand_over(self, parcel: Parcel) -> Exported:
         """Put the links into a parcel; describe them, the robot, and what was published. To be called while held."""
-        return {
-            "links": [connection.hand_over(parcel) for connection in self._links],
-            "robot": self._context.robot.export(),
-            "published": self._publishers.export(),
-        }
+        return {**self._describe(parcel), "published": self._publishers.export()}
+
+    def _describe(self, parcel: Parcel) -> Exported:
+        links = [connection.hand_over(parcel) for connection in self._links]
+        return {"links": links, "robot": self._context.robot.export()}
+
+    def keep(self, parcel: Parcel) -> Exported | None:
+        """Describe what another process needs to go on if this one dies; None where it could not.
+
+        Large values that were published are left out.
+        """
+        session = self._context.robot.driving
+        if not self._context.robot.hands_over or session is None or session.state is not State.ESTABLISHED:
+            return None
+        talks = (connection.conversation for connection in self._links)
+        if any(talk is not None and talk.link is None for talk in talks):  # a link that is not up yet
+            return None
+        published = self._publishers.export(most_bytes=KEPT_BYTES)
+        return {**self._describe(parcel), "published": published, _CRASHED: True}
 
     async def take_over(self, given: Exported, parcel: Parcel) -> None:
         """Hold what another process handed over; raise ProtocolError, OSError. Call :meth:`run` with ``begin`` then."""
@@ -271,6 +289,10 @@ class Device:
         session = self._context.robot.driving
         if session is not None and session.state is State.ESTABLISHED:
             self._presence.resume(session)
+            if given.get(_CRASHED):  # what waited then may have been written since, and may be motion
+                session.outbox.forget()
+                with contextlib.suppress(Refused):
+                    self._standstill.stop()
 
     async def go_on(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""

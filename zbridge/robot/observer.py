@@ -72,6 +72,9 @@ class Observer(Protocol):
     def linked(self, name: str, link: Link, up: bool) -> None:
         """Note that the link of this name is up, or that it is being closed."""
 
+    def read(self, name: str) -> None:
+        """Note that the bytes of a read of this link have been handled."""
+
     def changed(self) -> None:
         """Note that :meth:`Observed.last_stop` may give something else from now on. Called for every command."""
 
@@ -86,6 +89,9 @@ class Nobody:
         """Do nothing."""
 
     def linked(self, name: str, link: Link, up: bool) -> None:
+        """Do nothing."""
+
+    def read(self, name: str) -> None:
         """Do nothing."""
 
     def changed(self) -> None:

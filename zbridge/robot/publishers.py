@@ -47,9 +47,10 @@ class RobotPublishers:
             publisher = self.known[path] = self._bus.publisher(self._keys.key(path), topic)
         return publisher
 
-    def export(self) -> list[list[object]]:
-        """List the keys, each with the last value that it keeps."""
-        return [[path, publisher.last] for path, publisher in self.known.items()]
+    def export(self, most_bytes: int | None = None) -> list[list[object]]:
+        """List the keys, each with the last value that it keeps; without values of more than ``most_bytes``."""
+        known = [(path, publisher.last) for path, publisher in self.known.items()]
+        return [[path, last] for path, last in known if most_bytes is None or len(last or b"") <= most_bytes]
 
     def restore(self, known: Iterable[tuple[str, bytes | None]]) -> None:
         """Declare the keys of another process, which answer for their last values; nothing is published."""

@@ -56,6 +56,7 @@ class Conversation:
     ``refused`` is told which datagrams in the peer's name did not come from the peer.
     ``may_warn(kind)`` says whether a warning of this kind may be logged now.
     ``linked`` is called with the link and True when the link is up, and False when it is gone.
+    ``read`` is called when the bytes of a read have been handled.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
@@ -75,7 +76,9 @@ class Conversation:
         before: Callable[[], object] = lambda: None,
         stalled: Callable[[bool], object] = lambda stalled: None,
         linked: Callable[[Link, bool], object] = lambda link, up: None,
+        read: Callable[[], object] = lambda: None,
     ) -> None:
+        self._read = read
         self.session = session
         self._linked = linked
         self._observed: Link | None = None
@@ -118,6 +121,7 @@ class Conversation:
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
         self._hand_on(self.session.receive(data, self._clock()))
+        self._read()
 
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:

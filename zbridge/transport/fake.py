@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from zbridge.protocol.kept import Exported
 from zbridge.transport.parcel import Parcel
 
@@ -11,6 +13,7 @@ class FakeLink:
 
     def __init__(self, peer: str = "tcp://robot.test:1") -> None:
         self.peer = peer
+        self.reads: Callable[[], object] = lambda: None
         self.descriptors: tuple[int, ...] = ()
         self.ready = True
         self.silent_s = 0.0

@@ -6,6 +6,7 @@ Links are :class:`~zbridge.transport.tcp.TcpLink`, :class:`~zbridge.transport.se
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from zbridge.protocol.kept import Exported
@@ -50,6 +51,8 @@ class Link(Protocol):
     """One connection to a peer."""
 
     peer: str
+    reads: Callable[[], object]
+    """Called before bytes are taken from the kernel; set by who watches the link."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:

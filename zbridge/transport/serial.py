@@ -14,6 +14,7 @@ import os
 import struct
 import termios
 import time
+from collections.abc import Callable
 from typing import Any
 
 from zbridge.errors import LinkError
@@ -42,6 +43,7 @@ class SerialLink:
 
     def __init__(self, address: SerialAddress, port: Any, receiver: Receiver) -> None:
         self.peer = str(address)
+        self.reads: Callable[[], object] = lambda: None
         self._port = port
         self._fd: int = port.fileno()
         self._receiver = receiver
@@ -155,6 +157,7 @@ class SerialLink:
         self._end("closed")
 
     def _read(self) -> None:
+        self.reads()
         try:
             data = os.read(self._fd, READ_BYTES)
         except (BlockingIOError, InterruptedError):

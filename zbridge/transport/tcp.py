@@ -60,6 +60,7 @@ class TcpLink(asyncio.BufferedProtocol):
         given_udp: socket.socket | None = None,
     ) -> None:
         self.peer = ""
+        self.reads: Callable[[], object] = lambda: None
         self._given_udp = given_udp
         self._backlog: Backlog | None = None
         self._hub = hub
@@ -217,6 +218,7 @@ class TcpLink(asyncio.BufferedProtocol):
         self._receiver.attached(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
+        self.reads()
         return self._view
 
     def buffer_updated(self, nbytes: int) -> None:

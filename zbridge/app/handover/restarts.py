@@ -59,6 +59,14 @@ class Restarts:
             await self._restart()
             self.gone.set()
 
+    def keep(self, parcel: Parcel) -> Given | None:
+        """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
+        device = self.device.keep(parcel) if self.device is not None else None
+        claim = self.claim.hand_over(parcel) if self.claim is not None else None
+        if device is None or not claim:
+            return None
+        return Given(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
+
     def answer(self, bus: Bus) -> Handle:
         """Restart for whoever the access rules let ask, and answer when that is done."""
 

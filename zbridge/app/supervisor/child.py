@@ -10,15 +10,31 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import mmap
 import os
 import signal
 import socket
+from collections.abc import Callable
+from functools import partial
 
-from zbridge.app.supervisor.messages import Beat, Closed, Opened, Started, Succeeded, WantSuccessor
+import msgspec
+
+from zbridge.app.handover.messages import Given
+from zbridge.app.supervisor.messages import (
+    PAGE_BYTES,
+    Beat,
+    Closed,
+    Kept,
+    Opened,
+    Shared,
+    Started,
+    Succeeded,
+    WantSuccessor,
+)
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.errors import HandoverError
 from zbridge.robot.observer import LastStop, Observed
-from zbridge.transport import Link
+from zbridge.transport import Link, Parcel
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -30,6 +46,20 @@ LOOK_S = 0.05
 """Least time between two looks at the frames of the stop, while commands come in."""
 ANSWER_S = 10.0
 """Longest wait for the start of a successor."""
+KEEP_S = 0.9
+"""Least seconds between two deposits of what a successor needs."""
+KEPT_BYTES = 48 * 1024
+"""Largest such deposit."""
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class _Listed(Parcel):
+    """Lists descriptors; duplicates none."""
+
+    def put(self, descriptor: int) -> int:
+        """Note a descriptor; return its number."""
+        self.descriptors.append(descriptor)
+        return len(self.descriptors) - 1
 
 
 class Reporter:
@@ -46,7 +76,12 @@ class Reporter:
         """The number, the name and the descriptors that were told, for each link that is up."""
         self._numbers = 0
         self._told = LastStop()
-        self._looked_at = 0.0
+        self._looked_at = self._kept_at = 0.0
+        self._kept = Kept()
+        self._at: dict[str, int] = {}
+        self._page: mmap.mmap
+        self.keep: Callable[[Parcel], Given | None] = lambda parcel: None
+        """Describes what a successor needs; set by the gateway's process."""
         self._timer: asyncio.TimerHandle | None = None
         self._answer: asyncio.Future[Started] | None = None
 
@@ -57,6 +92,7 @@ class Reporter:
         """Beat from now on, and hear the supervisor."""
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._post.fileno(), self._hear)
+        self._share()
         self._beat()
 
     def close(self) -> None:
@@ -101,12 +137,20 @@ class Reporter:
     def linked(self, name: str, link: Link, up: bool) -> None:
         """Give the supervisor duplicates of a link's sockets, or tell it to close them."""
         if up:
-            self._numbers += 1
+            self._numbers = self._numbers % (PAGE_BYTES - 1) + 1
             self._links[link] = (self._numbers, name, ())
+            self._at[name] = self._numbers
+            link.reads = partial(self._page.__setitem__, self._numbers, 0)
             self._show(link)
         elif link in self._links:
             number, _, _ = self._links.pop(link)
+            self._page[number] = 0
             self._post.send(Closed(number))
+
+    def read(self, name: str) -> None:
+        """Note in the shared page whether a successor could go on reading here."""
+        if self._device is not None and name in self._at:
+            self._page[self._at[name]] = self._device.boundary(name).incoming
 
     def changed(self) -> None:
         """Beat at once if a program has begun to drive the robot, or has ended, or its link is another one."""
@@ -127,10 +171,34 @@ class Reporter:
             self._show(link)
         device = self._device
         streams = {number: device.boundary(name) for number, name, _ in self._links.values()} if device else {}
+        for _, name, _ in self._links.values():
+            self.read(name)
         last = device.last_stop() if device else LastStop()
+        if self._loop.time() >= self._kept_at + KEEP_S or last.state != self._told.state:
+            self._keep()
         if self._post.send(Beat(last, streams, self._hands_over)):
             self._told = last
         self._timer = self._loop.call_later(DRIVEN_BEAT_S if last.driven else BEAT_S, self._beat)
+
+    def _keep(self) -> None:
+        """Deposit what a successor needs if this process dies."""
+        self._kept_at, parcel = self._loop.time(), _Listed()
+        given = self.keep(parcel) if self._device is not None else None
+        known = {told: (number, at) for number, _, all_told in self._links.values() for at, told in enumerate(all_told)}
+        kept = Kept()
+        if given is not None and all(descriptor in known for descriptor in parcel.descriptors):
+            data = _encode(given)
+            if len(data) <= KEPT_BYTES:
+                kept = Kept(data, tuple(known[descriptor] for descriptor in parcel.descriptors))
+        if kept != self._kept and self._post.send(kept):
+            self._kept = kept
+
+    def _share(self) -> None:
+        descriptor = os.memfd_create("zbridge")
+        os.ftruncate(descriptor, PAGE_BYTES)
+        self._page = mmap.mmap(descriptor, PAGE_BYTES)
+        self._post.send(Shared(), [descriptor])
+        os.close(descriptor)
 
     def _show(self, link: Link) -> None:
         """Give the sockets of a link that were not given yet: that of datagrams is opened later."""

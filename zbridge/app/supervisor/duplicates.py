@@ -45,6 +45,10 @@ class Duplicate:
         self._stream, self._datagrams = (*descriptors, None, None)[:2]
         close_all(descriptors[2:])
 
+    def descriptor(self, at: int) -> int | None:
+        """Give the stream's descriptor (0), or that of datagrams (1)."""
+        return (self._stream, self._datagrams)[at] if at in (0, 1) else None
+
     def close(self) -> None:
         """Close the duplicates; idempotent."""
         close_all([number for number in (self._stream, self._datagrams) if number is not None])
@@ -116,6 +120,13 @@ class Duplicates:
             close_all(descriptors)
             return
         self._links.setdefault(link, Duplicate(name, drives=drives)).take(descriptors)
+
+    def descriptor(self, link: int, at: int) -> int | None:
+        """Give a descriptor of a link: 0 its stream's, 1 that of datagrams; None where there is none, or half a frame
+        was written.
+        """
+        duplicate = self._links.get(link)
+        return duplicate.descriptor(at) if duplicate is not None and duplicate.boundary.outgoing else None
 
     def stands(self, streams: dict[int, Boundary]) -> None:
         """Note where the streams stand."""

@@ -9,6 +9,9 @@ import msgspec
 
 from zbridge.robot.observer import Boundary, LastStop
 
+PAGE_BYTES = 256
+"""Size of the shared page, a byte for each link."""
+
 
 class Beat(msgspec.Struct, frozen=True, tag="beat"):
     """The event loop of a gateway turns. streams: where the streams of its links stand, by the links' numbers.
@@ -38,6 +41,23 @@ class Closed(msgspec.Struct, frozen=True, tag="closed"):
     link: int
 
 
+class Shared(msgspec.Struct, frozen=True, tag="shared"):
+    """A page of memory that both processes see; its descriptor comes along. Byte n is 1 while link n is between frames.
+
+    The byte is 0 from before a read until its bytes are handled: then a successor could not go on reading.
+    """
+
+
+class Kept(msgspec.Struct, frozen=True, tag="kept"):
+    """What a successor needs to go on if this process dies (:class:`Given` of the handover), as MessagePack.
+
+    sockets: the numbers of the links and of their descriptors, in the order of the parcel. Empty: nobody could go on.
+    """
+
+    given: bytes = b""
+    sockets: tuple[tuple[int, int], ...] = ()
+
+
 class WantSuccessor(msgspec.Struct, frozen=True, tag="successor"):
     """Start a process that takes this gateway over; the far end of its socket comes along. :class:`Started` answers."""
 
@@ -46,7 +66,7 @@ class Succeeded(msgspec.Struct, frozen=True, tag="succeeded"):
     """The successor has taken over; this process ends by itself."""
 
 
-FromGateway = Beat | Opened | Closed | WantSuccessor | Succeeded
+FromGateway = Beat | Opened | Closed | Shared | Kept | WantSuccessor | Succeeded
 
 
 class Started(msgspec.Struct, frozen=True, tag="started"):

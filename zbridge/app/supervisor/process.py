@@ -5,17 +5,32 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import mmap
 import os
 import signal
 import socket
 import time
 from collections.abc import Callable
 
+import msgspec
+
+from zbridge.app.handover.messages import Given
 from zbridge.app.supervisor.duplicates import Duplicates
 from zbridge.app.supervisor.heart import Heart
-from zbridge.app.supervisor.messages import Beat, Closed, FromGateway, Opened, Succeeded, WantSuccessor
+from zbridge.app.supervisor.messages import (
+    PAGE_BYTES,
+    Beat,
+    Closed,
+    FromGateway,
+    Kept,
+    Opened,
+    Shared,
+    Succeeded,
+    WantSuccessor,
+)
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.robot.observer import LastStop
+from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -52,8 +67,12 @@ class GatewayProcess:
         self.heart = Heart(time.monotonic())
         self.over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         """Done when the process has ended; its wait status."""
+        self.kept = Kept()
+        """What a successor needs if the process dies."""
+        self._page: mmap.mmap | None = None
         self._killed: str | None = None
         self._hung = asyncio.Event()
+        self._began = time.monotonic()
         self._wants_successor = wants_successor
         self._changed = changed
         self._loop = asyncio.get_running_loop()
@@ -71,6 +90,11 @@ class GatewayProcess:
             await self.gone(KILLED_S)
         self.hear()
         return self._killed or self.how
+
+    @property
+    def lived_s(self) -> float:
+        """Seconds since the process was forked."""
+        return time.monotonic() - self._began
 
     async def gone(self, within_s: float) -> bool:
         """Wait so long for the end of the process; whether it has ended."""
@@ -138,6 +162,11 @@ class GatewayProcess:
                 return
             case Closed():
                 self.duplicates.closed(message.link)
+            case Kept():
+                self.kept = message
+            case Shared() if descriptors and self._page is None:
+                with contextlib.suppress(OSError, ValueError):
+                    self._page = mmap.mmap(descriptors[0], PAGE_BYTES, prot=mmap.PROT_READ)
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
             case Succeeded():
@@ -145,9 +174,26 @@ class GatewayProcess:
                 self.duplicates.close()
         close_all(descriptors)
 
+    def inheritance(self) -> tuple[Given, Parcel] | None:
+        """Give what a successor of this dead process can take over; None where it would read or write half a frame."""
+        links = {link for link, _ in self.kept.sockets}
+        if not links or self._page is None or not all(self._page[link] for link in links):
+            return None
+        descriptors = [self.duplicates.descriptor(link, at) for link, at in self.kept.sockets]
+        if None in descriptors:
+            return None
+        try:
+            given = msgspec.msgpack.decode(self.kept.given, type=Given)
+        except msgspec.MsgspecError:
+            return None
+        return given, Parcel([os.dup(number) for number in descriptors if number is not None])
+
     def close(self) -> None:
         """Close the post and all duplicates; idempotent."""
         if self.post.fileno() >= 0:
             self._loop.remove_reader(self.post.fileno())
             self.post.close()
         self.duplicates.close()
+        if self._page is not None:
+            self._page.close()
+            self._page = None

@@ -17,13 +17,14 @@ import socket
 import time
 from collections.abc import Callable
 
-from zbridge.app.supervisor.back_off import BackOff
+from zbridge.app.supervisor.back_off import HEALTHY_S, BackOff
 from zbridge.app.supervisor.files import RobotFile, read
 from zbridge.app.supervisor.forks import Forks
+from zbridge.app.supervisor.inheritance import bequeath
 from zbridge.app.supervisor.messages import Fork, Started
 from zbridge.app.supervisor.post import Post
 from zbridge.app.supervisor.process import KILLED_S, GatewayProcess
-from zbridge.errors import NotReady
+from zbridge.errors import HandoverError, NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -122,10 +123,43 @@ class Runner:
                 how = None
             if how is not None:
                 log.error("%s: process %d %s", self.file.robot, process.pid, how)
-                await self._stop_robot(process)
+                stopped = asyncio.ensure_future(self._stop_robot(process))
+                if successor is None and not self._ending and not process.told_to_end:
+                    self.process = await self._inherited(process, stopped)
+                await stopped
             process.close()
-            if successor is not None:  # one that has not taken over ends by itself
+            if self.process is not None and successor is None:
+                self.restarts += 1
+            elif successor is not None:  # one that has not taken over ends by itself
                 log.info("%s: process %d serves it now", self.file.robot, successor.pid)
+
+    async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
+        """Start a successor of a dead process that keeps its connections; None where that is not possible."""
+        left = process.inheritance() if self._back_off.failures == 0 or process.lived_s >= HEALTHY_S else None
+        if left is None:
+            return None
+        self._back_off.failed(process.lived_s)
+        near, far = socket.socketpair()
+        try:
+            with far:
+                successor = await self._start(far.fileno())
+        except NotReady as error:
+            log.error("%s: its connections are lost: %s", self.file.robot, error)
+            near.close()
+            left[1].close()
+            return None
+        self._successor = successor
+        try:
+            await bequeath(near, *left, stopped)
+        except HandoverError as error:
+            log.error("%s: its connections are lost: %s", self.file.robot, error)
+            await self._end(successor)
+            successor.close()
+            return None
+        finally:
+            self._successor = None
+        log.info("%s: process %d goes on with its connections", self.file.robot, successor.pid)
+        return successor
 
     async def _stop_robot(self, process: GatewayProcess) -> None:
         """Write the stop that the process deposited last."""

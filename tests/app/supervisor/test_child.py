@@ -1,18 +1,34 @@
 """What a gateway process tells its supervisor: the device and the links are played, the post is a real socket."""
 
 import asyncio
+import mmap
+import os
 import signal
 import socket
 from collections.abc import AsyncIterator, Iterator
 
+import msgspec
 import pytest
 
+from zbridge.app.handover.messages import Given
 from zbridge.app.supervisor import child
 from zbridge.app.supervisor.child import Reporter
-from zbridge.app.supervisor.messages import Beat, Closed, Message, Opened, Started, Succeeded, WantSuccessor
+from zbridge.app.supervisor.messages import (
+    PAGE_BYTES,
+    Beat,
+    Closed,
+    Kept,
+    Message,
+    Opened,
+    Shared,
+    Started,
+    Succeeded,
+    WantSuccessor,
+)
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.errors import HandoverError
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
+from zbridge.transport import Parcel
 from zbridge.transport.fake import FakeLink
 
 
@@ -46,8 +62,17 @@ class Scene:
         self.reporter, self.device = Reporter(Post(far)), PlayedDevice()
         self.descriptors = 0
         self.reporter.begin()
+        received = self.post.receive()
+        assert received is not None
+        shared, (self.page,) = received
+        assert shared == Shared()
         self.reporter.began(self.device)
         self.told()
+
+    def close(self) -> None:
+        self.reporter.close()
+        self.post.close()
+        os.close(self.page)
 
     def told(self) -> list[Message]:
         """What was told since."""
@@ -78,8 +103,7 @@ class Scene:
 async def scene() -> AsyncIterator[Scene]:
     scene = Scene()
     yield scene
-    scene.reporter.close()
-    scene.post.close()
+    scene.close()
 
 
 @pytest.fixture
@@ -179,6 +203,52 @@ async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -
         monkeypatch.setattr(child, "ANSWER_S", 0.01)
         with pytest.raises(HandoverError, match="no successor within"):
             await scene.reporter.start_successor(far)
+
+
+async def test_what_a_successor_needs_is_deposited_with_its_sockets(scene: Scene, sock: socket.socket) -> None:
+    link = FakeLink()
+    link.descriptors = (sock.fileno(),)
+    scene.reporter.linked("robot", link, True)
+    given = Given(1, {}, 1, claim={"since": 1.0}, device={"links": []})
+    left = [given]
+
+    def keep(parcel: Parcel) -> Given | None:
+        parcel.put(sock.fileno())
+        return left[0] if left else None
+
+    scene.reporter.keep = keep
+    scene.told()
+    scene.device.now = LastStop(state="handshaking")
+    scene.reporter.changed()
+    kept = next(message for message in scene.told() if isinstance(message, Kept))
+    assert msgspec.msgpack.decode(kept.given, type=Given) == given
+    assert kept.sockets == ((1, 0),)
+    left.clear()
+    scene.device.now = LastStop(state="closing")
+    scene.reporter.changed()
+    assert Kept() in scene.told(), "nobody could go on any more"
+
+
+async def test_the_shared_page_tells_at_any_time_whether_a_link_is_between_frames(sock: socket.socket) -> None:
+    scene = Scene()
+    link = FakeLink()
+    link.descriptors = (sock.fileno(),)
+    scene.reporter.linked("robot", link, True)
+    with mmap.mmap(scene.page, PAGE_BYTES, prot=mmap.PROT_READ) as page:
+        seen = [page[1]]
+        scene.reporter.read("robot")
+        seen.append(page[1])
+        link.reads()  # bytes are about to be taken from the kernel
+        seen.append(page[1])
+        scene.device.stands = Boundary(incoming=False)
+        scene.reporter.read("robot")
+        seen.append(page[1])
+        scene.device.stands = Boundary()
+        scene.reporter.read("robot")
+        scene.reporter.linked("robot", link, False)
+        seen.append(page[1])
+    assert seen == [0, 1, 0, 0, 0]
+    scene.close()
 
 
 async def test_the_end_of_the_supervisor_ends_the_process_in_order(scene: Scene) -> None:

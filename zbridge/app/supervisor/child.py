@@ -102,6 +102,7 @@ class Reporter:
         if self._post.fileno() >= 0:
             self._loop.remove_reader(self._post.fileno())
             self._post.close()
+            self._page.close()
 
     async def start_successor(self, far_end: socket.socket) -> None:
         """Ask for a process that takes over from ``far_end``; raise HandoverError if none is started."""

@@ -125,6 +125,7 @@ class Device:
             self._show()
         self._declare()
         if begin is not None:
+            await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
             await self.go_on()
             self._show()

@@ -47,6 +47,8 @@ _ZID = 6
 """Characters of the bus session's id in a listener's name: they differ between processes."""
 RETRY_S = 1.0
 """Seconds between attempts to open the bus."""
+LINGER_S = 0.2
+"""Seconds between a handover and the end of the bus session: closing it drops what Zenoh has not yet sent."""
 TELL_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
@@ -101,6 +103,8 @@ class Gateway:
                     self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))
                 raise
             finally:
+                if self.restarts.gone.is_set():  # what was published last is still on its way
+                    await asyncio.sleep(LINGER_S)
                 self.left = await bus.close()
 
     async def _run(self, bus: Bus, audit: Audit) -> None:

@@ -134,6 +134,7 @@ class Device:
             self._show()
         self._declare()
         if begin is not None:
+            await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
             await self.go_on()
             self._show()
@@ -281,9 +282,9 @@ class Device:
 
     async def take_over(self, given: Exported, parcel: Parcel) -> None:
         """Hold what another process handed over; raise ProtocolError, OSError. Call :meth:`run` with ``begin`` then."""
-        self._publishers.restore(given["published"])
         for connection, link in zip(self._links, given["links"], strict=True):
             await connection.take_over(link, parcel)
+        self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
         if any(given["links"]):
             self._context.robot.restore(given["robot"])
         session = self._context.robot.driving

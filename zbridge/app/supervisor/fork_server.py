@@ -11,6 +11,7 @@ begins with the post, the standard streams and nothing else that is open, and wi
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import select
@@ -23,8 +24,10 @@ from typing import NoReturn
 
 import msgspec
 
+from zbridge.app.config import plan
 from zbridge.app.supervisor.messages import Fork, Forked, Ready
 from zbridge.app.supervisor.post import Post, close_all
+from zbridge.errors import ConfigError
 from zbridge.protocol.plugin import find_protocol, protocol_names
 
 IMPORTED = ("numpy", "uvloop", "serial", "encodings.idna", "zbridge.bus.zenoh", "zbridge.app.gateway")
@@ -80,6 +83,8 @@ def _import_all() -> None:
             continue
     for name in protocol_names():
         find_protocol(name)
+        with contextlib.suppress(ConfigError):  # what the first check of a configuration makes, all gateways share
+            plan({"robot": {"name": "r1"}, "device": {"protocol": name, "connect": ["tcp://127.0.0.1:1"]}})
 
 
 def _forked(control: Post, request: Fork, descriptors: list[int], run: Run) -> Forked:

@@ -1,19 +1,19 @@
 """Decides when a gateway process counts as hung. Sans-IO: time is an argument, in seconds.
 
-A robot that moves when its gateway hangs has to rest within 1.5 s: a driven process is given 1 s without a beat (it
-beats five times a second), which leaves half a second for the stop. Where the machine held up the supervisor itself,
+A robot that moves when its gateway hangs has to rest within 1.5 s: a driven process is given 0.8 s without a beat (it
+beats five times a second), which leaves 0.7 s for a busy machine and the stop. Where the machine held up the supervisor itself,
 the beats may be late for the same reason, and get a little longer.
 """
 
 from __future__ import annotations
 
-DRIVEN_S = 1.0
+DRIVEN_S = 0.8
 """Longest time without a beat while the robot is driven."""
 IDLE_S = 5.0
 """The same while it is not driven."""
 FIRST_S = 30.0
 """Longest time until the first beat: thirty processes that start at once share the processors."""
-EXCUSED_S = 0.3
+EXCUSED_S = 0.2
 """Most that is added for a supervisor that was held up itself."""
 
 

@@ -6,11 +6,13 @@ comes when the robot's stop is written: two processes never write to one socket.
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Awaitable
 
 from zbridge.app.handover.channel import Channel
 from zbridge.app.handover.messages import Given, Go, Hello, Up
+from zbridge.app.supervisor.duplicates import PERIOD_S
 from zbridge.errors import HandoverError
 from zbridge.transport import Parcel
 
@@ -29,6 +31,7 @@ async def bequeath(near: socket.socket, given: Given, parcel: Parcel, stopped: A
         await channel.send(given, parcel)
         await channel.receive(Up, TAKE_OVER_S)
         await stopped
+        await asyncio.sleep(PERIOD_S)  # the successor begins with a stop: the robot must not read both as one packet
         await channel.send(Go())
     finally:
         channel.close()

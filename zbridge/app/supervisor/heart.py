@@ -1,8 +1,8 @@
 """Decides when a gateway process counts as hung. Sans-IO: time is an argument, in seconds.
 
 A robot that moves when its gateway hangs has to rest within 1.5 s: a driven process is given 0.8 s without a beat (it
-beats five times a second), which leaves 0.7 s for a busy machine and the stop. Where the machine held up the supervisor itself,
-the beats may be late for the same reason, and get a little longer.
+beats five times a second), which leaves 0.7 s for a busy machine and the stop. Where the machine held up the supervisor
+itself, the beats may be late for the same reason, and get a little longer.
 """
 
 from __future__ import annotations

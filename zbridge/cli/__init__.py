@@ -1,10 +1,11 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, restart,
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, health, echo, drive, stop, restart,
 certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``probe``,
-``restart`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes: 0 done, 1 failed, 2 wrong
-arguments or configuration.
+``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo``, ``drive``, ``health``,
+``probe``, ``restart``, ``router`` and ``supervise`` carry theirs out, ``keyboard`` turns keys into drives,
+``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2
+wrong arguments or configuration; those of ``health`` are for monitoring programs.
 """
 
 from __future__ import annotations

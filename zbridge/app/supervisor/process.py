@@ -34,7 +34,7 @@ from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.supervisor")
 
-KILLED_S = 0.2
+KILLED_S = 0.05
 """Longest wait for the end of a process that was killed, before its robot is stopped."""
 _MESSAGES = 64
 """Most messages that are taken from one process before others have their turn."""

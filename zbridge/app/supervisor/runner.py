@@ -30,6 +30,8 @@ log = logging.getLogger("zbridge.app.supervisor")
 
 END_S = 5.0
 """Seconds that a process is given to end in order, with its robot's stop."""
+GONE_S = 2.0
+"""Longest wait for the end of a process that was killed, before another one has its connections."""
 HAND_OVER_S = 20.0
 """Seconds that a process is given to hand over to a successor."""
 
@@ -135,6 +137,8 @@ class Runner:
 
     async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
         """Start a successor of a dead process that keeps its connections; None where that is not possible."""
+        if not await process.gone(GONE_S):  # it may still be within a read
+            return None
         left = process.inheritance() if self._back_off.failures == 0 or process.lived_s >= HEALTHY_S else None
         if left is None:
             return None

@@ -176,7 +176,8 @@ class Fleet:
 def start(*arguments: str, **popen: Any) -> subprocess.Popen[str]:
     """Start a command of zbridge."""
     output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, **popen}
-    command = [sys.executable, "-m", "zbridge", *arguments]
+    main = os.environ.get("ZBRIDGE_TEST_MAIN")
+    command = [sys.executable, *([main] if main else ["-m", "zbridge"]), *arguments]
     return subprocess.Popen(command, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}, **output)
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import signal
 import time
-from pathlib import Path
 
 import pytest
 
 from tests.e2e.conftest import Bench, device, free_port, start, until
 from tests.e2e.fragile import Fragile, charges
+from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
 
@@ -38,7 +38,9 @@ def test_a_strict_robot_finds_nothing_to_complain_of_in_a_restart_while_it_is_dr
     until(lambda: bench.fleet.last("r1/control").get("state") == "free", what="the new authority")
     report = robot.ended()
     assert charges(report["violations"]) == []
-    assert report["alive"] and not report["left"] and not report["moving"]
+    assert report["alive"]
+    assert not report["left"]
+    assert not report["moving"]
     gateway.end()
 
 
@@ -52,12 +54,14 @@ def served(bench: Bench, robot: Robot, *more: str) -> Restarted:
 def refused(gateway: Restarted, robot: Robot, bench: Bench, reason: str) -> None:
     """The restart is refused for this reason, and the gateway goes on: it takes commands, and telemetry flows."""
     (answer,) = gateway.ask()
-    assert answer["code"] == "not_ready" and re.search(reason, answer["reason"]), answer
+    assert answer["code"] == "not_ready"
+    assert re.search(reason, answer["reason"]), answer
     bench.fleet.hold("r1", deadman_s=1.0)
     drive = {"forward": 0.5, "left": 0.0, "turn": 0.0}
     since = time.monotonic()
     until(lambda: bench.fleet.put("r1/@cmd/drive", **drive) or robot.packets(MOVE, since), what="motion")
-    assert robot.connections == 1 and bench.fleet.state() == "established"
+    assert robot.connections == 1
+    assert bench.fleet.state() == "established"
     assert re.search(reason, gateway.gateway.log)
 
 
@@ -107,12 +111,12 @@ def test_a_broken_successor_is_ended_and_the_gateway_goes_on(
     bench: Bench, robot: Robot, monkeypatch: pytest.MonkeyPatch, how: str, reason: str
 ) -> None:
     broken = bench.folder / "broken.py"
-    broken.write_text(FAKE.format(root=str(Path(__file__).parents[2]), how=how))
+    broken.write_text(FAKE.format(root=str(ROOT), how=how))
     patched = bench.folder / "patched.py"
     patched.write_text(
-        "import sys\n"
+        f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
         "from zbridge.app.handover import outgoing, successor\n"
-        "outgoing.START_S, outgoing.TAKE_OVER_S = 2.0, 0.5\n"
+        f"outgoing.START_S, outgoing.TAKE_OVER_S = {1.0 if how == 'silent' else 20.0}, 0.5\n"
         f"successor.COMMAND = [sys.executable, {str(broken)!r}]\n"
         "from zbridge.cli import main\n"
         "main()\n"
@@ -136,8 +140,10 @@ def test_the_signal_restarts_too_and_the_old_process_ends_with_0(bench: Bench, r
 def test_the_command_waits_for_the_answer_and_tells_a_refusal(bench: Bench, robot: Robot) -> None:
     gateway = served(bench, robot)
     done = start("restart", "r1", "--connect", bench.endpoint)
-    assert done.communicate(timeout=60)[0].strip() == "r1: restarted" and done.returncode == 0
+    assert done.communicate(timeout=60)[0].strip() == "r1: restarted"
+    assert done.returncode == 0
     (bench.folder / "r1.toml").write_text("nonsense\n")
     done = start("restart", "--all", "--connect", bench.endpoint)
-    assert "r1: not restarted" in done.communicate(timeout=60)[0] and done.returncode == 1
+    assert "r1: not restarted" in done.communicate(timeout=60)[0]
+    assert done.returncode == 1
     gateway.end()

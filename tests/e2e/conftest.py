@@ -98,7 +98,10 @@ class Lease:
         threading.Thread(target=self._renew, daemon=True).start()
 
     def _ask(self, name: str, payload: bytes) -> dict[str, Any]:
-        answers = ask(self._session, self._key + name, payload)
+        try:
+            answers = ask(self._session, self._key + name, payload)
+        except ValueError:  # Zenoh's own words: who should have answered has just left the bus
+            return {}
         return answers[0] if answers else {}
 
     def _renew(self) -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import signal
 import time
 
 import pytest
 
-from tests.e2e.conftest import Bench, device, free_port, start, until
+from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
+from gateways.wc2ec.conformance.fragile_hq import FragileController
+from tests.e2e.conftest import HOST, Bench, device, free_port, listener, start, until
 from tests.e2e.fragile import Fragile, charges
+from tests.e2e.hq_scene import playing, ports, soon
 from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
@@ -42,6 +47,47 @@ def test_a_strict_robot_finds_nothing_to_complain_of_in_a_restart_while_it_is_dr
     assert not report["left"]
     assert not report["moving"]
     gateway.end()
+
+
+# HQ programs
+
+
+async def test_old_hq_programs_stay_connected_and_drive_again_after_neutral(bench: Bench) -> None:
+    tcp, alf, ec = ports(3)
+    parts = [listener("tcp", "tcpudp", tcp), listener("alf", "alf", alf), listener("ec", "wc2ec", ec)]
+    gateway = Restarted(bench, bench.gateway(device(bench.simulator()), *parts))
+    await soon(lambda: gateway.gateway.listens(3), "listeners")
+    await soon(lambda: bench.fleet.state() == "established", "established")
+    program, vehicle, controller = TcpHq(), AlfHq(), FragileController()
+
+    async def drives() -> None:
+        before = bench.fleet.last("r1/pose")
+        program.move(0.0, 1.0, 0.5)
+        await soon(lambda: abs(bench.fleet.last("r1/pose")["y"] - before["y"]) > 0.1, "motion")
+        assert bench.fleet.last("r1/control")["holder"] == "hq.tcp.2"
+
+    async with playing(program.run(HOST, tcp), vehicle.run(HOST, alf), controller.run(HOST, ec)):
+        await soon(lambda: program.position, "position")
+        program.mode(2)
+        program.idle()
+        await drives()
+        assert await asyncio.to_thread(gateway.ask) == [{}]
+        received = len(program.received)
+        await soon(lambda: bench.fleet.refusal(code="neutral_first", who="hq.tcp.2"), "the stick still pushed")
+        await soon(lambda: len(program.received) > received + 3, "telemetry for the program")
+        still = bench.fleet.last("r1/pose")
+        await soon(lambda: bench.fleet.last("r1/pose")["at"] > still["at"] + 0.5, "a pose")
+        assert bench.fleet.last("r1/pose")["y"] == pytest.approx(still["y"])
+        program.idle()
+        await drives()
+        assert not [event for each in (program, vehicle, controller) for event in each.events if "ended" in event]
+        program.idle()
+        await vehicle.end()
+        gateway.end()
+    for each in (program, vehicle, controller):
+        assert each.alive
+        assert charges(each.violations) == []
+    assert not [text for text in program.texts if "gateway serves" in text or "the robot is there" in text]
 
 
 # Successors that fail

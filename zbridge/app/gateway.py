@@ -59,9 +59,8 @@ _RIVALS = "rivals"
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this process, shared by all parts. observer: is told of the robot's links.
-    predecessor: the channel to a gateway that hands everything over. successor: starts the process to which this
-    gateway can be handed over.
+    metrics, sessions, conditions: shared by all parts. observer: is told of the robot's links. predecessor: the channel
+    to a gateway that hands everything over. successor: starts a process to which this one can be handed over.
     """
 
     def __init__(
@@ -130,7 +129,7 @@ class Gateway:
             await until(self.restarts.gone, together(*work))
 
     async def _serve_metrics(self, address: Address) -> None:
-        """Serve the counters; first of all wait until a predecessor has let go."""
+        """Serve the counters, once a predecessor has let go."""
         given = []
         if self._incoming is not None:
             await self._incoming.begun.wait()
@@ -140,17 +139,16 @@ class Gateway:
 
     def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
         plans, incoming = self._plan.listeners, self._incoming
-        given = incoming.given.listeners if incoming is not None else (None,) * len(plans)
-        parcel = incoming.parcel if incoming is not None else None
+        given = [(each, incoming.parcel) for each in incoming.given.listeners] if incoming else [None] * len(plans)
         return [
             Listener(
                 plan,
-                plan.settings.name or (each["name"] if each is not None else name),
+                plan.settings.name or (each[0]["name"] if each else name),
                 robot,
                 self.sessions,
                 self.metrics,
                 time.monotonic,
-                (each, parcel) if each is not None and parcel is not None else None,
+                each,
             )
             for plan, name, each in zip(plans, self._listener_names(bus), given, strict=True)
         ]

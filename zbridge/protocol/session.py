@@ -19,15 +19,15 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from enum import Enum
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.messages import SessionEntry
-from zbridge.protocol.kept import Exported, Kept
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.session_kept import KeptSession
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
@@ -57,24 +57,9 @@ _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
 """Every message is compared with these; a lookup in the class is slow in Python 3.11."""
 
 
-class Session(Kept, ABC, Generic[M]):
+class Session(KeptSession, ABC, Generic[M]):
     """One conversation; a protocol subclasses it once for each role it plays."""
 
-    kept: ClassVar[dict[str, Any]] = {
-        "state": State,
-        "reason": str | None,
-        "busy": str | None,
-        "doubts": tuple[str, ...],
-        "version": str | None,
-        "features": tuple[str, ...],
-        "transport": str,
-        "traffic": Traffic,
-        "left_out": dict[str, int],
-        "last_malformed": str | None,
-        "outbox": Outbox,
-        "_limit_at": float,
-        "_allowance": RateLimit,
-    }
     role: Role
     frame_end: FrameEnd
     handled: frozenset[type] = frozenset()
@@ -107,19 +92,6 @@ class Session(Kept, ABC, Generic[M]):
     def __repr__(self) -> str:
         reason = f" ({self.reason})" if self.reason else ""
         return f"<{type(self).__name__} {self.name or self.peer} {self.state.value}{reason}>"
-
-    def export(self) -> Exported:
-        """Write the state, with the frame that has come in part. A protocol names in ``kept`` what is its own."""
-        return super().export() | {"rest": self._frames.rest}
-
-    def restore(self, state: Exported) -> None:
-        """Take over the state of the same session of another process; raise ProtocolError if it has another form.
-
-        To be called in place of :meth:`open`, on a session that was just made from the same settings.
-        """
-        super().restore(state)
-        for frame in self._frames.feed(state.get("rest", b"")):
-            raise ProtocolError(f"a whole frame of {len(frame)} bytes was left over")
 
     # What a protocol contributes
 

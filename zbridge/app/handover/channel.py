@@ -82,8 +82,8 @@ class Channel:
             message = decode(self._read(size))
         except TimeoutError as error:
             raise HandoverError(f"the other side says nothing for {timeout_s:g} s") from error
-        except OSError as error:
-            raise HandoverError(f"the other side is gone: {error}") from error
+        except OSError as error:  # reset: it ended with a message of ours unread
+            raise EndError("the other side has ended") from error
         except msgspec.MsgspecError as error:
             raise HandoverError(f"the other side cannot be understood: {error}") from error
         if isinstance(message, Failed):

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from zbridge.errors import HandoverError
 
+COMMAND = [sys.executable, "-m", "zbridge"]
+"""The installed version of this program."""
 Successor = Callable[[socket.socket], Awaitable[None]]
 """``await start(far_end)``: start a process that owns the far end; raise HandoverError where none can be started.
 
@@ -41,7 +43,7 @@ class Spawn:
     def _start(self, descriptor: int) -> subprocess.Popen[bytes]:
         if self.process is not None:
             self.process.poll()
-        command = [sys.executable, "-m", "zbridge", "run", str(self._file), "--take-over", str(descriptor)]
+        command = [*COMMAND, "run", str(self._file), "--take-over", str(descriptor)]
         command += ["--verbose"] if self._verbose else []
         return subprocess.Popen(command, pass_fds=(descriptor,))
 

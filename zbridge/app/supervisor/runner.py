@@ -32,7 +32,9 @@ END_S = 5.0
 """Seconds that a process is given to end in order, with its robot's stop."""
 GONE_S = 2.0
 """Longest wait for the end of a process that was killed, before another one has its connections."""
-HAND_OVER_S = 20.0
+ASK_S = 5.0
+"""Longest wait until a process that was told to hand over asks for its successor."""
+HAND_OVER_S = 40.0
 """Seconds that a process is given to hand over to a successor."""
 
 
@@ -49,6 +51,10 @@ class Runner:
         self._back_off = BackOff()
         self._successor: GatewayProcess | None = None
         self._succession: asyncio.Task[None] | None = None
+        self._asked = asyncio.Event()
+        """Set when the process asks for a successor."""
+        self._settled = asyncio.Event()
+        """Set when a successor has taken over, or has not."""
         self._ending = False
         self._now = asyncio.Event()
         """Set to start the next process without waiting."""
@@ -121,6 +127,7 @@ class Runner:
             how = await process.ended()
             successor, self._successor = self._successor, None
             self.process = successor
+            self._settled.set()
             if process.succeeded or (process.told_to_end and not len(process.duplicates)):
                 how = None
             if how is not None:
@@ -196,12 +203,22 @@ class Runner:
 
     async def _handed_over(self, process: GatewayProcess) -> bool:
         """Ask a process to hand over to one that runs by the new file; False if that failed."""
+        self._asked.clear()
+        self._settled.clear()
         process.signal(signal.SIGUSR2)
-        await asyncio.wait([process.over], timeout=HAND_OVER_S)
+        for event, within_s in ((self._asked, ASK_S), (self._settled, HAND_OVER_S)):
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(within_s):
+                    await event.wait()
+            if not event.is_set():
+                break
+        if process.succeeded:
+            await process.gone(END_S)
         return process.succeeded
 
     def _succeed(self, process: GatewayProcess, far_end: socket.socket) -> None:
         """Start the successor of a process; ``far_end``: the socket from which it takes over."""
+        self._asked.set()
         self._succession = asyncio.ensure_future(self._start_successor(process, far_end))
 
     async def _start_successor(self, process: GatewayProcess, far_end: socket.socket) -> None:
@@ -219,12 +236,14 @@ class Runner:
                     reason = str(error)
         if reason is not None:
             log.error("%s: no successor: %s", self.file.robot, reason)
+            self._settled.set()
         process.post.send(Started(reason))
 
     def _watch(self, successor: GatewayProcess) -> None:
         """Forget a successor that ends before it has taken over."""
 
         def ended(_: object) -> None:
+            self._settled.set()
             if self._successor is successor:
                 self._successor = None
                 log.error("%s: process %d has not taken over: %s", self.file.robot, successor.pid, successor.how)

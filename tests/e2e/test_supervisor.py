@@ -88,6 +88,12 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1], "its robot noticed nothing"
     assert fleet.state("r5") == "established"
 
+    former, host.robots[4] = host.robots[4], host.bench.stack.enter_context(contextlib.closing(Robot()))
+    host.write(4)
+    host.reload("r4.toml: has changed")
+    until(lambda: host.robots[4].connections == 1, 20, "a robot at another address, which cannot be handed over")
+    assert former.ended
+
     (host.folder / "r7.toml").unlink()
     host.reload("is gone")
     until(lambda: host.robots[7].ended, what="the end of one gateway")

@@ -56,7 +56,7 @@ class Conversation:
     ``refused`` is told which datagrams in the peer's name did not come from the peer.
     ``may_warn(kind)`` says whether a warning of this kind may be logged now.
     ``linked`` is called with the link and True when the link is up, and False when it is gone.
-    ``read`` is called when the bytes of a read have been handled.
+    ``read`` is called when the bytes of a read have been cut into frames.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
@@ -120,8 +120,9 @@ class Conversation:
     @_then_pump
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        self._hand_on(self.session.receive(data, self._clock()))
+        messages = self.session.receive(data, self._clock())
         self._read()
+        self._hand_on(messages)
 
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:

@@ -54,12 +54,12 @@ class Duplicate:
         close_all([number for number in (self._stream, self._datagrams) if number is not None])
         self._stream = self._datagrams = None
 
-    async def stop(self, last: LastStop) -> bool:
-        """Write the stop several times; False where the link takes nothing.
+    async def stop(self, last: LastStop, times: int) -> bool:
+        """Write the stop so often; False where the link takes nothing.
 
         The first frame waits for one gap: the dead process may have written a moment ago.
         """
-        for time in range(TIMES):
+        for time in range(times):
             if time:
                 await asyncio.sleep(PERIOD_S)
             for frame in last.frames:
@@ -144,12 +144,12 @@ class Duplicates:
         while self._links:
             self._links.popitem()[1].close()
 
-    async def stop(self, last: LastStop) -> bool | None:
-        """Write the robot's stop; whether its link took it, None where there is no link or no stop."""
+    async def stop(self, last: LastStop, times: int = TIMES) -> bool | None:
+        """Write the robot's stop so often; whether its link took it, None where there is no link or no stop."""
         driving = [link for link in self._links.values() if link.drives]
         if not driving or not last.frames:
             return None
-        return await driving[-1].stop(last)
+        return await driving[-1].stop(last, times)
 
 
 def _is_link(descriptor: int) -> bool:

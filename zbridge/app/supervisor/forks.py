@@ -137,15 +137,19 @@ class Forks:
         """The process id of the fork server."""
         return self._server.pid if self._server is not None else None
 
-    async def fork(self, request: Fork, post: socket.socket, take_over: int | None = None) -> int:
+    async def fork(
+        self, request: Fork, post: socket.socket, take_over: int | None = None, *, at_once: bool = False
+    ) -> int:
         """Fork a gateway and return its process id; raise NotReady with the reason.
 
-        post: the gateway's end. take_over: descriptor of the socket by which it takes over.
+        post: the gateway's end. take_over: descriptor of the socket by which it takes over. at_once: do not look
+        whether the installation has changed.
         """
         descriptors = [post.fileno()] if take_over is None else [post.fileno(), take_over]
         loop = asyncio.get_running_loop()
         async with self._turn:
-            if self._server is None or not self._server.alive or loop.time() >= self._looked_at + LOOK_S:
+            looks = not at_once and loop.time() >= self._looked_at + LOOK_S
+            if looks or self._server is None or not self._server.alive:
                 await self._renew()
             assert self._server is not None
             return await self._server.fork(request, descriptors)
@@ -161,7 +165,7 @@ class Forks:
     async def _renew(self) -> None:
         self._looked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
-        old, stamp = self._server, Stamp()
+        old, stamp = self._server, await asyncio.to_thread(Stamp)
         if old is not None and old.alive:
             if stamp == old.stamp or stamp == self._refused or not stamp.settled:
                 return

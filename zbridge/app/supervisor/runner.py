@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 
 from zbridge.app.supervisor.back_off import HEALTHY_S, BackOff
+from zbridge.app.supervisor.duplicates import PERIOD_S, TIMES
 from zbridge.app.supervisor.files import RobotFile, read
 from zbridge.app.supervisor.forks import Forks
 from zbridge.app.supervisor.inheritance import bequeath
@@ -106,12 +107,13 @@ class Runner:
 
     # One process
 
-    async def _start(self, take_over: int | None = None) -> GatewayProcess:
+    async def _start(self, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
+        """Fork a process; ``at_once``: without a look at the installation."""
         post, far = Post.pair()
         request = Fork(str(self.file.path), self.file.robot, self._verbose)
         try:
             with far:
-                pid = await self._forks.fork(request, far, take_over)
+                pid = await self._forks.fork(request, far, take_over, at_once=at_once)
         except NotReady:
             post.close()
             raise
@@ -132,7 +134,8 @@ class Runner:
                 how = None
             if how is not None:
                 log.error("%s: process %d %s", self.file.robot, process.pid, how)
-                stopped = asyncio.ensure_future(self._stop_robot(process))
+                await process.duplicates.stop(process.last, 1)  # before anything that may take time
+                stopped = asyncio.ensure_future(self._stop_again(process))
                 if successor is None and not self._ending and not process.told_to_end:
                     self.process = await self._inherited(process, stopped)
                 await stopped
@@ -153,7 +156,7 @@ class Runner:
         near, far = socket.socketpair()
         try:
             with far:
-                successor = await self._start(far.fileno())
+                successor = await self._start(far.fileno(), at_once=True)
         except NotReady as error:
             log.error("%s: its connections are lost: %s", self.file.robot, error)
             near.close()
@@ -172,9 +175,10 @@ class Runner:
         log.info("%s: process %d goes on with its connections", self.file.robot, successor.pid)
         return successor
 
-    async def _stop_robot(self, process: GatewayProcess) -> None:
-        """Write the stop that the process deposited last."""
-        took = await process.duplicates.stop(process.last)
+    async def _stop_again(self, process: GatewayProcess) -> None:
+        """Write the stop that the process deposited last some times more."""
+        await asyncio.sleep(PERIOD_S)
+        took = await process.duplicates.stop(process.last, TIMES - 1)
         if took is not None:
             moved = "it was driven" if process.last.driven else "it was not driven"
             what = "the robot was sent its stop" if took else "the robot's link takes no stop"

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from tests.transport.recorder import LOCAL, Recorder, connected
+from tests.transport.recorder import LOCAL, Recorder, connected, until
 from zbridge.errors import ProtocolError
 from zbridge.transport import Door, Parcel, listen
 from zbridge.transport.tcp import take_over
@@ -63,9 +63,7 @@ async def test_a_shut_door_keeps_who_comes_for_the_next_owner() -> None:
                 assert not came
                 await other.open()
                 peer.sendall(b"hello")
-                async with asyncio.timeout(5):
-                    while not came:
-                        await asyncio.sleep(0.01)
+                await until(lambda: bool(came))
                 await came[0].until("received", received=5)
 
 

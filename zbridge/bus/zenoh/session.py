@@ -231,11 +231,11 @@ class ZenohBus:
         return self._keep(Declared(watch))
 
     async def flush(self) -> None:
-        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S` seconds."""
+        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S`."""
         await self._flush(self._writer)
 
     async def drain(self, key_expr: str) -> None:
-        """Wait until all that was published has left; a query of the lowest priority for ``key_expr`` goes behind it."""
+        """Wait until all that was published has left: a query of the lowest priority goes behind it."""
         await self._flush(self._streams)
         options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
         await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)

@@ -160,7 +160,7 @@ class Gateway:
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
                     device = self._make_device(bus, audit, plan)
-                    await device.take_over(given.device, incoming.parcel)
+                    device.take_over(given.device, incoming.parcel)
                     await self._serve_shown(bus, ownership, device, incoming.taken)
                 elif not incoming.given.listeners:
                     await incoming.finish()

@@ -33,6 +33,7 @@ async def test_what_came_while_a_link_was_held_is_read_once_by_who_took_it_over(
         link.write(b"answer")
         await pair.far.until("received", received=6)
         link.abort()
+        pair.near.lost("released")  # nobody tells it: that is the point
 
 
 async def test_a_shut_door_keeps_who_comes_for_the_next_owner() -> None:

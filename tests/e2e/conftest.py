@@ -203,8 +203,10 @@ class Gateway:
     ``parts``: of its configuration, besides robot and bus. It is killed with the stack.
     """
 
-    def __init__(self, stack: contextlib.ExitStack, file: Path, endpoint: str, *parts: str, robot: str = "r1") -> None:
-        bus = f'[bus]\nconnect = ["{endpoint}"]\nmulticast = false\n'
+    def __init__(
+        self, stack: contextlib.ExitStack, file: Path, endpoint: str, *parts: str, robot: str = "r1", bus: str = ""
+    ) -> None:
+        bus = f'[bus]\nconnect = ["{endpoint}"]\nmulticast = false\n{bus}\n'
         file.write_text(f'[robot]\nname = "{robot}"\n' + "".join(parts) + bus)
         self._log = file.with_suffix(".log")
         with self._log.open("ab") as log:
@@ -296,10 +298,10 @@ class Bench:
         assert "listening" in process.stdout.readline()
         return port
 
-    def gateway(self, *parts: str, robot: str = "r1", name: str = "", endpoint: str = "") -> Gateway:
+    def gateway(self, *parts: str, robot: str = "r1", name: str = "", endpoint: str = "", bus: str = "") -> Gateway:
         """Start a process for a robot with these parts of a configuration."""
         file = self.folder / f"{name or robot}.toml"
-        process = Gateway(self.stack, file, endpoint or self.endpoint, *parts, robot=robot)
+        process = Gateway(self.stack, file, endpoint or self.endpoint, *parts, robot=robot, bus=bus)
         self._processes.append(process.process.pid)
         return process
 

@@ -112,7 +112,7 @@ class Gateway:
         async with contextlib.AsyncExitStack() as stack:
             if self._plan.metrics is not None:
                 stack.callback(bus.watch_connected(self._on_bus).close)
-            robot = RobotSubscription(bus, self._keys, self.metrics)
+            self.restarts.bus, robot = bus, RobotSubscription(bus, self._keys, self.metrics)
             listeners = self._listeners(bus, robot)
             taken = self._incoming.taken if self._incoming is not None else None
             work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
@@ -182,7 +182,7 @@ class Gateway:
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
                     device = self._make_device(bus, audit, plan)
-                    await device.take_over(given.device, incoming.parcel)
+                    device.take_over(given.device, incoming.parcel)
                     await self._serve_shown(bus, ownership, device, incoming.taken)
                 elif not incoming.given.listeners:
                     await incoming.finish()
@@ -338,10 +338,7 @@ async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
 async def until_signal(
     work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
 ) -> None:
-    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended.
-
-    ``on``: what to run, by signal, while the coroutine runs.
-    """
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then end it. ``on``: what other signals run beside."""
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []

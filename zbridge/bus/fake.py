@@ -168,6 +168,9 @@ class FakeBus:
     async def flush(self) -> None:
         pass
 
+    async def drain(self, key_expr: str) -> None:
+        pass
+
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
         if any(matches(key_expr, key) for key_expr, _ in self._shared.subscribers):

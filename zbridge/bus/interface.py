@@ -185,6 +185,12 @@ class Bus(Protocol):
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded); raise BusError after 2 s."""
 
+    async def drain(self, key_expr: str) -> None:
+        """Wait until all that was published has left this process, streams too; ``key_expr``: a query for its answer.
+
+        The query has the lowest priority, so that all else goes before it. Waits for a second at most, raises BusError.
+        """
+
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
 

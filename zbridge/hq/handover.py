@@ -50,6 +50,8 @@ class ListenerHandover:
         self._clients = clients
         self._numbers = numbers
         self._make = make
+        self._given: list[tuple[Client, object, tuple[str, int] | None]] = []
+        """Clients that were taken over and are not yet attached: number of the descriptor, source of datagrams."""
 
     def __repr__(self) -> str:
         return f"<ListenerHandover of {self._context.name}, {len(self._clients)} clients>"
@@ -120,7 +122,7 @@ class ListenerHandover:
     # The process that comes
 
     async def take_over(self, given: Exported, parcel: Parcel) -> None:
-        """Hold the clients of another process; raise ProtocolError, OSError."""
+        """Restore the clients of another process, which :meth:`go_on` attaches; raise ProtocolError."""
         context = self._context
         self.held = True
         patience = context.clock() + VIEW_S
@@ -129,10 +131,10 @@ class ListenerHandover:
         context.side.restore(given["side"])
         self._numbers.restore(given["numbers"])
         for each in given["clients"]:
-            await self._restore(each, parcel)
+            self._restore(each)
         self._numbers.keep(self._clients, context.clock())
 
-    async def _restore(self, given: Exported, parcel: Parcel) -> None:
+    def _restore(self, given: Exported) -> None:
         try:
             number, host = msgspec.convert(given["number"], int), msgspec.convert(given["host"], str)
             source = msgspec.convert(given["source"], tuple[str, int] | None)
@@ -142,14 +144,20 @@ class ListenerHandover:
         session.restore(given["session"])
         client = self._make(number, host, session)
         client.resume(given, RESTARTED)
-        await self._door.admit(given["link"].get("tcp"), Accepted(_attached(client.conversation)), source)
+        self._given.append((client, given["link"].get("tcp"), source))
 
     async def go_on(self) -> None:
         """Read, write and accept: again, or for the first time with what was taken over."""
         self.held = False
-        await self._door.open()
         for client in tuple(self._clients.values()):
             client.go_on()
+        given, self._given = self._given, []
+        for client, number, source in given:
+            try:
+                await self._door.admit(number, Accepted(_attached(client.conversation)), source)
+            except (OSError, ProtocolError) as error:
+                client.conversation.lost(str(error))
+        await self._door.open()
 
 
 def _stays(client: Client) -> str | None:

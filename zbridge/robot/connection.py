@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.errors import LinkError
+from zbridge.errors import LinkError, ProtocolError
 from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
@@ -113,6 +113,7 @@ class Connection:
         self._free = asyncio.Event()
         """Cleared while another process may get the link: nothing is connected then."""
         self._free.set()
+        self._given: tuple[Exported, Parcel] | None = None
         self._watchers: dict[str, Callable[[bytes], object]] = {}
 
     def __repr__(self) -> str:
@@ -158,18 +159,25 @@ class Connection:
         if self.conversation is not None:
             self.conversation.hold()
 
-    def go_on(self) -> None:
-        """Go on after :meth:`hold`, or with what was taken over."""
+    async def go_on(self) -> None:
+        """Go on after :meth:`hold`, or attach what was taken over: from now on this process has the link."""
         self._free.set()
-        if self.conversation is not None:
-            self.conversation.go_on()
+        given, self._given = self._given, None
+        if self.conversation is None:
+            return
+        self.conversation.go_on()
+        if given is not None:
+            try:
+                await take_over(self.address, *given, self.conversation)
+            except (OSError, ProtocolError) as error:
+                self.conversation.lost(str(error))
 
     def hand_over(self, parcel: Parcel) -> Exported | None:
         """Put the connection into a parcel, and describe its conversation; None where there is none."""
         return self.conversation.hand_over(parcel) if self.conversation is not None else None
 
-    async def take_over(self, given: Exported | None, parcel: Parcel) -> None:
-        """Hold the conversation of another process; raise ProtocolError, OSError. :meth:`run` is called afterwards."""
+    def take_over(self, given: Exported | None, parcel: Parcel) -> None:
+        """Restore the conversation of another process, which :meth:`go_on` attaches; raise ProtocolError."""
         if given is None:
             return
         session = self._hooks.session()
@@ -177,7 +185,7 @@ class Connection:
         self.state, self.reason = _STATES[session.state], session.busy or session.reason
         self.conversation = conversation = self._make_conversation(session)
         conversation.held = True
-        await take_over(self.address, given["link"], parcel, conversation)
+        self._given = (given["link"], parcel)
 
     def release(self) -> None:
         """Give up the connection, which another process has now."""

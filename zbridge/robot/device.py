@@ -280,10 +280,10 @@ class Device:
         published = self._publishers.export(most_bytes=KEPT_BYTES)
         return {**self._describe(parcel), "published": published, _CRASHED: True}
 
-    async def take_over(self, given: Exported, parcel: Parcel) -> None:
-        """Hold what another process handed over; raise ProtocolError, OSError. Call :meth:`run` with ``begin`` then."""
+    def take_over(self, given: Exported, parcel: Parcel) -> None:
+        """Restore what another process handed over; raise ProtocolError. Call :meth:`run` with ``begin`` then."""
         for connection, link in zip(self._links, given["links"], strict=True):
-            await connection.take_over(link, parcel)
+            connection.take_over(link, parcel)
         self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
         if any(given["links"]):
             self._context.robot.restore(given["robot"])
@@ -301,7 +301,7 @@ class Device:
         self._commands.refuse_all(None)
         self._leases.refuse_all(None)
         for connection in self._links:
-            connection.go_on()
+            await connection.go_on()
 
     def withdraw(self) -> None:
         """Take no commands and queries from the bus any more: another process does."""

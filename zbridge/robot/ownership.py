@@ -54,7 +54,8 @@ RIVALS = 16
 MOST_S = 10 * 365 * 86_400.0
 """The longest time for which a robot can have been served, seconds: ten years. Longer claims are ignored."""
 _WHO = "gateway"
-_CLAIM = "@rpc/claim/gateway"
+CLAIM = "@rpc/claim/gateway"
+"""The path at which a gateway answers with its claim."""
 
 
 class _Served(msgspec.Struct):
@@ -196,7 +197,7 @@ class Ownership:
 
     def _announce(self) -> None:
         self._handles = [
-            self._bus.answer(self._keys.key(_CLAIM), self._on_question),
+            self._bus.answer(self._keys.key(CLAIM), self._on_question),
             self._bus.announce(self._keys.alive(_WHO)),
         ]
 
@@ -243,7 +244,7 @@ class Ownership:
         """Ask for the claims of others; return the best by session id. Implausible claims are ignored."""
         claims: list[tuple[_Served, str]] = []
         heard = {self._bus.zid}
-        for answer in await self._bus.ask(self._keys.key(_CLAIM), timeout_s=ASK_S):
+        for answer in await self._bus.ask(self._keys.key(CLAIM), timeout_s=ASK_S):
             if answer.replier is None or answer.replier in heard:
                 continue
             heard.add(answer.replier)

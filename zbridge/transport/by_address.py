@@ -19,7 +19,7 @@ async def connect(address: DeviceAddress, receiver: Receiver) -> Link:
 async def take_over(address: DeviceAddress, given: Exported, parcel: Parcel, receiver: Receiver) -> Link:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError.
 
-    The receiver must hold the link when it is attached: the other process may still have it.
+    Only when the other process has let go: reading begins at once.
     """
     if isinstance(address, SerialAddress):
         return serial.take_over(address, parcel.take(given.get("serial")), receiver)

@@ -213,6 +213,7 @@ class TcpLink(asyncio.BufferedProtocol):
             self._backlog = new_backlog(sock)
             if self._given_udp is not None:
                 self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp)
+                self._datagrams.go_on()
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)

@@ -70,7 +70,6 @@ class Incoming:
         except EndError:
             log.warning("the gateway before this one has died: going on in its place")
         self._channel.close()
-        self.parcel.close()
         self.begun.set()
 
     def fail(self, reason: str) -> None:

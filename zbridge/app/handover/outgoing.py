@@ -22,7 +22,7 @@ import os
 import select
 import signal
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Protocol
 
 from zbridge.app.handover.channel import Channel
@@ -75,12 +75,18 @@ Describe = Callable[[Parcel], Given]
 
 
 class Outgoing:
-    """One handover. ``start``: starts the successor. ``parts``: what is handed over. ``describe``: writes all of it."""
+    """One handover. ``start``: starts the successor. ``parts``: what is handed over. ``describe``: writes all of it.
 
-    def __init__(self, start: Successor, parts: Sequence[Part], describe: Describe) -> None:
+    ``drain``: waits until what was published has left: what the successor publishes must not overtake it.
+    """
+
+    def __init__(
+        self, start: Successor, parts: Sequence[Part], describe: Describe, drain: Callable[[], Awaitable[None]]
+    ) -> None:
         self._start = start
         self._parts = parts
         self._describe = describe
+        self._drain = drain
         self._pid: int | None = None
         self._process: int | None = None
 
@@ -101,6 +107,7 @@ class Outgoing:
             await channel.receive(Up, TAKE_OVER_S)
             for part in self._parts:
                 part.withdraw()
+            await self._drain()
             await channel.send(Go())
         except (HandoverError, Refused, BusError, OSError) as error:
             await self._take_back(channel, str(error), changed=changed)

@@ -25,6 +25,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
 from zbridge.robot.device import Device
+from zbridge.robot.ownership import CLAIM
 from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.handover")
@@ -37,6 +38,7 @@ class Restarts:
     """
 
     def __init__(self, plan: Plan, keys: KeySpace, incoming: Incoming | None, successor: Successor | None) -> None:
+        self.bus: Bus | None = None
         self.listeners: Sequence[Part] = ()
         self.device: Device | None = None
         self.claim: ClaimPart | None = None
@@ -102,8 +104,12 @@ class Restarts:
         async with self._lock:
             began = time.monotonic()
             parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
-            pid = await Outgoing(self._successor, parts, self._describe).run()
+            pid = await Outgoing(self._successor, parts, self._describe, self._drain).run()
             log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
+
+    async def _drain(self) -> None:
+        if self.bus is not None and self.claim is not None:
+            await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 
     def _describe(self, parcel: Parcel) -> Given:
         given = Given(

@@ -231,10 +231,16 @@ class ZenohBus:
         return self._keep(Declared(watch))
 
     async def flush(self) -> None:
-        """Wait until all queued states and answers are handed to Zenoh (streams excluded).
+        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S`."""
+        await self._flush(self._writer)
 
-        Raises BusError after :data:`FLUSH_S` seconds.
-        """
+    async def drain(self, key_expr: str) -> None:
+        """Wait until all that was published has left: a query of the lowest priority goes behind it."""
+        await self._flush(self._streams)
+        options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
+        await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
+
+    async def _flush(self, writer: Writer) -> None:
         loop = self._loop
         written: asyncio.Future[None] = loop.create_future()
 
@@ -245,7 +251,7 @@ class ZenohBus:
         def ring() -> None:
             loop.call_soon_threadsafe(tell)
 
-        self._writer.put(ring)
+        writer.put(ring)
         try:
             async with asyncio.timeout(FLUSH_S):
                 await written

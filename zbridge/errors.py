@@ -14,6 +14,7 @@ ZbridgeError
 │   └── TooFast      ... because commands come faster than allowed                   rate
 ├── LinkError        an address is not valid, or a connection cannot be made
 ├── BusError         the bus cannot be opened, or a query has no answer
+├── HandoverError    a restarted gateway cannot take over what the one before it hands over
 └── ConfigError      a configuration cannot be used
 """
 
@@ -148,6 +149,10 @@ class BusError(ZbridgeError):
 
 class BusRefused(BusError):
     """The bus cannot be opened, and trying again soon helps nobody: the text says who refused whom, and why."""
+
+
+class HandoverError(ZbridgeError):
+    """A restarted gateway cannot take over what the one before it hands over, or got nothing."""
 
 
 class ConfigError(ZbridgeError):

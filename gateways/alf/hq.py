@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -31,7 +31,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motion, Motor, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import EncodeError, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
+from zbridge.protocol import EncodeError, Exported, HqSide, Limits, Metrics, ProtocolError, Send, Telemetry
 
 DEADMAN_S = 0.3
 """Deployed HQ programs repeat their command every 20 ms."""
@@ -65,9 +65,14 @@ class HqClient(VehicleRole):
     drive: whether it is shown drive info.
     """
 
+    kept: ClassVar[dict[str, Any]] = {"scanner": bytes | None, "laser": bool, "drive": bool}
     scanner: bytes | None = None
     laser = True
     drive = True
+
+    def restore(self, state: Exported) -> None:
+        super().restore(state)
+        self.scanner = self.outbox.found(self.scanner)
 
     def show_drive(self) -> None:
         """Show drive info instead of measurements from now on; drop the measurements that are queued."""
@@ -143,6 +148,8 @@ class AlfHq(HqSide):
     """One listener."""
 
     name = NAME
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"_sequence": int}
     deadman_s = DEADMAN_S
 
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:

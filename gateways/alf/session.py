@@ -6,6 +6,8 @@ is established at once.
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import msgspec
 
 from gateways.alf.messages import (
@@ -44,6 +46,7 @@ class AlfSession(Session[AlfMessage]):
     ``bounds``: what a listener demands of its clients.
     """
 
+    kept: ClassVar[dict[str, Any]] = {"points": int, "_broken": bool}
     handled = frozenset({End})
     _SENT_BY_PEER: frozenset[int]
 

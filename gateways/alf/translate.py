@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 import numpy as np
@@ -78,6 +78,16 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class AlfRobot(Robot):
     """One vehicle, with one link or two; the first link drives."""
+
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {
+        "_scanner": ScannerInit | None,
+        "_clock": DeviceClock,
+        "_sequence": int | None,
+        "_light": bool,
+        "_backward": bool,
+        "_command": DriveCommand,
+    }
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
@@ -190,6 +200,9 @@ class AlfRobot(Robot):
 
     def stop(self, now: float, until: float) -> None:
         self._send(self._neutral(), now, urgent=True)
+
+    def stop_frames(self) -> tuple[bytes, ...]:
+        return (self._session.encode(self._neutral()),) if self._session is not None else ()
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"an ALF vehicle cannot be asked for its {topic.path}")

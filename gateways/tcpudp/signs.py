@@ -6,7 +6,9 @@ it received, without texts: every client of a robot gets texts, also on a poor c
 
 from __future__ import annotations
 
-from zbridge.protocol import Traffic
+from typing import Any, ClassVar
+
+from zbridge.protocol import Kept, Traffic
 
 FIRST_CLIENT = 2
 """The id that a robot gives its first client."""
@@ -21,8 +23,17 @@ UNANSWERED = f"no telemetry and no answer to the probe within {LOOK_S:g} s"
 MUTE = f"no telemetry within {LOOK_S:g} s, unlike on the connection before"
 
 
-class Signs:
+class Signs(Kept):
     """The signs on one connection. ``before``: the signs on the connection before."""
+
+    kept: ClassVar[dict[str, Any]] = {
+        "talks": bool,
+        "_expected": bool,
+        "_talked": bool,
+        "_looked": bool,
+        "_asked": int,
+        "_silent": str | None,
+    }
 
     def __init__(self, before: Signs | None = None) -> None:
         self.talks: bool = before is not None and before.talks

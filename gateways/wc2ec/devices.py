@@ -5,9 +5,12 @@ Source: the dialects of the protocol page; names in keys are the design's.
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import msgspec
 
 from zbridge.fleet.messages import Device, Devices
+from zbridge.protocol import Kept
 
 DISTANCE, LIGHT, ROTATIONAL, LINEAR = "distance", "light", "rotational", "linear"
 _SENSOR_KINDS = {37: DISTANCE, 38: DISTANCE}
@@ -29,8 +32,14 @@ class WebotsDevice(msgspec.Struct, frozen=True):
         return self.kind in (ROTATIONAL, LINEAR)
 
 
-class Table:
+class Table(Kept):
     """The devices of one session, by number and by name."""
+
+    kept: ClassVar[dict[str, Any]] = {
+        "collisions": list[str],
+        "_by_number": dict[int, WebotsDevice],
+        "_by_name": dict[str, WebotsDevice],
+    }
 
     def __init__(self) -> None:
         self.collisions: list[str] = []

@@ -7,6 +7,7 @@ that is the handshake. The draft has none.
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 from gateways.wc2ec.messages import (
     MAX_FRAME,
@@ -56,6 +57,7 @@ class Wc2EcSession(Session[Wc2EcMessage]):
 class ExternalRole(Wc2EcSession):
     """We play the external controller towards a Webots controller."""
 
+    kept: ClassVar[dict[str, Any]] = {"_settled_at": float}
     role = Role.HQ
     _PEER = Sender.WC
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -67,6 +67,8 @@ def _interpolation(table: tuple[tuple[float, float], ...]) -> Callable[[float], 
 class Wc2EcRobot(Robot):
     """One Webots robot, seen from its external controller."""
 
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"_table": Table, "_ring": BearingScan | None}
     link_names = ("robot",)
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
@@ -192,6 +194,12 @@ class Wc2EcRobot(Robot):
                 self._connected().outbox.clear(_slot(device))
             for device in self._table.motors(ROTATIONAL):
                 self._set_motor(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+
+    def stop_frames(self) -> tuple[bytes, ...]:
+        if self._dialect is not Dialect.DEPLOYED:
+            return ()
+        session, motors = self._connected(), self._table.motors(ROTATIONAL)
+        return tuple(session.encode(SetValue(device.type, device.number, 0.0)) for device in motors)
 
     def ask(self, topic: Topic) -> None:
         raise Unsupported(f"a Webots robot cannot be asked for its {topic.path}")

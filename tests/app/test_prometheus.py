@@ -102,3 +102,21 @@ async def test_without_the_address_the_context_is_entered_all_the_same(metrics, 
             entered = True
     assert entered
     assert "metrics endpoint tcp://127.0.0.1" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("path", "missing", "status", "body"),
+    [
+        (b"/healthz", ("robot offline",), b"200 OK", b"ok\n"),
+        (b"/readyz", (), b"200 OK", b"ok\n"),
+        (b"/readyz", ("no bus", "robot offline"), b"503 Service Unavailable", b"no bus\nrobot offline\n"),
+    ],
+)
+async def test_the_probes_tell_whether_the_gateway_lives_and_is_of_use(
+    address: Address, metrics: Metrics, path: bytes, missing: tuple[str, ...], status: bytes, body: bytes
+) -> None:
+    async with serve_metrics(address, metrics, lambda: missing):
+        response = await asked(address, b"GET " + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
+    head, _, shown = response.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.0 " + status + b"\r\n")
+    assert shown == body

@@ -100,7 +100,7 @@ async def test_a_process_with_listeners_only_drives_lives_and_answers_under_the_
         await established(viewer)
         await asyncio.to_thread(until, lambda: listeners.listens(1))
         async with asyncio.timeout(WAIT_S):  # a busy machine answers late
-            while not (others := {who for _, who in await viewer.sessions()} - {"gateway"}):
+            while not (others := {who for _, who in await viewer.sessions()} - {"gateway"}):  # noqa: ASYNC110
                 await asyncio.sleep(0.2)
         (own,) = others
         assert own.startswith("hq.h1.")

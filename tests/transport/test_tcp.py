@@ -12,7 +12,7 @@ from tests.e2e.conftest import free_port
 from tests.transport.recorder import LOCAL, SOON_S, Recorder, connected, socket_of, udp_socket, until
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address
-from zbridge.transport import tcp
+from zbridge.transport import tcp, tcp_options
 from zbridge.transport.link import STALLED_S
 from zbridge.transport.tcp import TcpLink, connect, listen
 
@@ -201,7 +201,7 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkey
         raise OSError("Inappropriate ioctl for device")
 
     monkeypatch.setattr(tcp.fcntl, "ioctl", unknown)
-    monkeypatch.setattr(tcp, "_unwatched_warned", False)
+    monkeypatch.setattr(tcp_options, "_unwatched_warned", False)
     for _ in range(2):
         async with connected() as pair:
             pair.there.pause()

@@ -43,7 +43,7 @@ class Keys(Enum):
     TAKEOVER = ("{robot}/@rpc/control/takeover/{name}",)
     LEASE = ("{robot}/@rpc/control/renew", "{robot}/@rpc/control/release")
     ASK = ("{robot}/@rpc/map", "{robot}/@rpc/pose")
-    RESTART = ("{robot}/@rpc/restart",)
+    RESTART = ("{robot}/@rpc/restart/{name}",)
     SESSIONS = ("{robot}/@rpc/sessions/*",)
     CLAIM = ("{robot}/@rpc/claim/gateway",)
     RPC = ("{robot}/@rpc/**",)

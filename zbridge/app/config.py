@@ -66,6 +66,15 @@ class Plan(msgspec.Struct, frozen=True):
     listeners: tuple[ListenerPlan, ...] = ()
     metrics: Address | None = None
 
+    @property
+    def setup(self) -> dict[str, Any]:
+        """What a gateway and its successor must have in common, by key, as MessagePack reads it back."""
+        config = self.config
+        parts: dict[str, Any] = {"robot": config.robot, "device": config.device}
+        parts |= {f"hq[{number}]": [each.protocol, each.listen, each.options] for number, each in enumerate(config.hq)}
+        common: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(parts))
+        return common
+
 
 def load(path: Path, environment: Mapping[str, str] = os.environ, *, tls: Path | None = None) -> Plan:
     """Read and check a configuration file; raise ConfigError, which names the file as well.

@@ -13,8 +13,9 @@ import logging
 import math
 import secrets
 import signal
+import socket
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from typing import Any
 import msgspec
 
 from zbridge.app.config import Plan
+from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, Handle, IncomingQuery
@@ -31,7 +33,7 @@ from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import Held
+from zbridge.errors import Held, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
@@ -39,8 +41,10 @@ from zbridge.fleet.topics import KeySpace
 from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
 from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
+from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
 from zbridge.transport import connect
@@ -48,6 +52,8 @@ from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
 
+LINGER_S = 0.2
+"""Seconds between a handover and the end of the bus session: closing it drops what Zenoh has not yet sent."""
 TELL_S = 60.0
 """Seconds between two log lines about other gateways that serve the same robot."""
 _NAMED = 3
@@ -68,12 +74,26 @@ class Neighbourhood(msgspec.Struct, frozen=True):
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this gateway, shared by all parts.
+    metrics, sessions, conditions: of this gateway, shared by all parts. observer: is told of the robot's links.
+    predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this one can
+    be handed over.
     """
 
-    def __init__(self, plan: Plan, metrics: Metrics | None = None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        metrics: Metrics | None = None,
+        *,
+        observer: Observer | None = None,
+        predecessor: socket.socket | None = None,
+        successor: Successor | None = None,
+    ) -> None:
         self._plan = plan
+        self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
+        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self.restarts = Restarts(plan, self._keys, self._incoming, successor)
+        """What a successor would be handed, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = metrics or Metrics()
@@ -83,23 +103,34 @@ class Gateway:
         """The name in our certificate."""
         self._process = "gateway"
         """The name of this process on the bus, while it does not serve the robot."""
+        self._neighbourhood: Neighbourhood | None = None
+        self._on_the_bus = False
+        self._device_served: Device | None = None
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
 
     async def run(self) -> None:
-        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus."""
+        """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
+
+        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        """
         with self._audit() as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
                 try:
-                    async with contextlib.AsyncExitStack() as stack:
-                        if self._plan.metrics is not None:
-                            await stack.enter_async_context(serve_metrics(self._plan.metrics, self.metrics))
-                        await self._run(bus, audit, None)
+                    await self._run(bus, audit)
+                    return
                 except CertificateEnded as error:
+                    self._incoming = None
                     log.error("%s", error)
+                except Exception as error:
+                    if self._incoming is not None and not self._incoming.begun.is_set():
+                        self._incoming.fail(str(error) if isinstance(error, ZbridgeError) else describe(error))
+                    raise
                 finally:
+                    if self.restarts.gone.is_set():  # what was published last is still on its way
+                        await asyncio.sleep(LINGER_S)
                     self.left = await bus.close()
 
     async def run_on(self, bus: Bus, neighbourhood: Neighbourhood | None = None) -> None:
@@ -107,47 +138,109 @@ class Gateway:
 
         neighbourhood: None where the process serves this robot only.
         """
+        self._neighbourhood = neighbourhood
         with self._audit() as audit:
-            await self._run(bus, audit, neighbourhood)
+            await self._run(bus, audit, metrics=False)
 
-    async def _run(self, bus: Bus, audit: Audit, neighbourhood: Neighbourhood | None) -> None:
+    async def _run(self, bus: Bus, audit: Audit, *, metrics: bool = True) -> None:
+        if self._incoming is not None:
+            await self._incoming.receive()
         async with contextlib.AsyncExitStack() as stack:
-            names = listener_names(self._plan.listeners, self._own, bus.zid)
-            self._process = process_name(names, self._own, bus.zid) if names else "gateway"
-            robot = RobotSubscription(bus, self._keys, self.metrics)
+            stack.callback(bus.watch_connected(self._on_bus).close)
+            self.restarts.bus, robot = bus, RobotSubscription(bus, self._keys, self.metrics)
+            listeners = self._listeners(bus, robot)
+            taken = self._incoming.taken if self._incoming is not None else None
+            work: list[Coroutine[Any, Any, None]] = [listener.run(taken) for listener in listeners]
+            self.restarts.listeners = [listener.handover for listener in listeners]
             certificate = own_certificate(self._plan.config.bus.tls)
-            work: list[Coroutine[Any, Any, None]] = [
-                Listener(listener, name, robot, self.sessions, self.metrics, time.monotonic).run()
-                for listener, name in zip(self._plan.listeners, names, strict=True)
-            ]
             if work:
                 robot.open()
                 stack.callback(robot.close)
             if certificate is not None:
                 work.append(watch_certificate(certificate, bus, self.conditions))
             if self._plan.device is not None:
-                work.append(self._robot(bus, audit, self._plan.device, neighbourhood))
+                work.append(self._robot(bus, audit, self._plan.device))
             else:
                 stack.callback(self._show_sessions(bus, self._process).close)
-            await together(*work)
+            if metrics and self._plan.metrics is not None:
+                work.append(self._serve_metrics(self._plan.metrics))
+            await until(self.restarts.gone, together(*work))
 
-    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> None:
+    async def _serve_metrics(self, address: Address) -> None:
+        """Serve the counters, once a predecessor has let go."""
+        given = []
+        if self._incoming is not None:
+            await self._incoming.begun.wait()
+            given = [socket.socket(fileno=self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
+        async with serve_metrics(address, self.metrics, self.missing, given) as self.restarts.metrics_sockets:
+            await asyncio.Event().wait()
+
+    def _listeners(self, bus: Bus, robot: RobotSubscription) -> list[Listener]:
+        plans, incoming = self._plan.listeners, self._incoming
+        names = listener_names(plans, self._own, bus.zid)
+        self._process = process_name(names, self._own, bus.zid) if names else "gateway"
+        given = [(each, incoming.parcel) for each in incoming.given.listeners] if incoming else [None] * len(plans)
+        return [
+            Listener(
+                plan,
+                each[0]["name"] if each and plan.settings.name is None else name,
+                robot,
+                self.sessions,
+                self.metrics,
+                time.monotonic,
+                each,
+            )
+            for plan, name, each in zip(plans, names, given, strict=True)
+        ]
+
+    def missing(self) -> tuple[str, ...]:
+        """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
+        reasons = [] if self._on_the_bus else ["no bus"]
+        if self._plan.device is not None:
+            state = self._device_served.state if self._device_served is not None else "served by another gateway"
+            reasons += [f"robot {state}"] * (state != "established")
+        return tuple(reasons)
+
+    def _on_bus(self, connected: bool) -> None:
+        self._on_the_bus = connected
+
+    async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        ownership = Ownership(bus, self._keys)
+        ownership, incoming = Ownership(bus, self._keys), self._incoming
+        self.restarts.claim = ClaimPart(ownership)
         try:
             bus.gather(self._keys.key("@rpc/**"))
+            if incoming is not None:
+                given = incoming.given
+                if given.device is not None and given.claim:
+                    ownership.inherit(given.claim)
+                    device = self._make_device(bus, audit, plan)
+                    device.take_over(given.device, incoming.parcel)
+                    await self._serve_shown(bus, ownership, device, incoming.taken)
+                elif not incoming.given.listeners:
+                    await incoming.finish()
+                await incoming.begun.wait()
             while True:
                 shown = self._show_sessions(bus, self._process) if self._plan.listeners else None
                 await ownership.take()
                 if shown is not None:
                     shown.close()
-                shown = self._show_sessions(bus, "gateway")
-                try:
-                    await self._serve(ownership, self._device(bus, audit, plan, neighbourhood))
-                finally:
-                    shown.close()
+                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan))
         finally:
             ownership.release()
+
+    async def _serve_shown(
+        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
+    ) -> None:
+        """Serve the robot, show the sessions as the gateway's, and answer who asks for a restart."""
+        handles = (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
+        self.restarts.device = device
+        try:
+            await self._serve(ownership, device, begin)
+        finally:
+            self.restarts.device = None
+            for handle in handles:
+                handle.close()
 
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer queries for the session table of this process; ``who`` names the process."""
@@ -157,9 +250,10 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, ownership: Ownership, device: Device) -> None:
+    async def _serve(self, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None) -> None:
         """Serve the robot until another gateway has to take it."""
-        serving = asyncio.ensure_future(device.run())
+        self._device_served = device
+        serving = asyncio.ensure_future(device.run(begin))
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
@@ -170,6 +264,7 @@ class Gateway:
             for task in (serving, watching):
                 task.cancel()
             await asyncio.shield(asyncio.gather(serving, watching, return_exceptions=True))
+            self._device_served = None
             self.conditions.set(_RIVALS, None)
 
     def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:
@@ -189,7 +284,8 @@ class Gateway:
 
         return tell
 
-    def _device(self, bus: Bus, audit: Audit, plan: DevicePlan, neighbourhood: Neighbourhood | None) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+        near = self._neighbourhood
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -205,8 +301,9 @@ class Gateway:
             audit=audit,
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
-            share=FairShare(neighbourhood.part) if neighbourhood is not None else None,
-            connect=partial(connect, buffer=neighbourhood.buffer) if neighbourhood is not None else connect,
+            share=FairShare(near.part) if near is not None else None,
+            connect=partial(connect, buffer=near.buffer) if near is not None else connect,
+            observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 
@@ -253,8 +350,23 @@ async def together(*work: Coroutine[Any, Any, None]) -> None:
         await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
-async def until_signal(work: Coroutine[Any, Any, None]) -> None:
-    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then cancel it and wait until it has ended."""
+async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
+    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(event.wait()))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until_signal(
+    work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
+) -> None:
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then end it. ``on``: what other signals run beside."""
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []
@@ -265,7 +377,16 @@ async def until_signal(work: Coroutine[Any, Any, None]) -> None:
             task.cancel()
         asked.append(number)
 
+    beside: set[asyncio.Task[None]] = set()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end, number)
+    for other, begin in (on or {}).items():
+        loop.add_signal_handler(other, _start_beside, begin, beside)
     with contextlib.suppress(asyncio.CancelledError):
         await task
+
+
+def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:
+    task = asyncio.ensure_future(begin())
+    tasks.add(task)
+    task.add_done_callback(tasks.discard)

@@ -1,4 +1,8 @@
-"""Serves the counters to Prometheus: one page over HTTP/1.0, nothing else. Knows no bus and no robot."""
+"""Serves the counters to Prometheus, and two probes: three pages over HTTP/1.0. Knows no bus and no robot.
+
+``/metrics``: the counters. ``/healthz``: the process lives and its event loop turns. ``/readyz``: status 200 if the
+gateway is of use now, else 503 with the reasons, one a line.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
@@ -21,24 +25,32 @@ WAITING = 16
 """Clients that wait in the operating system's queue; further ones are refused."""
 _REQUEST_BYTES = 8192
 
+Missing = Callable[[], tuple[str, ...]]
+"""``missing()``: why the gateway is of no use now; nothing if it is."""
+
 
 @contextlib.asynccontextmanager
-async def serve_metrics(address: Address, metrics: Metrics) -> AsyncIterator[None]:
-    """Serve ``GET /metrics`` while the context lasts. An address in use is logged as an error and otherwise ignored.
+async def serve_metrics(
+    address: Address, metrics: Metrics, missing: Missing = lambda: (), given: Sequence[socket.socket] = ()
+) -> AsyncIterator[list[socket.socket]]:
+    """Serve ``GET /metrics``, ``/healthz`` and ``/readyz`` while the context lasts.
+
+    Gives the sockets at which it listens; ``given``: those of another process, in place of new ones. An address in use
+    is logged as an error and otherwise ignored.
 
     Connections are accepted only while fewer than CLIENTS are served: a server of asyncio accepts all at once and
     starves the rest of the process meanwhile.
     """
     try:
-        sockets = await _listen(address)
+        sockets = list(given) or await _listen(address)
     except OSError as error:
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
-        yield
+        yield []
         return
     room = asyncio.Semaphore(CLIENTS)
-    tasks = [asyncio.create_task(_accept(each, room, metrics)) for each in sockets]
+    tasks = [asyncio.create_task(_accept(each, room, metrics, missing)) for each in sockets]
     try:
-        yield
+        yield sockets
     finally:
         for task in tasks:
             task.cancel()
@@ -61,7 +73,7 @@ async def _listen(address: Address) -> list[socket.socket]:
     return sockets
 
 
-async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics) -> None:
+async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics, missing: Missing) -> None:
     """Accept and serve clients, while there is room, until cancelled."""
     loop, clients = asyncio.get_running_loop(), dict[asyncio.Task[None], socket.socket]()
 
@@ -79,7 +91,7 @@ async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Me
                 room.release()
                 await asyncio.sleep(REQUEST_S)
                 continue
-            task = asyncio.create_task(_serve(client, metrics))
+            task = asyncio.create_task(_serve(client, metrics, missing))
             clients[task] = client
             task.add_done_callback(gone)
     finally:
@@ -88,7 +100,7 @@ async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Me
         await asyncio.gather(*clients, return_exceptions=True)
 
 
-async def _serve(client: socket.socket, metrics: Metrics) -> None:
+async def _serve(client: socket.socket, metrics: Metrics, missing: Missing) -> None:
     """Read one request and answer it."""
     loop, request = asyncio.get_running_loop(), b""
     with contextlib.suppress(OSError, TimeoutError):
@@ -98,13 +110,20 @@ async def _serve(client: socket.socket, metrics: Metrics) -> None:
                 request += data
                 if not data or len(request) > _REQUEST_BYTES:
                     return
-            await loop.sock_sendall(client, _response(request, metrics))
+            await loop.sock_sendall(client, _response(request, metrics, missing))
 
 
-def _response(request: bytes, metrics: Metrics) -> bytes:
+def _response(request: bytes, metrics: Metrics, missing: Missing) -> bytes:
+    status = "200 OK"
     if request.startswith((b"GET /metrics ", b"GET / ")):
-        body, status = metrics.exposition().encode(), "200 OK"
+        body = metrics.exposition().encode()
+    elif request.startswith(b"GET /healthz "):
+        body = b"ok\n"
+    elif request.startswith(b"GET /readyz "):
+        reasons = missing()
+        status = "503 Service Unavailable" if reasons else status
+        body = ("".join(f"{reason}\n" for reason in reasons) or "ok\n").encode()
     else:
-        body, status = b"see /metrics\n", "404 Not Found"
+        body, status = b"see /metrics, /healthz, /readyz\n", "404 Not Found"
     head = f"HTTP/1.0 {status}\r\nContent-Type: text/plain; version=0.0.4\r\nContent-Length: {len(body)}\r\n\r\n"
     return head.encode() + body

@@ -104,7 +104,9 @@ class FakeBus:
     def gather(self, key_expr: str) -> Handle:
         return _FakeHandle(lambda: None)
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        if last is not None:
+            self._shared.last[key] = last
         return self._keep(_FakePublisher(key, self._shared, keeps_last=topic.qos.keeps_last))
 
     def put_all(self, batch: Batch) -> bool:
@@ -175,6 +177,9 @@ class FakeBus:
     async def flush(self) -> None:
         pass
 
+    async def drain(self, key_expr: str) -> None:
+        pass
+
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
         if any(meet(key_expr, key) for key_expr, _ in self._shared.subscribers):
@@ -234,6 +239,10 @@ class _FakePublisher(_FakeHandle):
         self.key = key
         self._shared = shared
         self._keeps_last = keeps_last
+
+    @property
+    def last(self) -> bytes | None:
+        return self._shared.last.get(self.key)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         sample = Sample(self.key, payload, attachment)

@@ -117,6 +117,10 @@ class Publisher(Protocol):
 
     key: str
 
+    @property
+    def last(self) -> bytes | None:
+        """The last value, where the key keeps it."""
+
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         """Publish with the key's delivery, without blocking; False asks to pause the source."""
 
@@ -167,8 +171,8 @@ class Bus(Protocol):
         Its ``close`` takes back what was declared on it, and leaves the session to the others.
         """
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
-        """Declare that ``key`` will be written."""
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
 
     def put_all(self, batch: Batch) -> bool:
         """Publish stream messages in order; False asks to pause the source until the relief handler is called.
@@ -218,6 +222,12 @@ class Bus(Protocol):
 
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded); raise BusError after 2 s."""
+
+    async def drain(self, key_expr: str) -> None:
+        """Wait until all that was published has left this process, streams too; ``key_expr``: a query for its answer.
+
+        The query has the lowest priority, so that all else goes before it. Waits for a second at most, raises BusError.
+        """
 
     def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
         """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""

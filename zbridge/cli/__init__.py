@@ -1,9 +1,11 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, health, echo, drive, stop, restart,
+certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
 ``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo`` (with ``secure_demo`` and
-``processes``), ``drive``, ``probe`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes:
-0 done, 1 failed, 2 wrong arguments or configuration.
+``processes``), ``drive``, ``health``, ``probe``, ``restart``, ``router`` and ``supervise`` carry theirs out,
+``keyboard`` turns keys into drives, ``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked
+from. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of ``health`` are for monitoring programs.
 """
 
 from __future__ import annotations
@@ -12,17 +14,24 @@ import asyncio
 import gc
 import logging
 import os
+import signal
+import socket
 import sys
 from collections.abc import Coroutine, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.handover import Spawn
 from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
 from zbridge.app.member import check_member
 from zbridge.app.together import Together
+from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
+
+if TYPE_CHECKING:  # loaded where there is a supervisor only
+    from zbridge.app.supervisor.child import Reporter
 
 
 def main() -> None:
@@ -31,6 +40,8 @@ def main() -> None:
         match sys.argv[1:]:
             case ["run", file] if not file.startswith("-") and not Path(file).is_dir():
                 run_gateway(Path(file))
+            case ["run", file, "--take-over", descriptor] if not file.startswith("-"):
+                run_gateway(Path(file), take_over=int(descriptor))
             case _:
                 from zbridge.cli.app import app
 
@@ -51,10 +62,25 @@ def run_only(protocol: str) -> None:
         give_up(2, error)
 
 
-def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, tls: Path | None = None) -> None:
-    """Run the gateway of a configuration until SIGTERM or SIGINT. tls: a folder, for a file without ``bus.tls``."""
-    set_up_log(verbose=verbose)
+def run_gateway(
+    file: Path,
+    *,
+    only: str | None = None,
+    verbose: bool = False,
+    tls: Path | None = None,
+    take_over: int | None = None,
+    reporter: Reporter | None = None,
+) -> None:
+    """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
+
+    tls: a folder, for a file without ``bus.tls``. take_over: the descriptor of the channel to the gateway that hands
+    everything over to this process. reporter: tells the supervisor, where there is one, which also starts the successor
+    then.
+    """
+    if reporter is None:
+        set_up_log(verbose=verbose)
     plan = load(file, tls=tls)
+    hand_on_tls(tls)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
         if only is not None and part.protocol.name != only:
@@ -64,14 +90,35 @@ def run_gateway(file: Path, *, only: str | None = None, verbose: bool = False, t
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
-    gateway = Gateway(plan)
+    predecessor = socket.socket(fileno=take_over) if take_over is not None else None
+    spawn = Spawn(file, verbose=verbose)
+    successor = reporter.start_successor if reporter is not None else spawn
+    gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
+
+    async def work() -> None:
+        if reporter is not None:
+            reporter.keep = gateway.restarts.keep
+            reporter.begin()
+        await until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart})
+
     try:
-        run_loop(until_signal(gateway.run()))
+        run_loop(work())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
+    if gateway.restarts.gone.is_set():
+        if reporter is not None:
+            reporter.succeeded()
+        else:
+            spawn.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)
+
+
+def hand_on_tls(folder: Path | None) -> None:
+    """Let the processes that this one starts read certificates from the same folder."""
+    if folder is not None:
+        os.environ[TLS_VARIABLE] = str(folder.absolute())
 
 
 def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = False) -> None:
@@ -108,10 +155,11 @@ def run_loop(work: Coroutine[Any, Any, Any]) -> Any:
     return uvloop.run(work)
 
 
-def set_up_log(*, verbose: bool, level: int = logging.INFO) -> None:
-    """Log to stderr from ``level`` on; ``verbose`` logs every frame."""
+def set_up_log(*, verbose: bool, level: int = logging.INFO, robot: str = "") -> None:
+    """Log to stderr from ``level`` on; ``verbose`` logs every frame. ``robot``: stands in every line, if given."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(LineFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s"))
+    whose = f"{robot.replace('%', '%%')}: " if robot else ""
+    handler.setFormatter(LineFormatter(f"%(asctime)s %(levelname)-7s {whose}%(name)s: %(message)s"))
     logging.basicConfig(level=logging.DEBUG if verbose else level, handlers=[handler])
 
 

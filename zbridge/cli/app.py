@@ -12,7 +12,7 @@ from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.bus.tls.files import TLS_VARIABLE, ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, run_gateway, run_loop, run_together, set_up_log
+from zbridge.cli import certs, give_up, hand_on_tls, run_gateway, run_loop, run_together, set_up_log
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
@@ -68,24 +68,35 @@ def run(
     together: Annotated[
         bool, typer.Option("--together", help="several robots in one process, as host.toml of a directory may say")
     ] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="follow files that come, change or go")] = False,
     tls: FileTls = None,
     verbose: Verbose = False,
+    take_over: Annotated[int, typer.Option("--take-over", help="descriptor of a gateway that goes", hidden=True)] = -1,
 ) -> None:
-    """Run a gateway in the foreground until SIGTERM or SIGINT; or several, in one process."""
-    if len(files) == 1 and files[0].is_dir():
-        host, directory = load_host(files[0]), files[0]
-        files = robot_files(directory)
-        if not files:
-            give_up(2, f"{directory}: no robot files (*.toml)")
-        if not (together or host.together):
-            give_up(2, f"{directory}: expected [host] together = true in host.toml, or --together")
-        run_together(files, host, verbose=verbose)
-    elif len(files) == 1 and not together:
-        run_gateway(files[0], verbose=verbose, tls=tls)
-    elif together:
-        run_together(files, HostSettings(together=True), verbose=verbose)
+    """Run a gateway in the foreground until SIGTERM or SIGINT; of a directory or several files one process each.
+
+    SIGUSR2 restarts a gateway under way.
+    """
+    host = load_host(files[0]) if len(files) == 1 and files[0].is_dir() else HostSettings()
+    if together or host.together:
+        if watch:
+            give_up(2, "--watch: expected without --together: one process follows no files")
+        hand_on_tls(tls)
+        run_together(_robot_files(files), host, verbose=verbose)
+    elif len(files) == 1 and not files[0].is_dir() and not watch:
+        run_gateway(files[0], verbose=verbose, tls=tls, take_over=take_over if take_over >= 0 else None)
     else:
-        give_up(2, "give one file, or a directory, or --together for several robots in one process")
+        from zbridge.cli.supervise import supervise
+
+        hand_on_tls(tls)
+        supervise(tuple(files), watch=watch, verbose=verbose)
+
+
+def _robot_files(paths: list[Path]) -> list[Path]:
+    files = [file for path in paths for file in (robot_files(path) if path.is_dir() else [path])]
+    if not files:
+        give_up(2, f"{paths[0]}: no robot files (*.toml)")
+    return files
 
 
 @app.command()
@@ -261,6 +272,25 @@ def ls(
 
 
 @app.command()
+def health(
+    robot: Annotated[str, typer.Argument(help="the robot's name; without it: all robots", show_default=False)] = "",
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+    json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
+    from zbridge.cli.health import report_health
+
+    set_up_log(verbose=False, level=logging.CRITICAL)
+    if robot:
+        check_name("ROBOT", robot)
+    code = run_loop(report_health(bus_settings(connect, tls), realm, robot or None, as_json=json))
+    if code:
+        raise typer.Exit(code)
+
+
+@app.command()
 def echo(
     key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
     connect: Connect = [],
@@ -311,6 +341,27 @@ def stop(
     if robot:
         check_name("ROBOT", robot)
     if not run_loop(bus.stop(bus_settings(connect, tls), realm, robot or None)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def restart(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
+    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    who: Annotated[str, typer.Option(help="the name of your certificate; user@host by default")] = "",
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
+    from zbridge.cli.restart import restart as ask
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    if bool(robot) == everything:
+        give_up(2, "name one ROBOT, or give --all")
+    if robot:
+        check_name("ROBOT", robot)
+    if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
         raise typer.Exit(1)
 
 

@@ -124,13 +124,13 @@ def cell(text: str) -> Text:
 
 
 def _robot_table(robots: dict[str, Status | None]) -> Table:
-    table = Table("robot", "state", "protocol", "version", "features", "reason", box=None)
+    table = Table("robot", "state", "host", "protocol", "version", "features", "reason", box=None)
     for name, status in robots.items():
         if status is None:
-            cells = (name, "?", "", "", "", "the gateway has published no status yet")
+            cells = (name, "?", "", "", "", "", "the gateway has published no status yet")
         else:
             agreed = (status.protocol or "", status.version or "", " ".join(status.features))
-            cells = (name, status.state, *agreed, status.reason or "")
+            cells = (name, status.state, status.host or "", *agreed, status.reason or "")
         table.add_row(*map(cell, cells))
     return table
 

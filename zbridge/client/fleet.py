@@ -91,6 +91,16 @@ class Fleet:
         tokens = await self._bus.alive(f"{self.realm}/*/@alive/gateway")
         return {split[1] for key in tokens if (split := split_key(key))}
 
+    async def statuses(self, robot: str | None = None) -> AsyncIterator[tuple[str, Status]]:
+        """Iterate over the statuses that robots, or one robot, publish from now on, with the robots' names."""
+
+        def read(sample: Sample) -> tuple[str, Status]:
+            split = split_key(sample.key)
+            return (split[1] if split is not None else ""), payloads.decode(Status, sample.payload)
+
+        async for named in Feed(self._bus, f"{self.realm}/{robot or '*'}/{topics.STATUS.path}", read):
+            yield named
+
     async def sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         """Return the session tables by robot and process: peers, their states, and what was not translated.
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 
 from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
@@ -50,6 +51,8 @@ class Enforcer:
         self._standstill = standstill
         self._audit = audit
         self._limits = limits
+        self.settled: Callable[[], object] = lambda: None
+        """Called after :meth:`settle`: whether the robot is driven may have changed."""
         self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -141,6 +144,7 @@ class Enforcer:
         deadline = self.authority.deadline()
         if deadline is not None and deadline < self._timer_at:
             self._arm(deadline)
+        self.settled()
 
     def keep_time(self) -> None:
         """Do what is due, before anything is written: the loop may come back late, from a process that was frozen."""

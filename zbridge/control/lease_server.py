@@ -71,8 +71,8 @@ class LeaseServer:
             self._context.bus.watch_alive(self._context.keys.alive(_ANYBODY), self._on_alive),
         ]
 
-    def refuse_all(self, reason: str) -> None:
-        """Give no lease from now on."""
+    def refuse_all(self, reason: str | None) -> None:
+        """Give no lease from now on; None: give leases again."""
         self._closing = reason
 
     def _answer(self, name: str, decide: Decide) -> Handle:

@@ -152,7 +152,7 @@ RobotState = Literal["offline", "connecting", "handshaking", "established", "clo
 
 
 class Status(FleetMessage, frozen=True):
-    """Whether the robot can be used, and what was negotiated with it."""
+    """Whether the robot can be used, and what was negotiated with it. host: the machine of its gateway."""
 
     state: RobotState
     reason: str | None = None
@@ -161,6 +161,7 @@ class Status(FleetMessage, frozen=True):
     version: str | None = None
     features: tuple[str, ...] = ()
     links: tuple[LinkStatus, ...] = ()
+    host: str | None = None
 
 
 class Refusal(msgspec.Struct, frozen=True, kw_only=True):

@@ -197,6 +197,7 @@ RPC_ACQUIRE = _family("@rpc/control/acquire", Acquire, Delivery.QUERY, QUERY_BYT
 RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY, QUERY_BYTES)
 RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY, SMALL_BYTES)
 RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY, SMALL_BYTES)
+RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
 RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
 
 _TOPICS = {
@@ -217,6 +218,7 @@ _FAMILIES = {
     "@rpc/control/acquire": RPC_ACQUIRE,
     "@rpc/control/takeover": RPC_TAKEOVER,
     "@rpc/control/refused": RPC_REFUSED,
+    "@rpc/restart": RPC_RESTART,
 }
 
 

@@ -20,9 +20,10 @@ from zbridge.hq.intent import Intent
 from zbridge.hq.operator import Operator
 from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Send, Telemetry
 from zbridge.protocol.session import Session, State
-from zbridge.transport import Conversation
+from zbridge.transport import Conversation, Parcel
 
 STALL_S = 5.0
 """Seconds without taking what is written after which a client is closed; seconds of taking it count against them."""
@@ -117,6 +118,39 @@ class Client:
     def let_go(self, why: str) -> None:
         """Give the robot back; the program must send neutral before it drives again."""
         self.operator.let_go(why)
+
+    # A restart
+
+    @property
+    def stays(self) -> str | None:
+        """Why the program's connection cannot be handed to another process now; None where it can."""
+        return self.conversation.stays
+
+    def export(self, parcel: Parcel) -> Exported:
+        """Put the connection of a held conversation into a parcel; describe the client."""
+        return {
+            "number": self.number,
+            "host": self.host,
+            "begun": self.begun,
+            "operator": self.operator.export(),
+            **self.conversation.hand_over(parcel),
+        }
+
+    def resume(self, given: Exported, why: str) -> None:
+        """Be the client that another process served: its session is restored. It owes neutral."""
+        self.begun = bool(given["begun"])
+        self.operator.resume(given["operator"], why)
+        self.conversation.held = True
+
+    def go_on(self) -> None:
+        """Read and write; carry out what the side keeps of this client in its time."""
+        self.conversation.go_on()
+        self._set_timer(self._context.side.deadline(self.session))
+
+    def release(self) -> None:
+        """Forget the client, which another process serves now: its program notices nothing."""
+        self.conversation.release()
+        self.close()
 
     def sweep(self) -> None:
         """End a client that takes nothing, is silent for too long, or sends nothing but malformed messages."""

@@ -14,6 +14,7 @@ from zbridge.hq.settings import HqSettings
 from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Count, Metrics
 from zbridge.protocol.plugin import HqSide
+from zbridge.protocol.session import Limits
 
 
 class ListenerCounts(msgspec.Struct, frozen=True):
@@ -48,6 +49,8 @@ class ListenerContext(msgspec.Struct, frozen=True):
     failures: FailureLog
     freeze: FreezeWatch
     clock: Callable[[], float]
+    limits: Limits
+    """What is demanded of every client."""
 
 
 def listener_counts(metrics: Metrics, name: str) -> ListenerCounts:

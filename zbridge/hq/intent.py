@@ -180,6 +180,10 @@ class Intent:
         self.held_back, self._moving = why, False
         self._handle(Input.REFUSED)
 
+    def resume(self, mode: str, why: str) -> None:
+        """Go on, owing neutral, with the mode that the program chose in another process."""
+        self.mode, self.held_back = mode, why
+
     # Time
 
     def expire(self, now: float) -> None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from typing import Any
 
 from zbridge.hq.admission import FULL, Admission
 from zbridge.hq.bridge import Bridge
@@ -18,6 +19,7 @@ from zbridge.hq.broadcast import Broadcast
 from zbridge.hq.client import SWEEP_S, Client
 from zbridge.hq.context import ListenerContext, listener_counts
 from zbridge.hq.freeze import FROZEN, FreezeWatch
+from zbridge.hq.handover import ListenerHandover
 from zbridge.hq.listener_log import ConnectionLog, FailureLog
 from zbridge.hq.refusals import RefusalReports
 from zbridge.hq.robot_queries import RobotQueries
@@ -25,10 +27,11 @@ from zbridge.hq.robot_subscription import RobotSubscription
 from zbridge.hq.settings import ListenerPlan
 from zbridge.hq.tasks import Tasks
 from zbridge.metrics import Metrics
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import ATTEND_S
-from zbridge.protocol.session import Limits
+from zbridge.protocol.session import Limits, Session
 from zbridge.protocol.session_table import SessionTable
-from zbridge.transport import Accepted, Conversation, Link, Receiver, TlsLink, listen
+from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, TlsLink, listen
 
 log = logging.getLogger("zbridge.hq")
 
@@ -41,6 +44,7 @@ class Listener:
     """Serves the clients of one ``[[hq]]`` until cancelled.
 
     name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
+    given: the listener as another process handed it over, and its sockets.
     """
 
     def __init__(
@@ -51,7 +55,9 @@ class Listener:
         sessions: SessionTable,
         metrics: Metrics,
         clock: Callable[[], float] | None = None,
+        given: tuple[Exported, Parcel] | None = None,
     ) -> None:
+        self._given = given
         self.name = name
         self.address = plan.address
         self.ready = asyncio.Event()
@@ -67,21 +73,25 @@ class Listener:
         self._refusals = RefusalReports(
             robot.bus, robot.keys, f"hq.{name}", context.tasks, context.counts.refusals_untold
         )
-        self._limits = Limits(
-            frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
-        )
         self._active: set[Client] = set()
         """Clients whose operator has to be called regularly."""
         self._secured: Callable[[Receiver], Receiver] | None = None
         if (tls := plan.tls) is not None:
             self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
+        self._door = Door(given[0]["door"], given[1]) if given is not None else Door()
+        self.handover = ListenerHandover(context, self._door, self.clients, self._numbers, self._add)
+        """How the listener is handed to another process."""
 
     def __repr__(self) -> str:
         return f"<Listener {self.name} {self.address}, {len(self.clients)} clients>"
 
-    async def run(self) -> None:
-        """Listen until cancelled; then close every client and give the robot back. Raises LinkError."""
+    async def run(self, taken: Callable[[], Awaitable[None]] | None = None) -> None:
+        """Listen until cancelled; then close every client and give the robot back. Raises LinkError.
+
+        Returns where another process has taken the listener over. ``taken``: of a listener that was given; called when
+        everything was taken over, and waited for before anything is read or written.
+        """
         self._broadcast.begin()
         async with listen(
             self.address,
@@ -89,13 +99,21 @@ class Listener:
             datagrams=self._context.side.datagrams,
             foreign=self._context.counts.foreign_datagrams,
             secured=self._secured,
+            door=self._door,
         ) as self.address:
+            if self._given is not None and taken is not None:
+                await self.handover.take_over(*self._given)
+                self._broadcast.follow_wanted()
+                await taken()
+                self._context.freeze.begin(self._clock())
+                await self.handover.go_on()
             log.info("%s: HQ programs connect at %s", self.name, self.address)
             self.ready.set()
             try:
                 await self._attend()
             finally:
-                await asyncio.shield(self._leave())
+                if not self.handover.released.is_set():
+                    await asyncio.shield(self._leave())
 
     def _make_context(self, plan: ListenerPlan, robot: RobotSubscription, metrics: Metrics) -> ListenerContext:
         assert plan.protocol.hq is not None
@@ -112,6 +130,9 @@ class Listener:
             failures=FailureLog(self.name, counts.left_out),
             freeze=FreezeWatch(self._clock(), self._on_freeze),
             clock=self._clock,
+            limits=Limits(
+                frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
+            ),
         )
 
     # While it listens
@@ -119,9 +140,11 @@ class Listener:
     async def _attend(self) -> None:
         freeze, sweep_at = self._context.freeze, self._clock() + SWEEP_S
         freeze.begin(self._clock())
-        while True:
+        while not self.handover.released.is_set():
             await asyncio.sleep(ATTEND_S)
             freeze.beat(self._clock())
+            if self.handover.held:
+                continue
             for client in tuple(self._active):
                 client.tick()
                 if not client.operator.active:
@@ -166,21 +189,25 @@ class Listener:
             self._turn_away(link, host, reason or FULL)
             return None
         try:
-            session = context.side.session(number, self._limits)
+            session = context.side.session(number, context.limits)
         except Exception as error:
             context.failures.note("no session for a client", error)
             self._numbers.release(number, now, rests=False)
             self._turn_away(link, host, "the listener cannot serve the robot")
             return None
-        session.name = f"{self.name}.{number}"
-        client = self.clients[number] = Client(
-            context, number, host, session, queries=self._queries, refusals=self._refusals, spoke=self._on_spoken
-        )
-        client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
+        client = self._add(number, host, session)
         context.counts.accepted.value += 1
-        self._sessions.add(session)
         client.log("connected", "%s connected as client %d", link.peer, number)
         return client.conversation
+
+    def _add(self, number: int, host: str, session: Session[Any]) -> Client:
+        session.name = f"{self.name}.{number}"
+        client = self.clients[number] = Client(
+            self._context, number, host, session, queries=self._queries, refusals=self._refusals, spoke=self._on_spoken
+        )
+        client.conversation.ended.add_done_callback(lambda _: self._dismiss(client))
+        self._sessions.add(session)
+        return client
 
     def _turn_away(self, link: Link, host: str, reason: str) -> None:
         count = self._context.counts.turned_away

@@ -23,6 +23,7 @@ from zbridge.fleet.topics import Topic
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.command_queue import CommandQueue
 from zbridge.hq.intent import Action, Intent
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 
 log = logging.getLogger("zbridge.hq")
@@ -130,6 +131,15 @@ class Operator:
         if self.intent.held:
             self._release(why)
             self.intent.lost(why)
+
+    def export(self) -> Exported:
+        """Write what outlives a restart: the control mode. The lease does not."""
+        return {"mode": self.intent.mode, "chose": self._chose_mode}
+
+    def resume(self, state: Exported, why: str) -> None:
+        """Go on for a program that another process served; it must send neutral before it drives."""
+        self._chose_mode = bool(state["chose"])
+        self.intent.resume(str(state["mode"]), why)
 
     def close(self) -> None:
         """Release the robot: the client is gone; idempotent."""

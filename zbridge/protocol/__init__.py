@@ -17,6 +17,8 @@ rate_limit      :class:`RateLimit`: how often something may happen.
 exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
 codec           :class:`Codec`: the messages, for the conformance kit.
 kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
+kept            :class:`Kept`: what survives a restart of the gateway; :class:`Form`, ``FRAME``, ``FRAMES`` for what no
+                type describes; :class:`Frame`: a frame of a kind of its own.
 odometry        :class:`Odometry`: from what the wheels have turned to a pose.
 bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
 errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message
@@ -44,6 +46,7 @@ from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock
 from zbridge.protocol.exchange import Exchange, ExchangeSession
 from zbridge.protocol.handshake import Handshake
+from zbridge.protocol.kept import FRAME, FRAMES, Exported, Form, Frame, Kept
 from zbridge.protocol.kinematics import Differential, Factors, Positive
 from zbridge.protocol.negotiation import agree, newest, parse_versions
 from zbridge.protocol.odometry import Odometry
@@ -67,6 +70,8 @@ from zbridge.protocol.session_table import ClientIds
 
 __all__ = [
     "ATTEND_S",
+    "FRAME",
+    "FRAMES",
     "LIMIT",
     "Address",
     "BearingScan",
@@ -81,10 +86,14 @@ __all__ = [
     "EncodeError",
     "Exchange",
     "ExchangeSession",
+    "Exported",
     "Factors",
+    "Form",
+    "Frame",
     "Handshake",
     "HqSide",
     "HqSimulation",
+    "Kept",
     "Limits",
     "Malformed",
     "Metrics",

@@ -8,9 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from zbridge.fleet.messages import Scan, Scanner
+from zbridge.fleet.messages import Floats, Scan, Scanner
+from zbridge.protocol.kept import Form, Kept
 
 MOST_POINTS = 100_000
 """Points that are believed of a scanner that nobody has seen a scan of."""
@@ -24,12 +25,17 @@ if TYPE_CHECKING:
     _Indices = npt.NDArray[np.intp]
 
 
-class BearingScan:
+class BearingScan(Kept):
     """Makes one scan of the readings of several distance sensors.
 
     ``bearings_deg``: where each sensor looks, degrees; at least one. ``range_m``: the least and the greatest range that
     is believed; a reading outside is NaN. Evenly spread sensors give a point each, others a point a degree.
     """
+
+    kept: ClassVar[dict[str, Any]] = {
+        "_ranges_m": Form(lambda ranges: ranges.tolist(), lambda raw: _floats(raw)),
+        "_fresh": set[str],
+    }
 
     def __init__(self, bearings_deg: Mapping[str, float], range_m: tuple[float, float]) -> None:
         import numpy as np
@@ -63,6 +69,12 @@ class BearingScan:
         self._fresh.clear()
         first_rad, step_rad = math.radians(self._first_deg), math.radians(self._step_deg)
         return Scan(first_rad, step_rad, low, high, self._ranges_m.copy(), stamp_ns=stamp_ns)
+
+
+def _floats(raw: list[float]) -> Floats:
+    import numpy as np
+
+    return np.array(raw, np.float32)
 
 
 class Sectors:

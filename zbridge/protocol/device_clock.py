@@ -29,6 +29,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from itertools import pairwise
+from typing import Any, ClassVar
+
+from zbridge.protocol.kept import Kept
 
 JUMP_S = 10.0
 """Seconds by which the delays of two packets in a row may differ; a greater difference is a jump of a clock."""
@@ -61,7 +64,7 @@ _Point = tuple[int, int]
 """The counter since the beginning, ms; the time of arrival since the beginning less that counter, ns."""
 
 
-class DeviceClock:
+class DeviceClock(Kept):
     """Tells when one device took its measurements.
 
     ``wrap_ms``: the value at which the counter starts over (2**32 for a u32); None: it never does.
@@ -71,6 +74,24 @@ class DeviceClock:
     to 20 ms for 40 s); a step forward, or a restart, is found after ``jump_s`` if it is over ``LATE_S``, else
     forgotten after 64 s.
     """
+
+    kept: ClassVar[dict[str, Any]] = {
+        "beginnings": int,
+        "_device_ms": int,
+        "_now_ms": int,
+        "_arrived_ns": int,
+        "_stamp_ns": int,
+        "_origin_ns": int,
+        "_late_packets": int,
+        "_late_since_ns": int,
+        "_stray": tuple[int, int] | None,
+        "_drift_ppm": float,
+        "_height_ns": float,
+        "_points": list[tuple[int, int]],
+        "_lowest": tuple[int, int],
+        "_lowest_ns": float,
+        "_bucket_end_ms": int,
+    }
 
     def __init__(self, wrap_ms: int | None = None, jump_s: float = JUMP_S) -> None:
         self._wrap_ms = wrap_ms

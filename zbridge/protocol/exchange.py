@@ -33,9 +33,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from zbridge.errors import ProtocolError
+from zbridge.protocol.kept import FRAME
 from zbridge.protocol.outbox import LIMIT, Outbox
 from zbridge.protocol.session import Limits, Session
 from zbridge.wire.frames import FrameBuffer
@@ -52,6 +53,15 @@ class Exchange(Outbox):
 
     answer_s: seconds that an answer may take. expects: whether a request is answered at all.
     """
+
+    kept: ClassVar[dict[str, Any]] = {
+        "awaited": FRAME,
+        "failed": int,
+        "failed_in_a_row": int,
+        "_answer_at": float,
+        "_open": bool,
+        "_late": bool,
+    }
 
     def __init__(
         self,

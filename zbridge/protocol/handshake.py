@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
+
+from zbridge.errors import ProtocolError
+from zbridge.protocol.kept import Exported, Kept
 
 Step = TypeVar("Step", bound=Hashable)
 Event = TypeVar("Event", bound=Hashable)
@@ -16,11 +19,13 @@ Action = Callable[[Any, float], object]
 """``action(session, now)``; called when the next step has been taken."""
 
 
-class Handshake(Generic[Step, Event]):
+class Handshake(Kept, Generic[Step, Event]):
     """One run through a table. ``within_s``: seconds that a step may last; a step that is not in it may last for ever.
 
     ``timeout``: the event of a step that has lasted too long.
     """
+
+    kept: ClassVar[dict[str, Any]] = {"deadline": float}
 
     def __init__(
         self,
@@ -39,6 +44,18 @@ class Handshake(Generic[Step, Event]):
 
     def __repr__(self) -> str:
         return f"<Handshake {self.step}>"
+
+    def export(self) -> Exported:
+        """Write the step, and how long it may last."""
+        return super().export() | {"step": getattr(self.step, "name", self.step)}
+
+    def restore(self, state: Exported) -> None:
+        """Go on from a step; raise ProtocolError if the table has none of that name."""
+        super().restore(state)
+        steps = {getattr(step, "name", step): step for step in self._table}
+        if state.get("step") not in steps:
+            raise ProtocolError(f"no step {state.get('step')!r} in this handshake")
+        self.step = steps[state["step"]]
 
     def fire(self, event: Event, now: float) -> bool:
         """Take the next step, then act; False, and nothing happens, if the event is not due in this step."""

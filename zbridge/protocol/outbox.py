@@ -27,8 +27,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import Any, ClassVar
 
 from zbridge.errors import Code, NotReady
+from zbridge.protocol.kept import FRAMES, Form, Kept
 
 URGENT = 256
 """Frames of stops that may wait: one for each motor that a robot can have."""
@@ -63,8 +65,18 @@ class _Group:
         return self.position == 0 and (self.due > self.until or self.due == math.inf)
 
 
-class Outbox:
+class Outbox(Kept):
     """Frames on their way out. ``gap_s``: least time between two writes, seconds."""
+
+    kept: ClassVar[dict[str, Any]] = {
+        "_queue": FRAMES,
+        "_urgent": FRAMES,
+        "_exempt": FRAMES,
+        "_slots": Form(lambda slots: _write_slots(slots), lambda raw: _read_slots(raw)),
+        "_free_at": float,
+        "_turn_of_queue": bool,
+        "_quiet_until": float,
+    }
 
     def __init__(self, gap_s: float, limit: int = LIMIT) -> None:
         self.gap_s = gap_s
@@ -82,6 +94,11 @@ class Outbox:
 
     def __len__(self) -> int:
         return len(self._exempt) + len(self._urgent) + len(self._queue)
+
+    @property
+    def hurried(self) -> bool:
+        """Whether frames of a stop, or of a handshake, still wait."""
+        return bool(self._urgent or self._exempt)
 
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
@@ -105,6 +122,10 @@ class Outbox:
         found = len(waiting) < len(self._exempt)
         self._exempt = deque(waiting)
         return found
+
+    def found(self, frame: bytes | None) -> bytes | None:
+        """Return the exempt frame that equals ``frame``, after both were restored; ``frame`` itself if it has left."""
+        return next((kept for kept in self._exempt if kept == frame), frame)
 
     def set(
         self,
@@ -132,6 +153,11 @@ class Outbox:
                 del self._slots[slot]
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
+
+    def forget(self) -> None:
+        """Drop every frame that waits, and every repetition."""
+        for place in (self._queue, self._urgent, self._exempt, self._slots):
+            place.clear()
 
     def clear(self, slot: str) -> None:
         """Empty ``slot``."""
@@ -210,3 +236,18 @@ class Outbox:
         if not due or (self._queue and self._turn_of_queue):
             return None
         return due[0] if len(due) == 1 else min(due, key=lambda slot: self._slots[slot].due)
+
+
+def _write_slots(slots: dict[str, _Group]) -> list[Any]:
+    return [
+        [slot, FRAMES.write(group.frames), group.position, group.due, group.period_s, group.until]
+        for slot, group in slots.items()
+    ]
+
+
+def _read_slots(raw: list[Any]) -> dict[str, _Group]:
+    slots = {}
+    for slot, frames, position, due, period_s, until in raw:
+        group = slots[slot] = _Group(FRAMES.read(frames), due, period_s, until)
+        group.position = position
+    return slots

@@ -24,6 +24,7 @@ from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.codec import Codec
+from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
 from zbridge.protocol.session_table import ClientIds
 
@@ -41,13 +42,15 @@ class Outcome(msgspec.Struct, frozen=True):
     left_out: str | None = None
 
 
-class Robot(ABC):
+class Robot(Kept, ABC):
     """One robot as its protocol sees it: makes the sessions of its links, and translates both ways. Sans-IO.
 
     Commands are put into the outbox of the sessions that this object made. The time is an argument.
     """
 
     dialect: ClassVar[str | None] = None
+    hands_over: ClassVar[bool] = False
+    """Whether this class and its sessions name in ``kept`` all that they must not lose when the gateway restarts."""
     link_names: tuple[str, ...]
     """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 
@@ -75,6 +78,13 @@ class Robot(ABC):
     @abstractmethod
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
+
+    def stop_frames(self) -> tuple[bytes, ...]:
+        """Give the frames of a stop as the driving session would write them now; change nothing.
+
+        Somebody else writes them if this process dies. Empty: nobody can stop the robot then.
+        """
+        return ()
 
     @abstractmethod
     def ask(self, topic: Topic) -> None:
@@ -126,7 +136,7 @@ class RobotUser(typing.Protocol):
         """Give the robot back; the client must send neutral before it drives again."""
 
 
-class HqSide(ABC):
+class HqSide(Kept, ABC):
     """Shows a robot to the HQ programs (clients) of one listener, and translates what they send. Sans-IO.
 
     Made with the listener's options and the :class:`RobotView` that all listeners of a process share. :meth:`show`
@@ -137,6 +147,8 @@ class HqSide(ABC):
     """The protocol's name. Clients get the raw messages of a robot of the same protocol too."""
     deadman_s: ClassVar[float]
     """Seconds after which the motion of a silent client ends."""
+    hands_over: ClassVar[bool] = False
+    """Whether this class and its sessions name in ``kept`` all that they must not lose when the gateway restarts."""
     datagrams: bool = False
     """Whether clients send datagrams too."""
     follows: tuple[str, ...]

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
 
-class RateLimit:
+from zbridge.protocol.kept import Kept
+
+
+class RateLimit(Kept):
     """A bucket of ``rate_hz`` tokens that fills in a second; ``inf``: never empty."""
+
+    kept: ClassVar[dict[str, Any]] = {"left": float, "_filled_at": float}
 
     def __init__(self, rate_hz: float) -> None:
         self.rate_hz = rate_hz

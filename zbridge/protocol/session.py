@@ -2,17 +2,14 @@
 
 Theory of operation
 -------------------
-The state of a session is an entry of the table in :mod:`zbridge.protocol.session_states`; ``_on`` executes it.
-
-A driver (a conversation over a link, a simulator, a test) calls ``open`` when the transport is up, ``receive`` with the
-bytes that were read and ``lost`` when the transport is gone. After each call it writes ``outgoing(now)`` until that is
-None, and calls ``expire(now)`` at ``deadline()``.
+The state of a session is an entry of the table in :mod:`zbridge.protocol.session_states`; ``_on`` executes it. A driver
+(a conversation over a link, a simulator, a test) calls ``open`` when the transport is up, ``receive`` with the bytes
+that were read and ``lost`` when the transport is gone. After each call it writes ``outgoing(now)`` until that is None,
+and calls ``expire(now)`` at ``deadline()``.
 
 A protocol contributes the framing function, ``decode``, ``encode`` and the steps of its handshake: ``opened`` takes the
-first one, ``accept`` those that answer the peer, ``establish`` ends it.
-
-``receive`` guarantees: whatever the bytes, it raises nothing; a frame with a malformed body is counted and skipped; a
-frame that cannot be one, too many frames, or an answer that cannot be sent end the session.
+first one, ``accept`` those that answer the peer, ``establish`` ends it. ``receive`` raises nothing: a frame with a
+malformed body is skipped; what cannot be a frame, too many frames, or an answer that cannot be sent end the session.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from zbridge.errors import EncodeError, ProtocolError, Refused
 from zbridge.fleet.messages import SessionEntry
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.session_kept import KeptSession
 from zbridge.protocol.session_states import TRANSITIONS, SessionAction, SessionEvent
 from zbridge.protocol.session_states import State as State
 from zbridge.protocol.traffic import Datagram as Datagram
@@ -59,7 +57,7 @@ _ESTABLISHED, _CLOSING, _CLOSED = State.ESTABLISHED, State.CLOSING, State.CLOSED
 """Every message is compared with these; a lookup in the class is slow in Python 3.11."""
 
 
-class Session(ABC, Generic[M]):
+class Session(KeptSession, ABC, Generic[M]):
     """One conversation; a protocol subclasses it once for each role it plays."""
 
     role: Role
@@ -265,6 +263,11 @@ class Session(ABC, Generic[M]):
     def over(self) -> bool:
         """Whether the session is closing or closed."""
         return self.state is _CLOSED or self.state is _CLOSING
+
+    @property
+    def between_frames(self) -> bool:
+        """Whether no part of a frame waits for the rest of it."""
+        return not len(self._frames)
 
     @property
     def doubtful(self) -> str | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import random
-from typing import Any
+from collections.abc import Collection
+from typing import Any, ClassVar
 
 from zbridge.fleet.messages import SessionEntry
+from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Session
 
 REMEMBERED = 32
@@ -35,8 +37,10 @@ class Backoff:
         self._next_s = self._first_s
 
 
-class ClientIds:
+class ClientIds(Kept):
     """The ids that a robot gives its clients: the lowest free one; a released id is not given again for ``quiet_s``."""
+
+    kept: ClassVar[dict[str, Any]] = {"_free_at": dict[int, float]}
 
     def __init__(self, ids: range, quiet_s: float) -> None:
         self._quiet_s = quiet_s
@@ -53,6 +57,12 @@ class ClientIds:
                 self._free_at[client_id] = math.inf
                 return client_id
         return None
+
+    def keep(self, client_ids: Collection[int], now: float) -> None:
+        """Take back all ids but these: their clients are gone."""
+        for client_id, free_at in self._free_at.items():
+            if free_at == math.inf and client_id not in client_ids:
+                self.release(client_id, now)
 
     def release(self, client_id: int, now: float, *, rests: bool = True) -> None:
         """Take an id back. ``rests`` False: the client never used it, so it is free at once."""

@@ -6,6 +6,8 @@ import math
 
 import msgspec
 
+from zbridge.protocol.kept import Frame
+
 
 class Limits(msgspec.Struct, frozen=True):
     """Bounds of one session: bytes of a frame, seconds for the handshake, seconds between two writes.
@@ -19,7 +21,7 @@ class Limits(msgspec.Struct, frozen=True):
     rate_hz: float = math.inf
 
 
-class Datagram(bytes):
+class Datagram(Frame):
     """A frame that goes by datagram; every other frame goes by the stream."""
 
 

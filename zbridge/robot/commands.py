@@ -76,8 +76,8 @@ class Commands:
         if self.blocked:
             raise NotReady(LINK_BLOCKED)
 
-    def refuse_all(self, reason: str) -> None:
-        """Take nothing but stops from now on."""
+    def refuse_all(self, reason: str | None) -> None:
+        """Take nothing but stops from now on; None: take commands again."""
         self._closing = reason
 
     def _find(self, key: str) -> Topic:

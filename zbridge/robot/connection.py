@@ -12,13 +12,14 @@ from typing import Any
 
 import msgspec
 
-from zbridge.errors import LinkError
+from zbridge.errors import LinkError, ProtocolError
 from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Session, State, Tap
 from zbridge.protocol.session_table import Backoff, SessionTable
-from zbridge.transport import Conversation
+from zbridge.transport import Conversation, Link, Parcel, take_over
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.link")
@@ -56,6 +57,10 @@ class Hooks(msgspec.Struct, frozen=True):
     """Counts datagrams beyond the share."""
     stalled: Callable[[bool], object] = lambda stalled: None
     """Called when the link stops taking bytes (True), and when it takes them again (False)."""
+    linked: Callable[[Link, bool], object] = lambda link, up: None
+    """Called when a link is up (True), and when it is gone (False)."""
+    read: Callable[[], object] = lambda: None
+    """Called when the bytes of a read have been handled."""
 
 
 class Links:
@@ -110,6 +115,10 @@ class Connection:
         self.conversation: Conversation | None = None
         self._hooks = hooks
         self._ending = False
+        self._free = asyncio.Event()
+        """Cleared while another process may get the link: nothing is connected then."""
+        self._free.set()
+        self._given: tuple[Exported, Parcel] | None = None
         self._watchers: dict[str, Callable[[bytes], object]] = {}
 
     def __repr__(self) -> str:
@@ -126,6 +135,7 @@ class Connection:
             log.info("%s: %s; next attempt in %.1f s", self._label, reason, delay_s)
             self._set_state("offline", reason)
             await asyncio.sleep(delay_s)
+            await self._free.wait()
 
     async def close(self, reason: str, timeout_s: float) -> None:
         """End the conversation within ``timeout_s`` seconds, and do not connect again."""
@@ -135,6 +145,58 @@ class Connection:
             conversation.close(reason)
             await asyncio.wait([conversation.ended], timeout=timeout_s)
         self.state, self.reason = "offline", reason
+
+    # A restart
+
+    @property
+    def stays(self) -> str | None:
+        """Why the link cannot be handed to another process now; None where it can, or where there is none."""
+        conversation = self.conversation
+        if conversation is None:
+            return None
+        if conversation.session.outbox.hurried:
+            return "the stop is not yet written"
+        return conversation.stays
+
+    def hold(self) -> None:
+        """Read, write and connect nothing until :meth:`go_on`."""
+        self._free.clear()
+        if self.conversation is not None:
+            self.conversation.hold()
+
+    async def go_on(self) -> None:
+        """Go on after :meth:`hold`, or attach what was taken over: from now on this process has the link."""
+        self._free.set()
+        given, self._given = self._given, None
+        if self.conversation is None:
+            return
+        self.conversation.go_on()
+        if given is not None:
+            try:
+                await take_over(self.address, *given, self.conversation)
+            except (OSError, ProtocolError) as error:
+                self.conversation.lost(str(error))
+
+    def hand_over(self, parcel: Parcel) -> Exported | None:
+        """Put the connection into a parcel, and describe its conversation; None where there is none."""
+        return self.conversation.hand_over(parcel) if self.conversation is not None else None
+
+    def take_over(self, given: Exported | None, parcel: Parcel) -> None:
+        """Restore the conversation of another process, which :meth:`go_on` attaches; raise ProtocolError."""
+        if given is None:
+            return
+        session = self._hooks.session()
+        session.restore(given["session"])
+        self.state, self.reason = _STATES[session.state], session.busy or session.reason
+        self.conversation = conversation = self._make_conversation(session)
+        conversation.held = True
+        self._given = (given["link"], parcel)
+
+    def release(self) -> None:
+        """Give up the connection, which another process has now."""
+        self._ending = True
+        if self.conversation is not None:
+            self.conversation.release()
 
     def status(self) -> LinkStatus:
         """Return the entry of this link on ``status``."""
@@ -162,9 +224,29 @@ class Connection:
 
     async def _converse(self) -> tuple[str, bool]:
         """Hold one conversation to its end; return why it ended and whether it was ever established."""
-        hooks, session = self._hooks, self._hooks.session()
+        hooks, conversation = self._hooks, self.conversation
+        taken_over = conversation is not None
+        if conversation is None:
+            self._set_state("connecting", None)
+            conversation = self.conversation = self._make_conversation(hooks.session())
+        session = conversation.session
+        hooks.manager.add(session)
+        try:
+            if not taken_over:
+                await hooks.connect(self.address, conversation)
+            await conversation.ended
+        except LinkError as error:
+            session.lost(str(error))
+        finally:
+            conversation.abandon()
+            self.conversation = None
+            hooks.manager.remove(session)
+        return session.reason or "closed", session.version is not None
+
+    def _make_conversation(self, session: Session[Any]) -> Conversation:
+        hooks = self._hooks
         session.name, session.tap = self.name, self._tap
-        conversation = Conversation(
+        return Conversation(
             session,
             asyncio.get_running_loop(),
             deliver=hooks.deliver,
@@ -176,20 +258,9 @@ class Connection:
             stalled=hooks.stalled,
             share=hooks.share,
             surplus=hooks.surplus,
+            linked=hooks.linked,
+            read=hooks.read,
         )
-        self._set_state("connecting", None)
-        self.conversation = conversation
-        hooks.manager.add(session)
-        try:
-            await hooks.connect(self.address, conversation)
-            await conversation.ended
-        except LinkError as error:
-            session.lost(str(error))
-        finally:
-            conversation.abandon()
-            self.conversation = None
-            hooks.manager.remove(session)
-        return session.reason or "closed", session.version is not None
 
     def _on_session(self, session: Session[Any]) -> None:
         if session.state is State.ESTABLISHED and self.state != "established":

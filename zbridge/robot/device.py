@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
@@ -23,20 +23,22 @@ from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
-from zbridge.errors import BusError, Refused
+from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.plugin import Robot
-from zbridge.protocol.session import Session
+from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connect, Connection, Hooks, Links
+from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport import connect
+from zbridge.transport import Parcel, connect
 from zbridge.transport.fair_share import FairShare
 
 HEARTBEAT_S = 1.0
@@ -45,7 +47,12 @@ LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
+KEPT_BYTES = 2048
+"""Largest published value that is kept for the case that this process dies."""
 _LEAVING = "gateway stopped"
+_CRASHED = "crashed"
+_LOOK_S = 0.005
+"""Seconds between two looks whether the links can be handed over."""
 
 
 class Device:
@@ -68,13 +75,19 @@ class Device:
         idle_stop_s: float = IDLE_STOP_S,
         share: FairShare | None = None,
         connect: Connect = connect,
+        observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too."""
         loop = asyncio.get_running_loop()
+        self._protocol = protocol
+        self._released = asyncio.Event()
+        self._commanded: list[Handle] = []
+        self._declared: list[Handle] = []
         clock, conditions = clock or loop.time, conditions or Conditions()
         self._share = share
+        self._observer = observer or Nobody()
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
@@ -83,6 +96,7 @@ class Device:
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)
         self._enforcer = Enforcer(context, authority, self._standstill, audit, limits)
+        self._enforcer.settled = self._observer.changed
         self._leases = LeaseServer(context, self._enforcer)
         self._commands = Commands(context, self._enforcer)
         self._queries = Queries(context, self._commands, pending)
@@ -99,7 +113,7 @@ class Device:
             session=partial(self._session, name, str(address)),
             deliver=self._telemetry.deliver,
             session_changed=presence.session_changed,
-            state_changed=presence.publish_status,
+            state_changed=self._state_changed,
             connect=connect,
             manager=sessions,
             malformed=context.metrics.count("malformed"),
@@ -109,37 +123,97 @@ class Device:
             share=self._share,
             surplus=context.metrics.count("datagrams_over_share"),
             stalled=partial(presence.stalled, name),
+            linked=partial(self._observer.linked, name),
+            read=partial(self._observer.read, name),
         )
 
     def __repr__(self) -> str:
         return f"<Device {self._context.keys.robot} {self._links.first.state}>"
 
-    async def run(self) -> None:
-        """Serve the robot until cancelled; then stop it if it moves, and take leave of it."""
-        context = self._context
+    async def run(self, begin: Callable[[], Awaitable[None]] | None = None) -> None:
+        """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
+
+        Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
+        declared; until then nothing is read, written or published.
+        """
+        if begin is None:
+            self._show()
+        self._declare()
+        if begin is not None:
+            await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
+            await begin()
+            await self.go_on()
+            self._show()
+        self._standstill.begin()
+        self._observer.began(self)
+        async with asyncio.TaskGroup() as tasks:
+            work = [tasks.create_task(self._beat())]
+            work += [tasks.create_task(connection.run()) for connection in self._links]
+            try:
+                await self._released.wait()
+            finally:  # the links' tasks still run: the group ends them only after this
+                if not self._released.is_set():
+                    await asyncio.shield(self._shut_down())
+                for task in work:
+                    task.cancel()
+
+    def _show(self) -> None:
         self._presence.publish_status()
         self._enforcer.report()
-        self._standstill.begin()
-        declared = [
+
+    def _declare(self) -> None:
+        self._listen()
+        self._declared = [self._context.bus.watch_connected(self._on_bus), *self._telemetry.serve()]
+
+    def _listen(self) -> None:
+        """Take commands and queries from the bus; idempotent."""
+        context = self._context
+        self._commanded = self._commanded or [
             *self._leases.serve(),
             context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
-            context.bus.watch_connected(self._on_bus),
             *self._queries.serve(),
-            *self._telemetry.serve(),
         ]
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._beat())
-            for connection in self._links:
-                tasks.create_task(connection.run())
-            try:
-                await asyncio.Event().wait()
-            finally:  # the links' tasks still run: the group ends them only after this
-                await asyncio.shield(self._shut_down(declared))
 
     @property
     def reached(self) -> bool:
         """Whether the robot was ever reached."""
         return self._presence.reached
+
+    @property
+    def driven(self) -> bool:
+        """Whether a program drives the robot, or told it to move by itself."""
+        return self._enforcer.authority.driven or self._enforcer.authority.moving
+
+    @property
+    def state(self) -> str:
+        """The state of the robot, as on ``status``."""
+        return self._links.first.state
+
+    def last_stop(self) -> LastStop:
+        """Give what stops the robot now; see :class:`LastStop`."""
+        session, driven, state = self._context.robot.driving, self.driven, self.state
+        if session is None or session.state is not State.ESTABLISHED:
+            return LastStop(driven, state=state)
+        try:
+            frames = self._context.robot.stop_frames()
+        except Refused:
+            frames = ()
+        except Exception as error:
+            self._context.faults.note("stop", error)
+            frames = ()
+        stop = tuple(StopFrame(bytes(frame), type(frame) is Datagram) for frame in frames)
+        return LastStop(driven, stop, session.outbox.gap_s, state)
+
+    def boundary(self, name: str) -> Boundary:
+        """Give where the stream of a link stands; see :class:`Boundary`."""
+        conversation = next((each.conversation for each in self._links if each.name == name), None)
+        if conversation is None:
+            return Boundary(outgoing=False, incoming=False)
+        return Boundary(not conversation.stalled, conversation.session.between_frames)
+
+    def _state_changed(self) -> None:
+        self._presence.publish_status()
+        self._observer.changed()
 
     def refuse(self, command: str, refusal: Refused, who: str) -> None:
         """Show on ``control`` what was refused to somebody."""
@@ -163,7 +237,94 @@ class Device:
             self._presence.publish_status()
             self._enforcer.beat()
 
-    async def _shut_down(self, declared: list[Handle]) -> None:
+    # A restart: another process takes the robot over
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        """Stop the robot, end the lease and take no commands; wait until the links can be handed over.
+
+        Raises Refused with the reason where that takes longer than ``within_s``; :meth:`go_on` takes it all back.
+        """
+        if not self._context.robot.hands_over:
+            raise Unsupported(f"protocol {self._protocol} does not hand its sessions over")
+        self._commands.refuse_all(reason)
+        self._leases.refuse_all(reason)
+        self._enforcer.stop(reason)
+        self._context.pump()
+        until = self._context.clock() + within_s
+        while any(connection.stays for connection in self._links):
+            if self._context.clock() >= until:
+                raise NotReady("; ".join(f"{each.name}: {each.stays}" for each in self._links if each.stays))
+            await asyncio.sleep(_LOOK_S)
+
+    async def shut(self) -> None:
+        """Do nothing: nobody is accepted here."""
+
+    def hold(self) -> None:
+        """Read and write nothing from now on."""
+        for connection in self._links:
+            connection.hold()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the links into a parcel; describe them, the robot, and what was published. To be called while held."""
+        return {**self._describe(parcel), "published": self._publishers.export()}
+
+    def _describe(self, parcel: Parcel) -> Exported:
+        links = [connection.hand_over(parcel) for connection in self._links]
+        return {"links": links, "robot": self._context.robot.export()}
+
+    def keep(self, parcel: Parcel) -> Exported | None:
+        """Describe what another process needs to go on if this one dies; None where it could not.
+
+        Large values that were published are left out.
+        """
+        session = self._context.robot.driving
+        if not self._context.robot.hands_over or session is None or session.state is not State.ESTABLISHED:
+            return None
+        talks = (connection.conversation for connection in self._links)
+        if any(talk is not None and talk.link is None for talk in talks):  # a link that is not up yet
+            return None
+        published = self._publishers.export(most_bytes=KEPT_BYTES)
+        return {**self._describe(parcel), "published": published, _CRASHED: True}
+
+    def take_over(self, given: Exported, parcel: Parcel) -> None:
+        """Restore what another process handed over; raise ProtocolError. Call :meth:`run` with ``begin`` then."""
+        for connection, link in zip(self._links, given["links"], strict=True):
+            connection.take_over(link, parcel)
+        self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
+        if any(given["links"]):
+            self._context.robot.restore(given["robot"])
+        session = self._context.robot.driving
+        if session is not None and session.state is State.ESTABLISHED:
+            self._presence.resume(session)
+            if given.get(_CRASHED):  # what waited then may have been written since, and may be motion
+                session.outbox.forget()
+                with contextlib.suppress(Refused):
+                    self._standstill.stop()
+
+    async def go_on(self) -> None:
+        """Read, write and take commands: again, or for the first time with what was taken over."""
+        self._listen()
+        self._commands.refuse_all(None)
+        self._leases.refuse_all(None)
+        for connection in self._links:
+            await connection.go_on()
+
+    def withdraw(self) -> None:
+        """Take no commands and queries from the bus any more: another process does."""
+        handles, self._commanded = self._commanded, []
+        for handle in handles:
+            handle.close()
+
+    async def release(self) -> None:
+        """Give the links up and end :meth:`run`; the robot notices nothing."""
+        self._released.set()
+        self._standstill.close()
+        self._enforcer.close()
+        self._context.conditions.changed = lambda: None
+        for connection in self._links:
+            connection.release()
+
+    async def _shut_down(self) -> None:
         """Stop a moving robot, take leave of it, say so on the bus, and leave the robot's keys to others."""
         self._presence.leave()
         self._commands.refuse_all(_LEAVING)
@@ -175,10 +336,11 @@ class Device:
         self._presence.publish_status()
         self._standstill.close()
         self._enforcer.close()
+        self._observer.ended()
         with contextlib.suppress(BusError, TimeoutError):
             async with asyncio.timeout(FLUSH_S):
                 await self._context.bus.flush()
         self._context.conditions.changed = lambda: None
-        for handle in declared:
+        for handle in (*self._commanded, *self._declared):
             handle.close()
         self._publishers.close()

@@ -34,6 +34,7 @@ import msgspec
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.errors import BusError
 from zbridge.fleet.topics import KeySpace
+from zbridge.protocol.kept import Exported
 
 log = logging.getLogger("zbridge.app.gateway")
 
@@ -54,7 +55,8 @@ RIVALS = 16
 MOST_S = 10 * 365 * 86_400.0
 """The longest time for which a robot can have been served, seconds: ten years. Longer claims are ignored."""
 _WHO = "gateway"
-_CLAIM = "@rpc/claim/gateway"
+CLAIM = "@rpc/claim/gateway"
+"""The path at which a gateway answers with its claim."""
 
 
 class _Served(msgspec.Struct):
@@ -113,6 +115,8 @@ class Ownership:
         self._was_connected = False
         self._came = asyncio.Event()
         self._watch: Handle | None = None
+        self.hands_over = False
+        """Whether a successor announces the same claim now: it is no rival."""
 
     def __repr__(self) -> str:
         return f"<Ownership {self._keys.robot} {'held' if self._held_since is not None else 'not held'}>"
@@ -150,6 +154,8 @@ class Ownership:
                     await self._came.wait()
             self._came.clear()
             await asyncio.sleep(random.uniform(1.0, 4.0) * LOOK_S)  # all gateways of a router find their bus at once
+            if self.hands_over:
+                continue
             with contextlib.suppress(BusError):
                 serving = {zid: claim for zid, claim in (await self._claims()).items() if claim.held_s}
                 if has():
@@ -158,6 +164,17 @@ class Ownership:
                     log.error("another gateway served %s before this one: leaving it alone", self._keys.robot)
                     return
                 tell(tuple(serving))
+
+    def export(self) -> Exported | None:
+        """Write the claim for a successor of this gateway; None where the robot is not owned."""
+        return None if self._held_since is None else {"since": self._held_since, "has": self._has()}
+
+    def inherit(self, claim: Exported) -> None:
+        """Own the robot as the gateway before did, without waiting until it goes; called instead of :meth:`take`."""
+        self._announce()
+        self._held_since, has = float(claim["since"]), bool(claim["has"])
+        self._has = lambda: has
+        self._state = State.KEEPING if has else State.OWNING
 
     def release(self) -> None:
         """Withdraw the claim; idempotent."""
@@ -181,7 +198,7 @@ class Ownership:
 
     def _announce(self) -> None:
         self._handles = [
-            self._bus.answer(self._keys.key(_CLAIM), self._on_question),
+            self._bus.answer(self._keys.key(CLAIM), self._on_question),
             self._bus.announce(self._keys.alive(_WHO)),
         ]
 
@@ -228,7 +245,7 @@ class Ownership:
         """Ask for the claims of others; return the best by session id. Implausible claims are ignored."""
         claims: list[tuple[_Served, str]] = []
         heard = {self._bus.zid}
-        for answer in await self._bus.ask(self._keys.key(_CLAIM), timeout_s=ASK_S):
+        for answer in await self._bus.ask(self._keys.key(CLAIM), timeout_s=ASK_S):
             if answer.replier is None or answer.replier in heard:
                 continue
             heard.add(answer.replier)

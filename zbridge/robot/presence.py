@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import socket
 from typing import Any
 
 from zbridge.control.context import RobotContext
@@ -44,6 +45,7 @@ class Presence:
         self._busy: str | None = None
         self._doubtful: str | None = None
         self._shown_doubts: tuple[str, ...] = ()
+        self._host = socket.gethostname() or None
         self._leaving = False
         self._lost = context.metrics.count("commands_lost")
         self._stalls = context.metrics.count("link_stalls")
@@ -55,6 +57,10 @@ class Presence:
     def reached(self) -> bool:
         """Whether the robot was ever reached."""
         return self._greeted is not None
+
+    def resume(self, session: Session[Any]) -> None:
+        """Take a session for greeted: another process established it."""
+        self._greeted, self._busy, self._doubtful = session, session.busy, session.doubtful
 
     def leave(self) -> None:
         """Note that the gateway takes leave of the robot: the end of its session holds nothing back."""
@@ -107,6 +113,7 @@ class Presence:
                 version=(agreed.version or None) if agreed is not None else None,
                 features=agreed.features if agreed is not None else (),
                 links=tuple(connection.status() for connection in self._links),
+                host=self._host,
             ),
         )
 

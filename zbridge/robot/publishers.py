@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from zbridge.bus import Bus, Publisher
 from zbridge.control.conditions import Conditions
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.topics import KeySpace, Topic, find
 from zbridge.robot.names import NAMES, NameBudget
 
 
@@ -46,6 +46,18 @@ class RobotPublishers:
                 return None
             publisher = self.known[path] = self._bus.publisher(self._keys.key(path), topic)
         return publisher
+
+    def export(self, most_bytes: int | None = None) -> list[list[object]]:
+        """List the keys, each with the last value that it keeps; without values of more than ``most_bytes``."""
+        known = [(path, publisher.last) for path, publisher in self.known.items()]
+        return [[path, last] for path, last in known if most_bytes is None or len(last or b"") <= most_bytes]
+
+    def restore(self, known: Iterable[tuple[str, bytes | None]]) -> None:
+        """Declare the keys of another process, which answer for their last values; nothing is published."""
+        for path, last in known:
+            topic = find(path)
+            if topic is not None and (not _is_named(path) or self._names.admit(path, self._clock())):
+                self.known[path] = self._bus.publisher(self._keys.key(path), topic, last)
 
     def forget_names(self) -> None:
         """Give up the names of a connection that has ended."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from zbridge.protocol.address import DeviceAddress, SerialAddress
+from zbridge.protocol.kept import Exported
 from zbridge.transport import serial, tcp
 from zbridge.transport.link import Link, Receiver
+from zbridge.transport.parcel import Parcel
 
 
 async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray | None = None) -> Link:
@@ -15,3 +17,13 @@ async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray 
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
     return await tcp.connect(address, receiver, buffer)
+
+
+async def take_over(address: DeviceAddress, given: Exported, parcel: Parcel, receiver: Receiver) -> Link:
+    """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError.
+
+    Only when the other process has let go: reading begins at once.
+    """
+    if isinstance(address, SerialAddress):
+        return serial.take_over(address, parcel.take(given.get("serial")), receiver)
+    return await tcp.take_over(given, parcel, receiver)

@@ -15,9 +15,11 @@ from typing import Any, Concatenate, ParamSpec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import STALLED_S, Link
+from zbridge.transport.parcel import Parcel
 
 log = logging.getLogger("zbridge.link")
 
@@ -56,6 +58,8 @@ class Conversation:
     ``may_warn(kind)`` says whether a warning of this kind may be logged now.
     ``share``: of a processor; who sends more than can be worked off within it is not read meanwhile, and its datagrams
     are dropped and counted by ``surplus``.
+    ``linked`` is called with the link and True when the link is up, and False when it is gone.
+    ``read`` is called when the bytes of a read have been cut into frames.
     ``clock``: seconds on the loop's time line; the default is the loop's own clock, which may be a millisecond behind.
     """
 
@@ -76,8 +80,15 @@ class Conversation:
         stalled: Callable[[bool], object] = lambda stalled: None,
         share: FairShare | None = None,
         surplus: Count | None = None,
+        linked: Callable[[Link, bool], object] = lambda link, up: None,
+        read: Callable[[], object] = lambda: None,
     ) -> None:
+        self._read = read
         self.session = session
+        self._linked = linked
+        self._observed: Link | None = None
+        self.held = False
+        """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
         self._before = before
         self._on_stall = stalled
         self.blocked = False
@@ -109,7 +120,10 @@ class Conversation:
     @_then_pump
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
-        self._link = link
+        self._link = self._observed = link
+        self._linked(link, True)
+        if self.held:
+            link.hold()
         self.session.peer = link.peer
         self.session.open(self._clock())
 
@@ -117,7 +131,9 @@ class Conversation:
         """Take bytes from the link."""
         begun = self._clock()
         try:
-            self._hand_on(self.session.receive(data, begun))
+            messages = self.session.receive(data, begun)
+            self._read()
+            self._hand_on(messages)
             self._pump()
         except Exception as error:
             self._fault(error)
@@ -177,7 +193,9 @@ class Conversation:
     @_then_pump
     def lost(self, reason: str) -> None:
         """End: the link is gone."""
-        self._link = None
+        if self._observed is not None:
+            self._linked(self._observed, False)
+        self._link = self._observed = None
         self.session.lost(reason)
 
     def pump(self) -> None:
@@ -192,6 +210,8 @@ class Conversation:
         self.pump()
 
     def _pump(self) -> None:
+        if self.held:
+            return
         session, link = self.session, self._link
         outbox = session.outbox
         if session.drops_source and link is not None:
@@ -254,7 +274,7 @@ class Conversation:
     def resume(self) -> None:
         """Read again."""
         self._paused = False
-        if self._link is not None and self._rests is None:
+        if self._link is not None and self._rests is None and not self.held:
             self._link.resume()
 
     def _rest(self, share: FairShare, begun: float) -> None:
@@ -269,6 +289,48 @@ class Conversation:
         self._rests = None
         if not self._paused:
             self.resume()
+
+    # A restart
+
+    @property
+    def link(self) -> Link | None:
+        """The connection; None before there is one, and after it."""
+        return self._link
+
+    @property
+    def stays(self) -> str | None:
+        """Why the conversation cannot be handed to another process now; None where it can."""
+        link = self._link
+        if link is None or self.session.over:
+            return "the connection is not up"
+        return link.stays or (None if link.ready else "the peer takes nothing")
+
+    def hold(self) -> None:
+        """Read and write nothing, and run no timer, until :meth:`go_on`."""
+        self.held = True
+        self._set_timer(None)
+        if self._link is not None:
+            self._link.hold()
+
+    def go_on(self) -> None:
+        """Go on where :meth:`hold` interrupted: this process has the connection."""
+        self.held = False
+        if self._link is not None:
+            self._link.go_on()
+        self.pump()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the connection of a held conversation into a parcel; describe it and the session."""
+        assert self._link is not None
+        return {"session": self.session.export(), "link": self._link.hand_over(parcel)}
+
+    def release(self) -> None:
+        """Forget the connection, which another process has now: the peer notices nothing."""
+        self.held = True
+        self._set_timer(None)
+        link, self._link = self._link, None
+        if link is not None:
+            link.release()
 
     @_then_pump
     def _tick(self) -> None:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from zbridge.protocol.kept import Exported
+from zbridge.transport.parcel import Parcel
+
 
 class FakeLink:
     """A link without a socket: keeps what was written, and the test plays the peer."""
 
     def __init__(self, peer: str = "tcp://robot.test:1") -> None:
         self.peer = peer
+        self.reads: Callable[[], object] = lambda: None
+        self.descriptors: tuple[int, ...] = ()
         self.ready = True
         self.silent_s = 0.0
         self.unacknowledged_s = 0.0
@@ -15,6 +22,7 @@ class FakeLink:
         self.datagrams: list[bytes] = []
         self.sources_dropped = 0
         self.paused = False
+        self.held = False
         self.closed = False
 
     def write(self, data: bytes) -> None:
@@ -36,6 +44,24 @@ class FakeLink:
     def resume(self) -> None:
         """Note the call."""
         self.paused = False
+
+    stays: str | None = None
+
+    def hold(self) -> None:
+        """Note the call."""
+        self.held = True
+
+    def go_on(self) -> None:
+        """Note the call."""
+        self.held = False
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Have nothing to hand over."""
+        return {}
+
+    def release(self) -> None:
+        """Note the call."""
+        self.closed = True
 
     def close(self) -> None:
         """Note the call."""

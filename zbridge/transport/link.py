@@ -6,7 +6,11 @@ Links are :class:`~zbridge.transport.tcp.TcpLink`, :class:`~zbridge.transport.se
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
+
+from zbridge.protocol.kept import Exported
+from zbridge.transport.parcel import Parcel
 
 STALLED_S = 0.3
 """Seconds without acknowledgement after which a robot's link is stalled; healthy robots acknowledge within 50 ms."""
@@ -47,6 +51,12 @@ class Link(Protocol):
     """One connection to a peer."""
 
     peer: str
+    reads: Callable[[], object]
+    """Called before bytes are taken from the kernel; set by who watches the link."""
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """File descriptors: of the stream, then of the datagrams where there are any. Empty while there is no link."""
 
     @property
     def ready(self) -> bool:
@@ -78,8 +88,43 @@ class Link(Protocol):
     def resume(self) -> None:
         """Read again."""
 
+    @property
+    def stays(self) -> str | None:
+        """Why this connection cannot be handed to another process; None where it can."""
+
+    def hold(self) -> None:
+        """Read nothing, neither stream nor datagrams, until :meth:`go_on`: another process may do so meanwhile."""
+
+    def go_on(self) -> None:
+        """Read again, after :meth:`hold`."""
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put what the connection consists of into a parcel, and describe it; the link must be held and ``ready``."""
+
+    def release(self) -> None:
+        """Give up a connection that another process has now: neither the peer nor the receiver notices."""
+
     def close(self) -> None:
         """Close the connection after what was written; idempotent."""
 
     def abort(self) -> None:
         """Close the connection now; what was written may be lost. Idempotent."""
+
+
+class _Nobody:
+    """Takes nothing: the receiver of a link that was given up."""
+
+    def attached(self, link: Link) -> None: ...
+    def received(self, data: bytes) -> None: ...
+    def received_datagram(self, datagram: bytes) -> None: ...
+    def claims(self, datagram: bytes, port: int) -> bool:
+        return False
+
+    def rivalled(self) -> None: ...
+    def stray_datagram(self, datagram: bytes) -> None: ...
+    def foreign_datagram(self) -> None: ...
+    def lost(self, reason: str) -> None: ...
+    def writable(self) -> None: ...
+
+
+NOBODY: Receiver = _Nobody()

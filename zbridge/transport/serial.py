@@ -14,12 +14,15 @@ import os
 import struct
 import termios
 import time
+from collections.abc import Callable
 from typing import Any
 
 from zbridge.errors import LinkError
 from zbridge.protocol.address import SerialAddress
+from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.link import STALLED_S, Receiver
+from zbridge.transport.parcel import Parcel
 
 READ_BYTES = 4096
 """Most bytes taken from a line before the loop serves others; the kernel's buffer of a terminal holds no more."""
@@ -40,6 +43,7 @@ class SerialLink:
 
     def __init__(self, address: SerialAddress, port: Any, receiver: Receiver) -> None:
         self.peer = str(address)
+        self.reads: Callable[[], object] = lambda: None
         self._port = port
         self._fd: int = port.fileno()
         self._receiver = receiver
@@ -48,6 +52,7 @@ class SerialLink:
         self._unwritten = b""
         self._open = True
         self._reading = False
+        self._held = False
         self._close_by: float | None = None
 
     def __repr__(self) -> str:
@@ -57,6 +62,11 @@ class SerialLink:
         """Attach the receiver and begin to read; called once."""
         self.resume()
         self._receiver.attached(self)
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """The line's file descriptor."""
+        return (self._fd,) if self._open else ()
 
     @property
     def ready(self) -> bool:
@@ -105,9 +115,35 @@ class SerialLink:
 
     def resume(self) -> None:
         """Read again."""
-        if self._open and self._close_by is None and not self._reading:
+        if self._open and self._close_by is None and not self._reading and not self._held:
             self._reading = True
             self._loop.add_reader(self._fd, self._read)
+
+    @property
+    def stays(self) -> str | None:
+        """None: a line can be handed over."""
+        return None
+
+    def hold(self) -> None:
+        """Read nothing until :meth:`go_on`."""
+        self._held = True
+        self.pause()
+
+    def go_on(self) -> None:
+        """Read again."""
+        self._held = False
+        self.resume()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the line into a parcel: its lock goes with the descriptor, and what the driver has is still sent."""
+        return {"serial": parcel.put(self._fd)}
+
+    def release(self) -> None:
+        """Give up the own end of a line that another process has now."""
+        self.pause()
+        self._open = False
+        with contextlib.suppress(OSError):
+            self._port.close()
 
     def close(self) -> None:
         """Close the line after what was written, within :data:`CLOSE_S`; idempotent."""
@@ -121,6 +157,7 @@ class SerialLink:
         self._end("closed")
 
     def _read(self) -> None:
+        self.reads()
         try:
             data = os.read(self._fd, READ_BYTES)
         except (BlockingIOError, InterruptedError):
@@ -189,6 +226,26 @@ def connect(address: SerialAddress, receiver: Receiver) -> SerialLink:
     link = SerialLink(address, _opened(address), receiver)
     link.begin()
     return link
+
+
+def take_over(address: SerialAddress, descriptor: int, receiver: Receiver) -> SerialLink:
+    """Use a line that another process opened and configured."""
+    link = SerialLink(address, _Line(descriptor), receiver)
+    link.begin()
+    return link
+
+
+class _Line:
+    """An open line without its settings, which the driver keeps."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def close(self) -> None:
+        os.close(self._descriptor)
 
 
 def _opened(address: SerialAddress) -> Any:

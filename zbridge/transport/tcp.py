@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import logging
 import socket
 import struct
-import termios
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import cast
@@ -19,8 +17,12 @@ from typing import cast
 from zbridge.errors import LinkError
 from zbridge.metrics import Count
 from zbridge.protocol.address import Address
+from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
-from zbridge.transport.link import STALLED_S, Receiver
+from zbridge.transport.door import Door
+from zbridge.transport.link import NOBODY, STALLED_S, Receiver
+from zbridge.transport.parcel import Parcel
+from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
 from zbridge.transport.udp import DatagramHub, DatagramSocket
 
 log = logging.getLogger("zbridge.link")
@@ -33,19 +35,10 @@ CLIENT_READ_BYTES = 4096
 """The same for an accepted peer: there may be hundreds."""
 CLIENT_WRITE_BYTES = 64 * 1024
 """Bytes that the kernel keeps for an accepted peer that reads slowly; older ones are of no use."""
-KEEPALIVE_S = 1
-"""Seconds of silence after which the kernel asks an accepted peer for a sign of life."""
 GIVE_UP_S = 60.0
 """Seconds without acknowledgement after which a robot's connection ends: long, for a deployed robot gives only one."""
 CLIENT_GIVE_UP_S = 10.0
 """The same for an accepted peer."""
-_RETRY_MOST_S = 1.0
-"""Longest time between two retransmissions of the kernel to a robot."""
-_TCP_RTO_MAX_MS = 44
-"""Linux 6.15 and newer; Python has no name for it yet."""
-_OUTSTANDING = struct.Struct("=i")
-_SIOCOUTQ = termios.TIOCOUTQ
-"""The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
 _TCP_INFO = struct.Struct("=24xI28xI")
 """Two fields of Linux's tcp_info: unacknowledged segments, and milliseconds since the last acknowledgement."""
 CLOSE_S = 1.0
@@ -58,7 +51,8 @@ class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
     ``buffer``: where reads go, :data:`READ_BYTES` of its own by default. Reads are copied at once, so all links of a
-    loop may share it. ``accepted``: by a listener.
+    loop may share it. ``accepted``: by a listener. ``given_udp``: the socket for datagrams to a robot, where another
+    process handed the connection over.
     """
 
     def __init__(
@@ -68,8 +62,11 @@ class TcpLink(asyncio.BufferedProtocol):
         buffer: bytearray | None = None,
         *,
         accepted: bool = False,
+        given_udp: socket.socket | None = None,
     ) -> None:
         self.peer = ""
+        self.reads: Callable[[], object] = lambda: None
+        self._given_udp = given_udp
         self._backlog: Backlog | None = None
         self._hub = hub
         self._accepted = accepted
@@ -81,6 +78,15 @@ class TcpLink(asyncio.BufferedProtocol):
 
     def __repr__(self) -> str:
         return f"<TcpLink {self.peer or 'unconnected'}>"
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """File descriptors of the stream, and of our own socket for datagrams where there is one."""
+        if self._transport is None:
+            return ()
+        stream: int = self._transport.get_extra_info("socket").fileno()
+        datagrams = self._datagrams.fileno() if self._datagrams is not None else -1
+        return tuple(number for number in (stream, datagrams) if number >= 0)
 
     @property
     def ready(self) -> bool:
@@ -137,7 +143,7 @@ class TcpLink(asyncio.BufferedProtocol):
             return 0.0
         now = time.monotonic()
         if now - backlog.since > STALLED_S:
-            backlog.settle(_outstanding(transport))
+            backlog.settle(outstanding(transport))
         return now - backlog.since if backlog.since is not None else 0.0
 
     def pause(self) -> None:
@@ -149,6 +155,35 @@ class TcpLink(asyncio.BufferedProtocol):
         """Read again."""
         if self._transport is not None and not self._transport.is_reading():
             self._transport.resume_reading()
+
+    @property
+    def stays(self) -> str | None:
+        """Why this connection cannot be handed over: a tls connection has keys that no other process knows."""
+        tls = self._transport is not None and self._transport.get_extra_info("ssl_object") is not None
+        return "a tls connection cannot be handed over" if tls else None
+
+    def hold(self) -> None:
+        """Read nothing, neither stream nor datagrams of our own socket, until :meth:`go_on`."""
+        self.pause()
+        if self._datagrams is not None:
+            self._datagrams.hold()
+
+    def go_on(self) -> None:
+        """Read again, after :meth:`hold`."""
+        self.resume()
+        if self._datagrams is not None:
+            self._datagrams.go_on()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the sockets into a parcel. What the kernel has is sent by the kernel."""
+        assert self._transport is not None
+        udp = parcel.put(self._datagrams.fileno()) if self._datagrams is not None else None
+        return {"tcp": parcel.put(self._transport.get_extra_info("socket").fileno()), "udp": udp}
+
+    def release(self) -> None:
+        """Give up the own descriptors of a connection that another process has now: no FIN is sent."""
+        self._receiver = NOBODY
+        self.abort()
 
     def close(self) -> None:
         """Close the connection after what was written, within :data:`CLOSE_S`; idempotent."""
@@ -174,18 +209,22 @@ class TcpLink(asyncio.BufferedProtocol):
             return
         self.peer = str(Address(*peer[:2]))
         sock = transport.get_extra_info("socket")
-        _tune(sock, CLIENT_GIVE_UP_S if self._accepted else GIVE_UP_S)
+        tune(sock, CLIENT_GIVE_UP_S if self._accepted else GIVE_UP_S)
         if self._accepted:
-            _keep_alive(sock)
+            keep_alive(sock)
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         else:
-            _bound_retries(sock)
-            self._backlog = _new_backlog(sock)
+            bound_retries(sock)
+            self._backlog = new_backlog(sock)
+            if self._given_udp is not None:
+                self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp)
+                self._datagrams.go_on()
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
         self._receiver.attached(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
+        self.reads()
         return self._view
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -213,62 +252,6 @@ class TcpLink(asyncio.BufferedProtocol):
         self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
-def _tune(sock: socket.socket, give_up_s: float) -> None:
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for option, value in (
-        ("TCP_KEEPIDLE", 5),
-        ("TCP_KEEPINTVL", 2),
-        ("TCP_KEEPCNT", 3),
-        ("TCP_USER_TIMEOUT", round(give_up_s * 1000)),
-    ):
-        if hasattr(socket, option):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def _keep_alive(sock: socket.socket) -> None:
-    """Ask a silent peer for a sign of life every second; ``_tune`` says when the connection ends."""
-    for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
-        if hasattr(socket, option):
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def _bound_retries(sock: socket.socket) -> None:
-    """Bound the time between retransmissions by :data:`_RETRY_MOST_S`, where the kernel can."""
-    with contextlib.suppress(OSError):
-        sock.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(_RETRY_MOST_S * 1000))
-
-
-_unwatched_warned = False
-
-
-def _new_backlog(sock: socket.socket) -> Backlog | None:
-    """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
-    global _unwatched_warned
-    try:
-        _queued(sock)
-    except OSError:
-        if not _unwatched_warned:
-            _unwatched_warned = True
-            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
-        return None
-    return Backlog()
-
-
-def _outstanding(transport: asyncio.Transport) -> int:
-    """Count the unacknowledged bytes: the kernel's and the transport's own."""
-    queued = 0
-    with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
-        queued = _queued(transport.get_extra_info("socket"))
-    return queued + transport.get_write_buffer_size()
-
-
-def _queued(sock: socket.socket) -> int:
-    """Count the unacknowledged bytes of the kernel; raise OSError where the platform does not tell."""
-    queued: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
-    return queued
-
-
 async def connect(address: Address, receiver: Receiver, buffer: bytearray | None = None) -> TcpLink:
     """Connect within :data:`CONNECT_S`, or raise LinkError with the reason. buffer: where reads go; links may share it.
 
@@ -285,6 +268,16 @@ async def connect(address: Address, receiver: Receiver, buffer: bytearray | None
     return link
 
 
+async def take_over(given: Exported, parcel: Parcel, receiver: Receiver) -> TcpLink:
+    """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError."""
+    sock = socket.socket(fileno=parcel.take(given.get("tcp")))
+    sock.setblocking(False)
+    udp = socket.socket(fileno=parcel.take(given["udp"])) if given.get("udp") is not None else None
+    loop = asyncio.get_running_loop()
+    _, link = await loop.create_connection(lambda: TcpLink(receiver, given_udp=udp), sock=sock)
+    return link
+
+
 @contextlib.asynccontextmanager
 async def listen(
     address: Address,
@@ -293,26 +286,22 @@ async def listen(
     datagrams: bool = False,
     foreign: Count | None = None,
     secured: Callable[[Receiver], Receiver] | None = None,
+    door: Door | None = None,
 ) -> AsyncIterator[Address]:
     """Accept peers, each with a receiver of its own; give the address that is bound, with its port.
 
     ``datagrams``: serve UDP on the same port number too; ``foreign`` counts the datagrams of nobody. ``secured`` puts a
-    filter before each receiver (TLS); then there are no datagrams. Raise LinkError if the address cannot be bound.
+    filter before each receiver (TLS); then there are no datagrams. ``door``: keeps the sockets, for who shuts it or
+    hands them over. Raise LinkError if the address cannot be bound.
     """
-    loop = asyncio.get_running_loop()
+    door = door or Door()
     hub = DatagramHub(foreign or Count()) if datagrams and secured is None else None
     make = receiver if secured is None else lambda: secured(receiver())
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
-            server = await loop.create_server(
-                lambda: TcpLink(make(), hub, buffer, accepted=True), address.host, address.port
-            )
-            await stack.enter_async_context(server)
-            host, port = server.sockets[0].getsockname()[:2]
-            if hub is not None:
-                hub.open(host, port)
-                stack.callback(hub.close)
+            stack.callback(door.close)
+            bound = await door.bind(address, make, lambda each: TcpLink(each, hub, buffer, accepted=True), hub)
         except OSError as error:
             raise LinkError(f"{address}: {error.strerror or error}") from error
-        yield Address(host, port, address.tls)
+        yield bound

@@ -11,9 +11,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+from collections.abc import Callable
 
-from zbridge.errors import LinkError
+from zbridge.errors import LinkError, NotReady
+from zbridge.protocol.kept import Exported
 from zbridge.transport.link import Link, Receiver
+from zbridge.transport.parcel import Parcel
 
 _READ_BYTES = 16_384
 """The most that one record of TLS holds."""
@@ -48,6 +51,7 @@ class TlsLink(Receiver):
 
     def __init__(self, receiver: Receiver, context: ssl.SSLContext, handshake_s: float) -> None:
         self.peer = ""
+        self.reads: Callable[[], object] = lambda: None
         self._receiver = receiver
         self._handshake_s = handshake_s
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -99,6 +103,34 @@ class TlsLink(Receiver):
         """Read again."""
         if self._link is not None:
             self._link.resume()
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """The file descriptor of the stream; empty while there is no link."""
+        return self._link.descriptors if self._link is not None else ()
+
+    @property
+    def stays(self) -> str | None:
+        """Why this connection cannot be handed to another process: the keys of TLS stay in this one."""
+        return "encrypted by this process"
+
+    def hold(self) -> None:
+        """Read nothing until :meth:`go_on`."""
+        if self._link is not None:
+            self._link.hold()
+
+    def go_on(self) -> None:
+        """Read again, after :meth:`hold`."""
+        if self._link is not None:
+            self._link.go_on()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Raise NotReady: see :attr:`stays`."""
+        raise NotReady(f"the connection is {self.stays}")
+
+    def release(self) -> None:
+        """Close the connection: no other process can have it."""
+        self.close()
 
     def close(self) -> None:
         """Close the connection after what was written; idempotent."""

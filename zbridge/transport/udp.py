@@ -32,6 +32,7 @@ class _DatagramReader:
     def __init__(self) -> None:
         self._socket: socket.socket | None = None
         self._loop = asyncio.get_running_loop()
+        self._held = False
 
     def _listen(self, host: str, port: int) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -43,7 +44,29 @@ class _DatagramReader:
             sock.close()
             raise
         self._socket = sock
-        self._loop.add_reader(sock.fileno(), self._read)
+        self.go_on()
+
+    def fileno(self) -> int:
+        """Return the descriptor of the open socket."""
+        assert self._socket is not None
+        return self._socket.fileno()
+
+    def take_over(self, sock: socket.socket) -> None:
+        """Use a socket that another process bound; read nothing before :meth:`go_on`."""
+        sock.setblocking(False)
+        self._socket, self._held = sock, True
+
+    def hold(self) -> None:
+        """Read nothing until :meth:`go_on`: what comes waits in the kernel."""
+        self._held = True
+        if self._socket is not None:
+            self._loop.remove_reader(self._socket.fileno())
+
+    def go_on(self) -> None:
+        """Read again."""
+        self._held = False
+        if self._socket is not None:
+            self._loop.add_reader(self._socket.fileno(), self._read)
 
     def drain(self) -> None:
         """Read all datagrams that wait."""
@@ -51,7 +74,7 @@ class _DatagramReader:
 
     def _read(self, most: int = _DATAGRAMS) -> None:
         for _ in range(most):
-            if self._socket is None:
+            if self._socket is None or self._held:
                 return
             try:
                 data, source = self._socket.recvfrom(_DATAGRAM_BYTES)
@@ -78,11 +101,15 @@ class _DatagramReader:
 class DatagramSocket(_DatagramReader):
     """A UDP socket to one robot: hears the address and port of the robot, and counts everything else."""
 
-    def __init__(self, transport: asyncio.Transport, receiver: Receiver) -> None:
+    def __init__(self, transport: asyncio.Transport, receiver: Receiver, given: socket.socket | None = None) -> None:
+        """``given``: the socket of another process, that was held."""
         super().__init__()
         self._receiver = receiver
         self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
-        self._listen(transport.get_extra_info("sockname")[0], 0)
+        if given is not None:
+            self.take_over(given)
+        else:
+            self._listen(transport.get_extra_info("sockname")[0], 0)
 
     def send(self, data: bytes) -> None:
         """Send to the peer."""
@@ -134,6 +161,15 @@ class DatagramHub(_DatagramReader):
         source = self._sources.pop(link, None)
         if source is not None:
             del self._owners[source]
+
+    def source(self, link: Link) -> tuple[str, int] | None:
+        """Return the source that is the link's."""
+        return self._sources.get(link)
+
+    def bind(self, link: Link, receiver: Receiver, source: tuple[str, int]) -> None:
+        """Let a source be the link's, as it was in another process."""
+        self._sources[link] = source
+        self._owners[source] = (link, receiver)
 
     def send(self, link: Link, data: bytes) -> None:
         """Send to the source of a link; without a source the datagram is lost."""

@@ -35,6 +35,11 @@ class FrameBuffer:
     def __repr__(self) -> str:
         return f"<FrameBuffer {len(self._rest)} of {self._needed} bytes, limit {self._limit}>"
 
+    @property
+    def rest(self) -> bytes:
+        """The incomplete frame."""
+        return bytes(self._rest)
+
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Yield every frame that ``data`` completes; raise ProtocolError at a broken or too large frame.
 

@@ -5,6 +5,8 @@ Source: "The gateway as robot" of the protocol page.
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 from gateways.tcpudp.hq.options import HqOptions
 from gateways.tcpudp.maps import TCP_BYTES, Geometry
 from gateways.tcpudp.messages import PACKETS, Packet, ServerPosition, ServerSLAMMap, encode_packet
@@ -19,6 +21,8 @@ _ON_REQUEST = frozenset({ServerSLAMMap.spec.id, ServerPosition.spec.id})
 
 class HqClient(RobotRole):
     """One program: the geometry of the map that it was announced, and the packets that it knows."""
+
+    kept: ClassVar[dict[str, Any]] = {"geometry": Geometry, "_asked": set[int]}
 
     def __init__(self, bounds: Limits, settings: Settings, number: int, options: HqOptions, geometry: Geometry) -> None:
         self.geometry = geometry

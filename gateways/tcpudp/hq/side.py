@@ -33,6 +33,7 @@ class TcpUdpHq(HqSide):
     """One listener."""
 
     name = NAME
+    hands_over = True
     deadman_s = DEADMAN_S
     follows = ("pose", "map", "text", "lidar", "camera", f"raw/{NAME}")
 

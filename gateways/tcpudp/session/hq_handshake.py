@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from enum import Enum
+from typing import Any, ClassVar
 
 from gateways.tcpudp.messages import (
     HEADER,
@@ -28,7 +29,7 @@ from gateways.tcpudp.messages import (
     ServerUDPConnection,
 )
 from gateways.tcpudp.session.packets import PacketSession, decoders
-from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, Settings, read_settings
+from gateways.tcpudp.settings import ROBOT_BLOCKS, SETTINGS, Feature, Settings, read_settings
 from gateways.tcpudp.signs import LOOK_AGAIN_S, LOOK_S, Signs
 from gateways.tcpudp.versions import VERSIONS, announced
 from zbridge.protocol import Datagram, Handshake, Limits, ProtocolError, Role, agree, parse_versions
@@ -75,6 +76,17 @@ class HqHandshake(PacketSession):
     ``udp``: offer datagrams. ``announce``: the features that we announce. ``signs``: of the connection before.
     """
 
+    kept: ClassVar[dict[str, Any]] = {
+        "sender_id": int,
+        "settings": SETTINGS,
+        "_agreed": str,
+        "_handshake": Handshake,
+        "_silent_until": float,
+        "_answered": bool | None,
+        "_signs": Signs,
+        "_look_at": float,
+        "_others": int,
+    }
     role = Role.HQ
     handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, DebugMessage})
 

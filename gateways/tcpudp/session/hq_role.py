@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from typing import Any, ClassVar
 
 from gateways.tcpudp.messages import (
     HEADER,
@@ -24,7 +25,7 @@ from gateways.tcpudp.session.hq_handshake import HqHandshake
 from gateways.tcpudp.session.registered import Registered
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.protocol import LIMIT, EncodeError, Limits, Malformed
+from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -36,7 +37,7 @@ _MISREADING = frozenset({"1.1", "1.2"})
 _ANSWERED = (ClientGetSLAMMap, ClientGetPosition)
 
 
-class _Chosen(bytes):
+class _Chosen(Frame):
     """A packet 10 that was commanded, unlike the 1 of a stop."""
 
     @property
@@ -51,6 +52,8 @@ class HqRole(HqHandshake):
     ``udp``: offer datagrams. ``force``: features and packet ids to use although the robot does not announce them.
     ``announce``: the features that we announce. ``predecessor``: the session of the connection before.
     """
+
+    kept: ClassVar[dict[str, Any]] = {"autonomous": bool, "_chosen": FRAME, "_raw": FRAMES}
 
     def __init__(
         self,

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from enum import Enum
+from typing import Any, ClassVar
 
 from gateways.tcpudp.messages import (
     HEADER,
@@ -29,10 +30,12 @@ from gateways.tcpudp.messages import (
 )
 from gateways.tcpudp.session.packets import PacketSession, id_of
 from gateways.tcpudp.session.source import CLIENT_PORT, FROM_HQ, ClientSource
-from gateways.tcpudp.settings import HQ_BLOCKS, Settings, read_settings
+from gateways.tcpudp.settings import HQ_BLOCKS, SETTINGS, Settings, read_settings
 from gateways.tcpudp.versions import LISTED, VERSIONS
 from zbridge.protocol import (
+    FRAME,
     Datagram,
+    Exported,
     Handshake,
     Limits,
     NotReady,
@@ -87,6 +90,17 @@ class RobotRole(PacketSession):
     ignored: the connection identifies it, and programs send 0 before they have read the settings.
     """
 
+    kept: ClassVar[dict[str, Any]] = {
+        "settings": SETTINGS,
+        "client": SETTINGS,
+        "known": frozenset[int],
+        "_block": bytes,
+        "_agreed": str,
+        "_source": ClientSource,
+        "_answer": FRAME,
+        "_report_until": float,
+        "_handshake": Handshake,
+    }
     role = Role.ROBOT
     handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
     sender_id = SERVER_ID
@@ -114,12 +128,16 @@ class RobotRole(PacketSession):
         self._versions = tuple(versions)
         self._agreed = ""
         self._source = ClientSource(client_id, client_port)
-        self._answer: Datagram | None = None
+        self._answer: bytes | None = None
         """Packet 6, once it was queued."""
         self._report_until = -math.inf
         """Until when a 7(true) answers a 6 that was received."""
         within_s = {Step.PROBED: PROBE_S, Step.ANSWERED: REPORT_S, Step.UNANSWERED: REPORT_S}
         self._handshake = Handshake(self, TABLE, Step.GREETED, timeout=Event.TIMEOUT, within_s=within_s)
+
+    def restore(self, state: Exported) -> None:
+        super().restore(state)
+        self._answer = self.outbox.found(self._answer)
 
     def decode(self, frame: bytes) -> Packet:
         decode = FROM_HQ.get(frame[5])

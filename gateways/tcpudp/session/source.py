@@ -16,9 +16,11 @@ The session calls :meth:`bind` with the first datagram that it is given, and :me
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 from gateways.tcpudp.messages import SERVER_ID, ClientUDPConnection, read_header
 from gateways.tcpudp.session.packets import Decode, decoders
-from zbridge.protocol import ProtocolError, Role
+from zbridge.protocol import Kept, ProtocolError, Role
 
 CLIENT_PORT = 11000
 """The UDP port that deployed HQ programs bind."""
@@ -30,8 +32,10 @@ _NO_HEADER = (-1, -1)
 _PROBE = ClientUDPConnection.spec.id
 
 
-class ClientSource:
+class ClientSource(Kept):
     """The source of one client's datagrams. ``client_port``: the UDP port that it is known to bind; 0: none."""
+
+    kept: ClassVar[dict[str, Any]] = {"bound": bool, "_port": int, "_contested": bool}
 
     def __init__(self, client_id: int, client_port: int) -> None:
         self.client_port = client_port

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, ClassVar
 
 from gateways.tcpudp.messages import (
     PACKETS,
@@ -61,6 +61,14 @@ _NOTHING = Outcome()
 
 class TcpUdpRobot(Robot):
     """One robot of the TCP/UDP package protocol, seen from its HQ."""
+
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {
+        "_chosen": str | None,
+        "_rests_until": float,
+        "_paired_until": float,
+        "_telemetry": TelemetryTranslator,
+    }
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options
@@ -112,6 +120,11 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
+
+    def stop_frames(self) -> tuple[bytes, ...]:
+        """Packet 13; the pair 1, 13 also where mode 3 was chosen and is not written yet."""
+        session = self._connected()
+        return _sendable(session, _stop_packets(paired=session.autonomous or self._chosen == AUTONOMOUS))
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Load numpy for a robot that has maps or takes scans: now, and not when the first one comes while it moves."""
@@ -191,7 +204,7 @@ class TcpUdpRobot(Robot):
     def _rest(self, now: float, *, period_s: float, until: float, paired: bool, urgent: bool) -> None:
         """Repeat packet 13, ``paired`` with a mode 1 before it; raise Refused if the robot may be sent neither."""
         session = self._connected()
-        packets = (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
+        packets = _stop_packets(paired=paired)
         session.outbox.set(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
         self._rests_until, self._paired_until = until, until if paired else -math.inf
 
@@ -199,6 +212,10 @@ class TcpUdpRobot(Robot):
         if self._session is None:
             raise NotReady("offline")
         return self._session
+
+
+def _stop_packets(*, paired: bool) -> tuple[Packet, ...]:
+    return (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
 
 
 def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any, ClassVar
 
 from gateways.wc2ec.messages import Dialect, SetValue, Wc2EcMessage
 from gateways.wc2ec.session import ControllerRole
@@ -15,6 +16,14 @@ LEFT, RIGHT = "left", "right"
 class HqClient(ControllerRole):
     """One controller: which devices it was told, which it enabled (draft), and how it set the two wheels."""
 
+    kept: ClassVar[dict[str, Any]] = {
+        "registered": set[int],
+        "enabled": set[int],
+        "wheels": dict[str, float],
+        "fresh": set[str],
+        "joined_at": float,
+        "said_at": float,
+    }
     handled = frozenset({SetValue})
 
     def __init__(self, dialect: Dialect, *, values: int, bounds: Limits) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -20,7 +21,7 @@ from gateways.wc2ec.messages import Dialect, RegisterSensor, write
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet.messages import Device
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import Count
+from zbridge.protocol import Count, Kept
 
 NUMBERS = 255
 """Device numbers there are: 0 to 254."""
@@ -42,11 +43,17 @@ class ShownDevice(msgspec.Struct, frozen=True):
         return self.kind in (ROTATIONAL, LINEAR)
 
 
-class DeviceTable:
+class DeviceTable(Kept):
     """The devices of one robot. Those of the draft are listed in the options; others are learnt from the bus.
 
     registered: returns the numbers that some controller knows. unregistered: counts devices that find no number.
     """
+
+    kept: ClassVar[dict[str, Any]] = {
+        "by_name": dict[str, ShownDevice],
+        "by_number": dict[int, ShownDevice],
+        "registrations": dict[int, bytes],
+    }
 
     def __init__(
         self,

@@ -5,6 +5,8 @@ Source: "The gateway as Webots controller" and the dialects of the protocol page
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import msgspec
 
 from gateways.wc2ec.hq.client import HqClient
@@ -28,6 +30,8 @@ class Wc2EcHq(HqSide):
     """One listener."""
 
     name = NAME
+    hands_over = True
+    kept: ClassVar[dict[str, Any]] = {"_table": DeviceTable}
     deadman_s = DEADMAN_S
 
     def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:

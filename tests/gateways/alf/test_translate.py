@@ -307,6 +307,21 @@ def test_a_command_leaves_at_once_and_is_repeated(dialect: Dialect, talk: str) -
         assert [wire.sent() for _ in range(3)] == [frame] * 3
 
 
+@pytest.mark.parametrize(
+    "talk", ["forward 0.8 turn 1 = 0 0 0 0", "forward -0.8 light on = 0 1 0 1", "switch on = 0 0 0 1"]
+)
+@pytest.mark.parametrize("dialect", Dialect)
+def test_the_frames_of_a_stop_are_told_and_change_nothing(dialect: Dialect, talk: str) -> None:
+    wire = Wire(dialect=dialect.value)
+    command, _, expected = talk.partition(" = ")
+    frame = wire.command(command)
+    speed, direction, right_deg, light = map(int, expected.split())
+    text = b"3|%d|%d|%d|%d;" % (speed, direction, right_deg, light)
+    stop = bytes([3, speed, direction, 90, light]) if dialect is BINARY else text
+    assert wire.robot.stop_frames() == (stop,)
+    assert wire.sent() == frame
+
+
 def test_a_stop_replaces_a_drive_that_waits() -> None:
     wire = Wire()
     wire.robot.command(topics.CMD_DRIVE, Drive(forward=1.0), wire.now)

@@ -244,3 +244,27 @@ async def test_after_a_reconnection_in_mode_3_the_pair_comes_first_after_the_sil
         await asyncio.sleep(3.0)
         assert [frame[5] for frame in rig.link.written[:2]] == [3, 7]
         assert pairs(rig.link.written[2:]) >= 4
+
+
+@pytest.mark.parametrize(
+    ("acts", "frames"),
+    [
+        ((), [STOP]),
+        (("left",), [STOP]),
+        (("manual",), [STOP]),
+        (("auto",), PAIR),  # also before it is written
+        (("auto", "manual"), [STOP]),
+    ],
+)
+def test_the_frames_of_a_stop_are_told_and_change_nothing(acts: tuple[str, ...], frames: list[bytes]) -> None:
+    stage, other = Stage(SETTINGS["1.3"]), Stage(SETTINGS["1.3"])
+    for act in acts:
+        stage.command(*ACTS[act])
+        other.command(*ACTS[act])
+    assert list(stage.robot.stop_frames()) == frames
+    assert stage.after(2.0) == other.after(2.0)
+
+
+def test_a_robot_that_may_not_be_sent_a_stop_has_no_frames_of_one() -> None:
+    with pytest.raises(Refused):
+        Stage(NO_JOYSTICK).robot.stop_frames()

@@ -364,6 +364,14 @@ def test_a_stop_is_repeated_for_a_second_and_a_routine_one_sent_once(car: Wire) 
         assert least <= rounds <= most
 
 
+def test_the_frames_of_a_stop_set_every_rotational_motor_to_zero_and_change_nothing(car: Wire) -> None:
+    car.does("drive forward=1")
+    frames = car.robot.stop_frames()
+    assert car.values() != STOPPED
+    car.robot.stop(car.now, car.now)
+    assert set(frames) == set(drained(car.session, car.now))
+
+
 # Draft
 
 

@@ -42,10 +42,12 @@ class Publishers:
     def __repr__(self) -> str:
         return f"<Publishers {len(self.stream_keys)} of {STREAM_PUBLISHERS} stream keys>"
 
-    def make(self, key: str, topic: Topic) -> Publisher:
-        """Declare ``key`` with the delivery of ``topic``."""
+    def make(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        """Declare ``key`` with the delivery of ``topic``; ``last``: its last value, published by another process."""
         qos, options = topic.qos, _options(topic)
         if qos.keeps_last:
+            if last is not None:
+                self._last_values.note(key, last)
             return _StatePublisher(self._session, key, options, self._states, self._last_values)
         if topic.delivery is Delivery.STREAM:
             known = len(self.stream_keys) < STREAM_PUBLISHERS or key in self.stream_keys
@@ -69,6 +71,7 @@ class PlainPublisher(Declared):
         """Begin. watches: what is undeclared with the publisher."""
         super().__init__(*watches, publisher)
         self.key = key
+        self.last: bytes | None = None
         self._put = publisher.put
         self._writer = writer
 
@@ -90,6 +93,7 @@ class _StreamPublisher(Declared):
         self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer, *, blocks: bool
     ) -> None:
         self.key = key
+        self.last: bytes | None = None
         self._writer = writer
         self._blocks = blocks
         if blocks:
@@ -147,6 +151,9 @@ class _LastValues:
     def note(self, key: str, payload: bytes) -> None:
         self._values[key] = payload
 
+    def value(self, key: str) -> bytes | None:
+        return self._values.get(key)
+
     def forget(self, key: str) -> None:
         """Answer for a key no longer, and for none of its robot's after the last of them."""
         self._values.pop(key, None)
@@ -182,6 +189,10 @@ class _StatePublisher(Declared):
         last_values.add(key, options["encoding"])
         self._publisher = session.declare_publisher(key, **options)
         super().__init__(self._publisher)
+
+    @property
+    def last(self) -> bytes | None:
+        return self._last_values.value(self.key)
 
     def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
         self._last_values.note(self.key, payload)

@@ -119,9 +119,9 @@ class ZenohBus:
         """
         return ZenohBus(self._session, self._loop, metrics, stream=self._stream, beside=self)
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
-        """Declare that ``key`` will be written."""
-        return self._keep(self._publishers.make(key, topic))
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
+        return self._keep(self._publishers.make(key, topic, last))
 
     def on_relief(self, handler: Callable[[], None]) -> None:
         """Call ``handler`` when a paused source may go on."""
@@ -206,10 +206,16 @@ class ZenohBus:
         return Declared(watch)
 
     async def flush(self) -> None:
-        """Wait until all queued states and answers are handed to Zenoh (streams excluded).
+        """Wait until all queued states and answers are handed to Zenoh; raise BusError after :data:`FLUSH_S`."""
+        await self._flush(self._writer)
 
-        Raises BusError after :data:`FLUSH_S` seconds.
-        """
+    async def drain(self, key_expr: str) -> None:
+        """Wait until all that was published has left: a query of the lowest priority goes behind it."""
+        await self._flush(self._streams)
+        options: Any = {"priority": zenoh.Priority.BACKGROUND, "congestion_control": zenoh.CongestionControl.BLOCK}
+        await self._collect(key_expr, lambda handler: self._session.get(key_expr, handler, timeout=1.0, **options), 1.0)
+
+    async def _flush(self, writer: Writer) -> None:
         loop = self._loop
         written: asyncio.Future[None] = loop.create_future()
 
@@ -220,7 +226,7 @@ class ZenohBus:
         def ring() -> None:
             loop.call_soon_threadsafe(tell)
 
-        self._writer.put(ring)
+        writer.put(ring)
         try:
             async with asyncio.timeout(FLUSH_S):
                 await written

@@ -1,0 +1,141 @@
+"""Robot files that come, change and go, as real files."""
+
+from pathlib import Path
+
+import pytest
+
+from zbridge.app.supervisor.files import Changes, Follower, RobotFile, paths_of, read
+from zbridge.app.supervisor.supervisor import first_look
+from zbridge.errors import ConfigError
+
+
+def write(folder: Path, name: str, robot: str = "", port: int = 11001, more: str = "") -> Path:
+    path = folder / f"{name}.toml"
+    connect = f'connect = ["tcp://127.0.0.1:{port}"]'
+    path.write_text(f'[robot]\nname = "{robot or name}"\n[device]\nprotocol = "tcpudp"\n{connect}\n{more}')
+    return path
+
+
+class Scene:
+    """A directory that is followed, and what runs by it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.follower = Follower((folder,))
+        self.running: dict[Path, RobotFile] = {}
+
+    def look(self, *, twice: bool = False) -> dict[str, list[str]]:
+        """Look, and do what the changes ask for; give the names of the files."""
+        changes = self.follower.look(self.running, twice=twice)
+        for old, file in changes.moved:
+            del self.running[old]
+            self.running[file.path] = file
+        for path in changes.gone:
+            del self.running[path]
+        self.running |= {file.path: file for file in (*changes.came, *changes.changed)}
+        return names(changes)
+
+
+def names(changes: Changes) -> dict[str, list[str]]:
+    shown = {
+        "came": [file.path.stem for file in changes.came],
+        "changed": [file.path.stem for file in changes.changed],
+        "gone": [path.stem for path in changes.gone],
+        "moved": [f"{old.stem} {file.path.stem}" for old, file in changes.moved],
+        "faulty": [file.path.stem for file in changes.faulty],
+    }
+    return {kind: found for kind, found in shown.items() if found}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    write(tmp_path, "a")
+    write(tmp_path, "b")
+    scene = Scene(tmp_path)
+    assert scene.look() == {"came": ["a", "b"]}
+    return scene
+
+
+def test_files_that_come_change_and_go_are_told_once(scene: Scene) -> None:
+    assert scene.look() == {}
+    write(scene.folder, "c")
+    write(scene.folder, "a", port=11009)
+    (scene.folder / "b.toml").unlink()
+    assert scene.look() == {"came": ["c"], "changed": ["a"], "gone": ["b"]}
+    assert scene.look() == {}
+
+
+def test_a_file_that_changes_counts_when_two_looks_show_the_same(scene: Scene) -> None:
+    assert scene.look(twice=True) == {}
+    for port in (11002, 11003):
+        write(scene.folder, "a", port=port)
+        assert scene.look(twice=True) == {}
+    assert scene.look(twice=True) == {"changed": ["a"]}
+    (scene.folder / "a.toml").unlink()
+    assert scene.look(twice=True) == {}
+    assert scene.look(twice=True) == {"gone": ["a"]}
+
+
+def test_a_faulty_file_is_told_once_and_its_robot_goes_on(scene: Scene) -> None:
+    sound = scene.running[scene.folder / "a.toml"]
+    write(scene.folder, "a", more="colour = 1\n")
+    assert scene.look() == {"faulty": ["a"]}
+    assert scene.look() == {}
+    assert scene.running[sound.path] is sound
+    write(scene.folder, "a")
+    assert scene.look() == {}, "it is as it runs"
+    write(scene.folder, "a", more="colour = 1\n")
+    assert scene.look() == {"faulty": ["a"]}
+
+
+def test_a_second_file_with_the_name_of_a_robot_is_faulty_until_the_first_is_gone(scene: Scene) -> None:
+    write(scene.folder, "aa", robot="b", port=11009)
+    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    assert faulty.fault is not None
+    assert "robot.name = 'b'" in faulty.fault
+    assert "b.toml" in faulty.fault
+    (scene.folder / "b.toml").unlink()
+    assert scene.look() == {"came": ["aa"], "gone": ["b"]}
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_a_file_that_is_renamed_keeps_its_robot(scene: Scene, twice: bool) -> None:
+    (scene.folder / "a.toml").rename(scene.folder / "z.toml")
+    looks = [scene.look(twice=twice) for _ in range(2)]
+    assert looks == ([{}, {"moved": ["a z"]}] if twice else [{"moved": ["a z"]}, {}])
+
+
+def test_what_is_no_robot_file_is_left_alone(scene: Scene) -> None:
+    (scene.folder / "host.toml").write_text("[host]\n")
+    (scene.folder / "a.toml.bak").write_text("nothing")
+    assert scene.look() == {}
+
+
+def test_directories_and_files_are_listed_once(scene: Scene) -> None:
+    listed = paths_of((scene.folder / "b.toml", scene.folder))
+    assert [path.stem for path in listed] == ["b", "a"]
+
+
+def test_a_file_that_cannot_be_read_is_faulty(tmp_path: Path) -> None:
+    assert read(tmp_path / "none.toml").fault == f"{tmp_path}/none.toml: No such file or directory"
+
+
+@pytest.mark.parametrize(
+    ("robots", "words"),
+    [
+        ({}, "no robot file"),
+        ({"a": "r1", "b": "r1"}, "expected another name than that of"),
+        ({"a": "not a name"}, "robot.name"),
+    ],
+)
+def test_what_cannot_be_started_is_refused(tmp_path: Path, robots: dict[str, str], words: str) -> None:
+    for name, robot in robots.items():
+        write(tmp_path, name, robot=robot)
+    with pytest.raises(ConfigError, match=words):
+        first_look((tmp_path,))
+
+
+def test_a_faulty_file_does_not_keep_the_others_from_starting(tmp_path: Path) -> None:
+    write(tmp_path, "a")
+    write(tmp_path, "b", more="colour = 1\n")
+    assert [file.fault is None for file in first_look((tmp_path,))] == [True, False]

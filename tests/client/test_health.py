@@ -1,0 +1,89 @@
+"""How robots are, as monitoring asks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import pytest
+
+from tests.clock import jumping
+from zbridge.bus.fake import FakeBus
+from zbridge.client import Fleet
+from zbridge.client.health import Health, Level, health, judge
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Status
+
+OK, WARNING, CRITICAL = Level
+SILENT = "its gateway has said nothing for 3 s"
+
+
+@pytest.mark.parametrize(
+    ("status", "heard", "expected"),
+    [
+        (None, False, Health(CRITICAL, None, "no gateway serves it")),
+        (Status("established", host="lab1"), True, Health(OK, "established", None, "lab1")),
+        (Status("established", "client id 3"), True, Health(WARNING, "established", "client id 3")),
+        (Status("established"), False, Health(CRITICAL, "established", SILENT)),
+        (Status("handshaking"), True, Health(WARNING, "handshaking")),
+        (Status("connecting"), True, Health(WARNING, "connecting")),
+        (Status("closing", "bye"), True, Health(WARNING, "closing", "bye")),
+        (Status("offline", "no route"), True, Health(CRITICAL, "offline", "no route")),
+    ],
+)
+def test_a_status_is_judged(status: Status | None, heard: bool, expected: Health) -> None:
+    assert judge(status, heard=heard) == expected
+
+
+class Gateways:
+    """Gateways on a fake bus: the last value of each is known, and some publish theirs every second."""
+
+    def __init__(self) -> None:
+        self.bus = FakeBus("1")
+        self.fleet = Fleet(self.bus.join("2"))
+
+    async def publish(self, *robots: str) -> None:
+        publishers = [self.bus.publisher(f"fleet/{robot}/status", topics.STATUS) for robot in robots]
+        while True:
+            for publisher in publishers:
+                publisher.put(payloads.encode(Status("established")))
+            await asyncio.sleep(1.0)
+
+    async def ask(self, robot: str | None, *lively: str) -> dict[str, str]:
+        task = asyncio.ensure_future(self.publish(*lively))
+        await asyncio.sleep(0.5)
+        try:
+            found = await health(self.fleet, robot)
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        return {name: each.level.name for name, each in found.items()}
+
+
+@jumping
+async def test_all_robots_of_the_bus_are_judged_within_a_little_more_than_a_second() -> None:
+    began = asyncio.get_running_loop().time()
+    assert await Gateways().ask(None, "r1", "r2") == {"r1": "OK", "r2": "OK"}
+    assert asyncio.get_running_loop().time() - began < 3.0
+
+
+@jumping
+async def test_a_gateway_that_only_has_its_last_value_is_critical() -> None:
+    gateways = Gateways()
+    token = gateways.bus.announce("fleet/r3/@alive/gateway")
+    assert await gateways.ask(None, "r1") == {"r1": "OK", "r3": "CRITICAL"}
+    token.close()
+
+
+@jumping
+async def test_a_robot_that_was_asked_for_is_judged_alone() -> None:
+    gateways = Gateways()
+    assert await gateways.ask("r1", "r1", "r2") == {"r1": "OK"}
+    assert await gateways.ask("r9", "r1", "r2") == {"r9": "CRITICAL"}
+
+
+@jumping
+async def test_an_empty_bus_has_no_robots() -> None:
+    assert await Gateways().ask(None) == {}

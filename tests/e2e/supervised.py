@@ -1,0 +1,96 @@
+"""A supervisor as a part of a scene, whose gateways hang when they are told to.
+
+``python -m tests.e2e.supervised FOLDER``: ``zbridge run FOLDER``; its fork server is this module too. A gateway that is
+sent SIGUSR1 blocks its event loop for good.
+"""
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.e2e.conftest import WAIT_S, end, until
+from tests.e2e.processes import ROOT, module
+from zbridge.app import until_signal
+from zbridge.app.host import HostSettings
+from zbridge.app.supervisor.fork_server import Birth, serve
+from zbridge.app.supervisor.post import Post
+from zbridge.app.supervisor.supervisor import Supervisor
+from zbridge.cli import set_up_log
+from zbridge.cli.fork_server import run
+
+FORKS = "forks"
+
+
+class Supervised:
+    """A running supervisor: ``zbridge run FOLDER``, or that of this module (``hangs``). Its log goes to a file."""
+
+    def __init__(
+        self,
+        stack: contextlib.ExitStack,
+        folder: Path,
+        *more: str,
+        hangs: bool = False,
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        self.folder = folder
+        self._log = folder.with_suffix(".log")
+        command = (
+            module("supervised", folder) if hangs else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
+        )
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(command, stdout=log, stderr=log, text=True, cwd=ROOT, env=environment)
+        stack.callback(end, self.process)
+
+    @property
+    def log(self) -> str:
+        """What the supervisor and its gateways have logged."""
+        return self._log.read_text()
+
+    def gateway(self, robot: str, not_pid: int = 0) -> int:
+        """Wait for the gateway process of a robot, another one than ``not_pid``; give its process id."""
+        return until(lambda: self._gateway(robot, not_pid), WAIT_S, f"a process for {robot}")
+
+    def _gateway(self, robot: str, not_pid: int) -> int:
+        for pid in children(self.process.pid):
+            with contextlib.suppress(OSError):
+                if pid != not_pid and Path(f"/proc/{pid}/comm").read_text().strip() == f"zb {robot}"[:15]:
+                    return pid
+        return 0
+
+    def reload(self) -> None:
+        """Let the supervisor look at its files."""
+        self.process.send_signal(signal.SIGHUP)
+
+
+def children(pid: int) -> list[int]:
+    """List the children of a process."""
+    with contextlib.suppress(OSError):
+        return [*map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+    return []
+
+
+def hang(birth: Birth) -> int:
+    """Be a gateway that can be hung."""
+    signal.signal(signal.SIGUSR1, lambda *_: time.sleep(3600))
+    return run(birth)
+
+
+def main() -> None:
+    if sys.argv[1] == FORKS:
+        serve(Post.inherited(int(sys.argv[2])), hang)
+        return
+    set_up_log(verbose=False)
+    supervisor = Supervisor(
+        (Path(sys.argv[1]),), HostSettings(), module("supervised", FORKS), watch=False, verbose=False
+    )
+    asyncio.run(until_signal(supervisor.run()))
+
+
+if __name__ == "__main__":
+    os.environ.pop("NOTIFY_SOCKET", None)
+    main()

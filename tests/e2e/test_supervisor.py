@@ -1,0 +1,137 @@
+"""``zbridge run DIR`` with real processes: many robots, a crash, a hang, files that change, and the end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.conftest import Bench, device, end, start, until
+from tests.e2e.crashes import measure
+from tests.e2e.robots import STOP, Robot
+from tests.e2e.supervised import Supervised
+
+ROBOTS = 8
+
+
+class Host:
+    """A supervisor and its robots: scripted ones, in this process."""
+
+    def __init__(self, bench: Bench, systemd: socket.socket) -> None:
+        self.bench = bench
+        self.folder = bench.folder / "robots"
+        self.folder.mkdir()
+        self.robots: list[Robot] = []
+        for number in range(ROBOTS):
+            self.robots.append(bench.stack.enter_context(contextlib.closing(Robot())))
+            self.write(number)
+        self.systemd = systemd
+        environment = {**os.environ, "NOTIFY_SOCKET": str(systemd.getsockname())}
+        self.supervisor = Supervised(bench.stack, self.folder, environment=environment)
+
+    def write(self, number: int, more: str = "", name: str = "") -> Path:
+        """Write the file of a robot."""
+        path = self.folder / f"{name or f'r{number}'}.toml"
+        bus = f'[bus]\nconnect = ["{self.bench.endpoint}"]\nmulticast = false\n'
+        path.write_text(f'[robot]\nname = "r{number}"\n{device(self.robots[number].port)}{bus}{more}')
+        return path
+
+    def reload(self, words: str) -> None:
+        """Let the supervisor look at its files, and wait for what it says."""
+        count = self.supervisor.log.count(words)
+        self.supervisor.reload()
+        until(lambda: self.supervisor.log.count(words) > count, what=words)
+
+    @property
+    def connections(self) -> list[int]:
+        """How often each robot was connected to."""
+        return [robot.connections for robot in self.robots]
+
+
+@pytest.fixture
+def host(bench: Bench) -> Iterator[Host]:
+    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as systemd:
+        systemd.bind(str(bench.folder / "systemd"))
+        systemd.settimeout(20)
+        yield Host(bench, systemd)
+
+
+def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host) -> None:
+    fleet, supervisor = host.bench.fleet, host.supervisor
+    names = [f"r{number}" for number in range(ROBOTS)]
+    until(lambda: {fleet.state(name) for name in names} == {"established"}, 30, "all robots")
+    told = b""
+    while b"READY=1" not in told:
+        told = host.systemd.recv(1000)
+
+    for count, words in enumerate((r"r3: process \d+ goes on with its connections", "r3: next process in"), 1):
+        os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # soon after the first crash what was kept is not trusted
+        until(lambda words=words: re.search(words, supervisor.log), 20, words)  # type: ignore[misc]
+        until(lambda count=count: host.robots[3].connections == count, what="its connections")  # type: ignore[misc]
+        until(lambda: fleet.state("r3") == "established", what="the robot")
+    assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1]
+
+    host.write(5, more="colour = 1\n")
+    host.reload("colour")
+    host.write(6, name="twice")
+    host.reload("expected another name than that of")
+    (host.folder / "twice.toml").unlink()
+    host.write(5, more="[control]\nlease_s = 2.0\n")
+    host.reload("r5.toml: has changed")
+    until(lambda: re.search(r"r5: process \d+ serves it now", supervisor.log), 20, "the restart of one gateway")
+    assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1], "its robot noticed nothing"
+    assert fleet.state("r5") == "established"
+
+    former, host.robots[4] = host.robots[4], host.bench.stack.enter_context(contextlib.closing(Robot()))
+    host.write(4)
+    host.reload("r4.toml: has changed")
+    until(lambda: host.robots[4].connections == 1, 20, "a robot at another address, which cannot be handed over")
+    assert former.ended
+
+    (host.folder / "r7.toml").unlink()
+    host.reload("is gone")
+    until(lambda: host.robots[7].ended, what="the end of one gateway")
+
+    os.kill(supervisor.gateway("r0"), signal.SIGUSR2)
+    until(lambda: re.search(r"r0: process \d+ serves it now", supervisor.log), 20, "the restart of another one")
+    assert host.connections[0] == 1
+    stopped = [len(robot.packets(STOP)) for robot in host.robots]
+    supervisor.process.send_signal(signal.SIGTERM)
+    host.bench.ended_within(supervisor.process, 5.0)
+    assert "Traceback" not in supervisor.log, supervisor.log
+    until(lambda: all(robot.ended for robot in host.robots), what="the end of all connections")
+    assert all(count > 0 for count in stopped)
+
+
+def test_robots_rest_soon_after_their_gateway_hung_or_died_while_they_moved() -> None:
+    outcomes = measure([("tcpudp-1.3", "hung"), ("wc2ec", "frozen"), ("alf", "killed"), ("tcpudp-1.3-udp", "killed")])
+    assert len(outcomes) == 4
+    for outcome in outcomes:
+        assert outcome.rest_s is not None, outcome
+        assert not outcome.faults, outcome
+        assert outcome.kept, outcome
+
+
+def test_two_files_with_one_robot_are_refused_at_the_start(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.toml").write_text('[robot]\nname = "r1"\n' + device(1))
+    process = start("run", str(tmp_path))
+    said = end(process, signal.SIGCONT, 20)
+    assert process.returncode == 2
+    assert said.count("\n") == 1, said
+    assert "robot.name = 'r1': expected another name than that of" in said
+
+
+def test_the_gateways_end_in_order_when_the_supervisor_is_killed(host: Host) -> None:
+    until(lambda: all(robot.connections for robot in host.robots), 30, "all robots")
+    until(lambda: "ready:" in host.supervisor.log, what="ready")
+    host.supervisor.process.kill()
+    until(lambda: host.supervisor.log.count("the supervisor is gone") == ROBOTS, what="the end of all gateways")
+    until(lambda: all(robot.ended for robot in host.robots), what="the end of all connections")
+    assert "Traceback" not in host.supervisor.log

@@ -1,0 +1,127 @@
+"""What survives a restart: sessions of every protocol in the middle of their work, as MessagePack there and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from zbridge.errors import ProtocolError
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Drive
+from zbridge.fleet.view import RobotView
+from zbridge.metrics import Metrics
+from zbridge.protocol.kept import Kept
+from zbridge.protocol.outbox import Outbox
+from zbridge.protocol.plugin import Protocol, find_protocol
+from zbridge.protocol.session import Limits, Session
+from zbridge.protocol.traffic import Datagram
+
+SETTINGS = bytes.fromhex("210000000102020b000000312e312c312e322c312e3300010101010101e803000064000000")
+"""serverSettings of a robot of 1.3 without UDP, from the protocol page."""
+POSITION = bytes.fromhex("0e0000000137") + bytes(12)
+STREAMS = {
+    "tcpudp": SETTINGS + POSITION + POSITION,
+    "alf": b"2|-95|95|0.25|100|20|5600;4|0|1|2|3|4|5|6|7;4|0|1|2|3|4|5|6|7;",
+    "wc2ec": b"".join(bytes([0, 53, number, 5]) + b"motor" for number in (8, 9)),
+}
+
+
+def carried(state: Any) -> Any:
+    """Carry a state as it is carried between two processes."""
+    return msgspec.msgpack.decode(msgspec.msgpack.encode(state))
+
+
+def robot(protocol: Protocol) -> tuple[Any, Session[Any]]:
+    made = protocol.robot(msgspec.convert({}, protocol.options), 1, Metrics())
+    return made, made.session(made.link_names[0], "tcp://robot.test:1")
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_robots_session_goes_on_in_another_process_wherever_its_stream_is_cut(name: str) -> None:
+    stream, protocol = STREAMS[name], find_protocol(name)
+    _, whole = robot(protocol)
+    whole.open(1.0)
+    expected = whole.receive(stream, 2.0)
+    for cut in range(len(stream) + 1):
+        before_robot, before = robot(protocol)
+        before.open(1.0)
+        heard = before.receive(stream[:cut], 2.0)
+        after_robot, after = robot(protocol)
+        after.restore(carried(before.export()))
+        after_robot.restore(carried(before_robot.export()))
+        assert after.export() == before.export()
+        assert len(heard + after.receive(stream[cut:], 2.0)) == len(expected)
+        assert (after.state, after.version, after.features) == (whole.state, whole.version, whole.features)
+        assert after.traffic == whole.traffic
+    assert after_robot.hands_over
+
+
+def test_what_a_robot_was_to_be_sent_is_sent_by_the_other_process_at_its_time_and_once() -> None:
+    protocol = find_protocol("tcpudp")
+    told, before = robot(protocol)
+    before.open(1.0)
+    before.receive(SETTINGS, 1.0)
+    while before.outgoing(1.0):
+        pass
+    told.command(topics.CMD_DRIVE, Drive(forward=0.5), 2.0)
+    told.stop(2.0, 3.0)
+    other, after = robot(protocol)
+    after.restore(carried(before.export()))
+    other.restore(carried(told.export()))
+    times = [2.0 + tick / 100 for tick in range(150)]
+    sent = [(now, frame) for now in times if (frame := after.outgoing(now))]
+    expected = [(now, frame) for now in times if (frame := before.outgoing(now))]
+    assert sent == expected
+    assert {frame[5] for _, frame in sent} == {13}, "the stop replaces the drive"
+
+
+def test_a_frame_keeps_its_kind() -> None:
+    before, after = Outbox(0.0), Outbox(0.0)
+    before.put(Datagram(b"by udp"))
+    before.put(b"by tcp")
+    after.restore(carried(before.export()))
+    assert [(type(frame), frame) for frame in (after.take(0.0), after.take(0.0))] == [
+        (Datagram, b"by udp"),
+        (bytes, b"by tcp"),
+    ]
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_listeners_client_goes_on_in_another_process(name: str) -> None:
+    protocol = find_protocol(name)
+    assert protocol.hq is not None
+    sides = [protocol.hq(protocol.hq_options(), RobotView(), Metrics()) for _ in range(2)]
+    before, after = (side.session(3, Limits(65_536, 5.0)) for side in sides)
+    before.open(1.0)
+    sides[1].restore(carried(sides[0].export()))
+    after.restore(carried(before.export()))
+    assert after.export() == before.export()
+    assert sides[0].hands_over
+
+
+class _Thing(Kept):
+    kept = {"number": int, "step": str}  # noqa: RUF012 - as short as a protocol's
+
+    def __init__(self) -> None:
+        self.number, self.step = 1, "first"
+
+
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [({"number": 1}, "_Thing.step"), ({"number": "1", "step": ""}, "_Thing.number"), ({}, "_Thing.number")],
+)
+def test_a_state_of_another_form_is_refused_by_name(state: dict[str, Any], said: str) -> None:
+    with pytest.raises(ProtocolError, match=said):
+        _Thing().restore(state)
+
+
+def test_a_step_or_a_kind_of_frame_that_this_version_lacks_is_refused() -> None:
+    _, session = robot(find_protocol("tcpudp"))
+    state = session.export()
+    with pytest.raises(ProtocolError, match="no step 'LATER'"):
+        session.restore({**state, "_handshake": {"deadline": 1.0, "step": "LATER"}})
+    outbox = {**state["outbox"], "_queue": [["a.later.Kind", b""]]}
+    with pytest.raises(ProtocolError, match=r"unknown kind 'a\.later\.Kind'"):
+        session.restore({**state, "outbox": outbox})

@@ -1,0 +1,123 @@
+"""What somebody outside must know to stop a robot whose gateway dies, and how the next gateway goes on."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Any
+
+import msgspec
+import pytest
+
+from tests.clock import scene_of
+from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, TimedLink, established, serving
+from zbridge.robot.observer import Boundary, LastStop, Nobody, StopFrame
+from zbridge.transport import Parcel
+from zbridge.transport.conversation import Conversation
+
+pytestmark = pytest.mark.jumping
+
+NONE = COMMANDS["none"][2]
+LEFT = COMMANDS["left"][2]
+AT_REST = LastStop(False, (StopFrame(STOP),), 0.01, "established")
+rig = scene_of(established)
+
+
+class Notes(Nobody):
+    """An observer that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+        self.device: Any = None
+
+    def began(self, device: Any) -> None:
+        self.device = device
+        self.told.append("began")
+
+    def ended(self) -> None:
+        self.told.append("ended")
+
+    def linked(self, name: str, link: Any, up: bool) -> None:
+        self.told.append((name, up))
+
+    def read(self, name: str) -> None:
+        self.told.append(("read", self.device.boundary(name).incoming))
+
+
+async def test_the_stop_of_a_robot_is_known_once_it_is_established() -> None:
+    async with serving(hold=False) as rig:
+        assert rig.device.last_stop() == LastStop(state="handshaking")
+        await rig.establish()
+        assert rig.device.last_stop() == AT_REST
+        rig.goes()
+        assert rig.device.last_stop().frames == ()
+
+
+async def test_a_robot_that_is_driven_or_drives_itself_counts_as_driven(rig: Rig) -> None:
+    assert not rig.device.driven
+    rig.command("drive", {"left": 1.0})
+    assert rig.device.driven
+    await rig.play("neutral 0.1")
+    assert not rig.device.driven
+    await rig.play("autonomous 0.5")
+    last = rig.device.last_stop()
+    assert last.driven
+    assert [frame.data for frame in last.frames] == [NONE, STOP]
+
+
+async def test_an_observer_is_told_of_the_link_and_of_every_read() -> None:
+    notes = Notes()
+    async with serving(observer=notes) as rig:
+        rig.sends(SETTINGS[:7])
+        rig.sends(SETTINGS[7:])
+        rig.goes()
+    assert notes.told[:5] == ["began", ("robot", True), ("read", False), ("read", True), ("robot", False)]
+    assert notes.told[-1] == "ended"
+
+
+async def test_a_link_that_holds_bytes_back_may_stand_within_a_frame(rig: Rig) -> None:
+    assert rig.device.boundary("robot") == Boundary()
+    rig.link.ready = False
+    assert rig.device.boundary("robot") == Boundary(outgoing=False)
+    assert rig.device.boundary("another") == Boundary(outgoing=False, incoming=False)
+
+
+async def test_a_robot_that_is_not_established_leaves_nothing_to_go_on_with() -> None:
+    async with serving(hold=False) as rig:
+        assert rig.device.keep(Parcel()) is None
+        await rig.establish()
+        assert rig.device.keep(Parcel()) is not None
+
+
+async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.command("drive", {"left": 1.0})
+    rig.command("text", {"text": "hi"})
+    kept = msgspec.msgpack.decode(msgspec.msgpack.encode(rig.device.keep(Parcel())))
+
+    async def take_over(address: object, given: object, parcel: Parcel, conversation: Conversation) -> None:
+        link = TimedLink(heir.loop, str(address))
+        heir.links.append(link)
+        heir.conversations.append(conversation)
+        conversation.attached(link)
+
+    async def begin() -> None:
+        assert heir.link.written == [], "nothing is written before the word to go"
+
+    monkeypatch.setattr("zbridge.robot.connection.take_over", take_over)
+    heir = Rig()
+    await heir.device.take_over(kept, Parcel())
+    task = asyncio.ensure_future(heir.device.run(begin))
+    await heir.settle()
+    await asyncio.sleep(5.0)
+    assert heir.last("status")["state"] == "established"
+    assert len(heir.link.written) >= 5
+    assert set(heir.link.written) == {STOP}
+    assert heir.hold()["ok"]
+    heir.command("drive", {"left": 1.0})
+    await asyncio.sleep(0.2)
+    assert heir.link.written[-1] == LEFT
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task

@@ -1,0 +1,122 @@
+"""The Unix stream socket between a gateway and its successor: messages, and descriptors behind one of them.
+
+A message is its length (4 bytes, big-endian) and its bytes. Descriptors follow in groups, each with one byte. The calls
+block on threads of their own, so that the event loop never does; each has a time limit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from typing import TypeVar
+
+import msgspec
+
+from zbridge.app.handover.messages import Failed, Message, decode, encode
+from zbridge.errors import HandoverError
+from zbridge.transport import Parcel
+
+M = TypeVar("M")
+
+MESSAGE_BYTES = 64 * 2**20
+"""Bound of a message: a state with the largest map takes 4 MB."""
+SEND_S = 5.0
+"""Longest time that a message may take to be sent."""
+_GROUP = 200
+"""Descriptors that are sent at a time; Linux takes 253."""
+_HEADER = 4
+
+
+class Channel:
+    """One end of the socket. Errors are HandoverError, with the other side's reason where it gave one."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
+        end.setblocking(True)
+
+    def __repr__(self) -> str:
+        return f"<Channel {self._socket.fileno()}>"
+
+    async def send(self, message: Message, parcel: Parcel | None = None) -> None:
+        """Send a message, and the descriptors of a parcel."""
+        await asyncio.to_thread(self._send, message, parcel)
+
+    async def receive(self, kind: type[M], timeout_s: float | None = None) -> M:
+        """Wait for a message of this class; None: for ever. Raise HandoverError for any other, and for an end."""
+        return await asyncio.to_thread(self._receive, kind, timeout_s)
+
+    async def receive_parcel(self, descriptors: int, timeout_s: float) -> Parcel:
+        """Wait for the descriptors behind a message."""
+        return await asyncio.to_thread(self._receive_parcel, descriptors, timeout_s)
+
+    def say(self, message: Message) -> None:
+        """Send a short message if the socket takes it at once: nothing more is awaited from the other side."""
+        with contextlib.suppress(OSError, HandoverError):
+            self._send(message, None)
+
+    def close(self) -> None:
+        """End the channel, also for who waits at it; idempotent."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def _send(self, message: Message, parcel: Parcel | None) -> None:
+        data = encode(message)
+        try:
+            self._socket.settimeout(SEND_S)
+            self._socket.sendall(len(data).to_bytes(_HEADER, "big") + data)
+            descriptors = parcel.descriptors if parcel is not None else []
+            for start in range(0, len(descriptors), _GROUP):
+                socket.send_fds(self._socket, [b"."], descriptors[start : start + _GROUP])
+        except OSError as error:
+            raise HandoverError(f"the other side takes nothing: {error}") from error
+
+    def _receive(self, kind: type[M], timeout_s: float | None) -> M:
+        try:
+            self._socket.settimeout(timeout_s)
+            size = int.from_bytes(self._read(_HEADER), "big")
+            if size > MESSAGE_BYTES:
+                raise HandoverError(f"message of {size} bytes exceeds {MESSAGE_BYTES}")
+            message = decode(self._read(size))
+        except TimeoutError as error:
+            raise HandoverError(f"the other side says nothing for {timeout_s:g} s") from error
+        except OSError as error:  # reset: it ended with a message of ours unread
+            raise EndError("the other side has ended") from error
+        except msgspec.MsgspecError as error:
+            raise HandoverError(f"the other side cannot be understood: {error}") from error
+        if isinstance(message, Failed):
+            raise HandoverError(message.reason)
+        if not isinstance(message, kind):
+            raise HandoverError(f"{type(message).__name__} came instead of {kind.__name__}")
+        return message
+
+    def _read(self, size: int) -> bytes:
+        data = bytearray()
+        while len(data) < size:
+            more = self._socket.recv(min(size - len(data), 2**20))
+            if not more:
+                raise EndError("the other side has ended")
+            data += more
+        return bytes(data)
+
+    def _receive_parcel(self, descriptors: int, timeout_s: float) -> Parcel:
+        received: list[int] = []
+        try:
+            self._socket.settimeout(timeout_s)
+            while len(received) < descriptors:
+                data, group, _, _ = socket.recv_fds(self._socket, 1, _GROUP)
+                received += group
+                if not data or not group:
+                    raise HandoverError(f"{len(received)} descriptors came of {descriptors}")
+        except (OSError, HandoverError) as error:
+            Parcel(received).close()
+            raise error if isinstance(error, HandoverError) else HandoverError(f"no descriptors: {error}") from error
+        for descriptor in received:
+            os.set_inheritable(descriptor, False)
+        return Parcel(received)
+
+
+class EndError(HandoverError):
+    """The other side has ended without a word."""

@@ -1,0 +1,166 @@
+"""The gateway that goes: starts its successor, hands everything over, and is released or goes on. Knows no protocol.
+
+Theory of operation. The order of the steps keeps two promises: two processes never read or write one socket, and
+nothing is lost that this gateway cannot take back.
+
+1. The successor is started, reads its configuration and joins the bus. Meanwhile this gateway works as ever.
+2. ``prepare``: the robot is stopped, its lease ended, no command taken; every link has taken what was written.
+3. ``hold``: nothing is read, written or accepted. ``hand_over`` describes all of it: a value of that moment.
+4. The successor holds the same connections, has declared its keys, and says that it is up.
+5. ``withdraw``: this gateway's commands and its claim leave the bus. It says *go*, and ``release`` closes its copies of
+   the sockets. From *go* on the successor reads and writes.
+
+Until *go* every failure leads back: the successor is killed, and only when it has ended this gateway reads again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import select
+import signal
+import socket
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol
+
+from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
+from zbridge.app.handover.successor import Successor
+from zbridge.errors import BusError, HandoverError, NotReady, Refused
+from zbridge.protocol.kept import Exported
+from zbridge.transport import Parcel
+
+log = logging.getLogger("zbridge.app.handover")
+
+RESTARTED = "gateway restarted"
+START_S = 30.0
+"""Longest time until a successor has read its configuration and joined the bus; the robot is served meanwhile."""
+PREPARE_S = 4.0
+"""Longest time until the stop is written and all links have taken everything: a late handshake is silent for 2.5 s."""
+TAKE_OVER_S = 5.0
+"""Longest time until the successor has taken everything over; nothing is read or written meanwhile."""
+END_S = 2.0
+"""Longest wait for the end of a successor that was killed."""
+
+
+class Part(Protocol):
+    """What is handed over: the device, or a listener."""
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        """Stop what moves, and wait until it can be handed over; raise Refused."""
+
+    async def shut(self) -> None:
+        """Accept nobody any more."""
+
+    def hold(self) -> None:
+        """Read and write nothing."""
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Describe the part, with its descriptors in the parcel."""
+
+    async def go_on(self) -> None:
+        """Take everything since ``prepare`` back."""
+
+    def withdraw(self) -> None:
+        """Take no commands from the bus."""
+
+    async def release(self) -> None:
+        """Give up what another process has now."""
+
+
+Describe = Callable[[Parcel], Given]
+"""``describe(parcel)``: what is handed over, once all parts are held."""
+
+
+class Outgoing:
+    """One handover. ``start``: starts the successor. ``parts``: what is handed over. ``describe``: writes all of it.
+
+    ``drain``: waits until what was published has left: what the successor publishes must not overtake it.
+    """
+
+    def __init__(
+        self, start: Successor, parts: Sequence[Part], describe: Describe, drain: Callable[[], Awaitable[None]]
+    ) -> None:
+        self._start = start
+        self._parts = parts
+        self._describe = describe
+        self._drain = drain
+        self._pid: int | None = None
+        self._process: int | None = None
+
+    def __repr__(self) -> str:
+        return f"<Outgoing to process {self._pid}>"
+
+    async def run(self) -> int:
+        """Hand everything over; return the process that has it. Raise Refused and its reason: all is as before then."""
+        near, far = socket.socketpair()
+        channel, changed = Channel(near), False
+        try:
+            with far:
+                await self._start(far)
+            hello = await channel.receive(Hello, START_S)
+            self._know(hello)
+            changed = True
+            await self._give(channel)
+            await channel.receive(Up, TAKE_OVER_S)
+            for part in self._parts:
+                part.withdraw()
+            await self._drain()
+            await channel.send(Go())
+        except (HandoverError, Refused, BusError, OSError) as error:
+            await self._take_back(channel, str(error), changed=changed)
+            raise error if isinstance(error, Refused) else NotReady(f"not restarted: {error}") from error
+        except BaseException:  # the gateway ends meanwhile: it needs its sockets to take leave
+            await asyncio.shield(self._take_back(channel, "the gateway ends", changed=changed))
+            raise
+        await asyncio.gather(*(part.release() for part in self._parts))
+        channel.close()
+        self._forget()
+        return hello.pid
+
+    async def _give(self, channel: Channel) -> None:
+        """Stop, hold and describe everything; send it."""
+        await asyncio.gather(*(part.prepare(RESTARTED, PREPARE_S) for part in self._parts))
+        for part in self._parts:
+            await part.shut()
+        for part in self._parts:
+            part.hold()
+        parcel = Parcel()
+        try:
+            await channel.send(self._describe(parcel), parcel)
+        finally:
+            parcel.close()
+
+    async def _take_back(self, channel: Channel, reason: str, *, changed: bool) -> None:
+        """End the successor; go on when it has ended."""
+        log.error("not restarted: %s", reason)
+        channel.say(Failed(reason))
+        await asyncio.to_thread(self._end_successor)
+        channel.close()
+        if changed:
+            for part in self._parts:
+                await part.go_on()
+
+    # The process of the successor
+
+    def _know(self, hello: Hello) -> None:
+        if hello.version != VERSION:
+            raise HandoverError(f"the successor takes states of version {hello.version}, this gateway has {VERSION}")
+        self._pid = hello.pid
+        with contextlib.suppress(OSError, AttributeError):  # it may have ended; not every kernel has it
+            self._process = os.pidfd_open(hello.pid)
+
+    def _end_successor(self) -> None:
+        if self._process is None:
+            return
+        with contextlib.suppress(OSError):
+            signal.pidfd_send_signal(self._process, signal.SIGKILL)
+        select.select([self._process], [], [], END_S)
+        self._forget()
+
+    def _forget(self) -> None:
+        if self._process is not None:
+            os.close(self._process)
+            self._process = None

@@ -1,0 +1,124 @@
+"""The restarts of one gateway: who may ask for one, what is handed over, and how it is answered."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import time
+from collections.abc import Sequence
+
+import msgspec
+
+from zbridge.app.config import Plan
+from zbridge.app.handover.claim import ClaimPart
+from zbridge.app.handover.incoming import Incoming
+from zbridge.app.handover.messages import VERSION, Given
+from zbridge.app.handover.outgoing import Outgoing, Part
+from zbridge.app.handover.successor import Successor
+from zbridge.bus import Bus, Handle, IncomingQuery
+from zbridge.control.gate import NameGate
+from zbridge.errors import BusError, NotReady, Refused, Unsupported
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Query
+from zbridge.fleet.topics import KeySpace
+from zbridge.robot.device import Device
+from zbridge.robot.ownership import CLAIM
+from zbridge.transport import Parcel
+
+log = logging.getLogger("zbridge.app.handover")
+
+
+class Restarts:
+    """The restarts of one gateway. The gateway enters its parts as it makes them.
+
+    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused.
+    """
+
+    def __init__(self, plan: Plan, keys: KeySpace, incoming: Incoming | None, successor: Successor | None) -> None:
+        self.bus: Bus | None = None
+        self.listeners: Sequence[Part] = ()
+        self.device: Device | None = None
+        self.claim: ClaimPart | None = None
+        self.metrics_sockets: list[socket.socket] = []
+        self.gone = asyncio.Event()
+        """Set when a successor serves everything: the gateway ends."""
+        self._plan = plan
+        self._keys = keys
+        self._incoming = incoming
+        self._successor = successor
+        self._lock = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def __repr__(self) -> str:
+        return f"<Restarts of {self._keys.robot}>"
+
+    async def restart(self) -> None:
+        """Hand everything to a successor and end; log the reason where that is refused."""
+        with contextlib.suppress(Refused):
+            await self._restart()
+            self.gone.set()
+
+    def keep(self, parcel: Parcel) -> Given | None:
+        """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
+        device = self.device.keep(parcel) if self.device is not None else None
+        claim = self.claim.hand_over(parcel) if self.claim is not None else None
+        if device is None or not claim:
+            return None
+        return Given(VERSION, self._plan.setup, len(parcel), claim=claim, device=device)
+
+    def answer(self, bus: Bus) -> Handle:
+        """Restart for whoever the access rules let ask, and answer when that is done."""
+
+        def take(question: IncomingQuery) -> None:
+            task = asyncio.ensure_future(self._restart_for(question, bus))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(time.monotonic))
+
+    async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
+        try:
+            if not topics.is_concrete(question.asked):
+                raise Unsupported("a restart is asked for of one robot, in one name")
+            await self._restart()
+        except Refused as refusal:
+            question.refuse(refusal)
+            return
+        question.answer(payloads.encode(Query()))
+        with contextlib.suppress(BusError):
+            await bus.flush()
+        self.gone.set()
+
+    async def _restart(self) -> None:
+        """Hand everything over; raise Refused with the reason, after which all is as before."""
+        if self._successor is None:
+            raise Unsupported("nothing starts a successor of this process")
+        if self._plan.config.bus.listen:
+            raise Unsupported("[bus] listen: two processes cannot listen at one endpoint; stop this one and start it")
+        successor_begins = self._incoming is not None and not self._incoming.begun.is_set()
+        if self._lock.locked() or self.gone.is_set() or successor_begins:
+            raise NotReady("a restart is under way")
+        async with self._lock:
+            began = time.monotonic()
+            parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
+            pid = await Outgoing(self._successor, parts, self._describe, self._drain).run()
+            log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
+
+    async def _drain(self) -> None:
+        if self.bus is not None and self.claim is not None:
+            await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
+
+    def _describe(self, parcel: Parcel) -> Given:
+        given = Given(
+            VERSION,
+            self._plan.setup,
+            0,
+            claim=self.claim.hand_over(parcel) if self.claim is not None else None,
+            device=self.device.hand_over(parcel) if self.device is not None else None,
+            listeners=tuple(part.hand_over(parcel) for part in self.listeners),
+            metrics=tuple(parcel.put(sock.fileno()) for sock in self.metrics_sockets),
+        )
+        return msgspec.structs.replace(given, descriptors=len(parcel))

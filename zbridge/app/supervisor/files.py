@@ -1,0 +1,143 @@
+"""The robot files that a supervisor follows: directories and single files, and what has changed in them.
+
+A faulty file changes nothing: the robot that runs by what stood in it before goes on. A file that differs from the look
+before, or cannot be read, is looked at once more before it counts: an editor may be writing it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import msgspec
+
+from zbridge.app.config import Plan, load
+from zbridge.app.host import robot_files
+from zbridge.errors import ConfigError
+
+
+class RobotFile(msgspec.Struct, frozen=True):
+    """One file as it was read. fault: why nothing can run by it; plan is None then."""
+
+    path: Path
+    content: bytes
+    plan: Plan | None = None
+    fault: str | None = None
+
+    @property
+    def robot(self) -> str:
+        """The robot's name on the bus; of a faulty file the file's name."""
+        return self.plan.config.robot.name if self.plan is not None else self.path.stem
+
+    @property
+    def identity(self) -> tuple[str, str] | None:
+        """Realm and name of the robot; None of a faulty file."""
+        return (self.plan.config.robot.realm, self.plan.config.robot.name) if self.plan is not None else None
+
+
+class Changes(msgspec.Struct, frozen=True):
+    """What to do about a look: files whose robots start, restart and end, and those that are faulty."""
+
+    came: tuple[RobotFile, ...] = ()
+    changed: tuple[RobotFile, ...] = ()
+    gone: tuple[Path, ...] = ()
+    moved: tuple[tuple[Path, RobotFile], ...] = ()
+    """A file that has another name and is the same otherwise: the path before, and the file."""
+    faulty: tuple[RobotFile, ...] = ()
+
+
+def paths_of(sources: Iterable[Path]) -> list[Path]:
+    """List the robot files of directories and the single files, each once; raise ConfigError for no directory."""
+    found: dict[Path, None] = {}
+    for source in sources:
+        found.update(dict.fromkeys(robot_files(source) if source.is_dir() else [source]))
+    return list(found)
+
+
+def read(path: Path) -> RobotFile:
+    """Read and check one file; what is wrong is its fault."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        return RobotFile(path, b"", fault=f"{path}: {error.strerror or error}")
+    try:
+        return RobotFile(path, content, load(path))
+    except ConfigError as error:
+        return RobotFile(path, content, fault=str(error))
+
+
+def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Changes:
+    """Compare what runs with what was read now; of two files with one robot name the one that came later is faulty."""
+    now = {file.path: file for file in seen}
+    gone = {path for path in running if path not in now}
+    sound = {path: file for path, file in now.items() if file.fault is None}
+    moved = [
+        (old, file)
+        for path, file in sound.items()
+        if path not in running
+        for old in gone
+        if running[old].content == file.content and running[old].identity == file.identity
+    ]
+    gone -= {old for old, _ in moved}
+    settled = {file.path for _, file in moved}
+    names = {file.identity: path for path, file in running.items() if path in now}
+    names |= {file.identity: file.path for _, file in moved}
+    came, changed = list[RobotFile](), list[RobotFile]()
+    faulty = [file for file in now.values() if file.fault is not None]
+    for path, file in sound.items():
+        before = running.get(path)
+        if path in settled or (before is not None and before.content == file.content):
+            continue
+        other = names.setdefault(file.identity, path)
+        if other != path:
+            faulty.append(_doubled(file, other))
+        else:
+            (came if before is None else changed).append(file)
+    return Changes(tuple(came), tuple(changed), tuple(sorted(gone)), tuple(moved), tuple(faulty))
+
+
+def _doubled(file: RobotFile, other: Path) -> RobotFile:
+    fault = f"{file.path}: robot.name = {file.robot!r}: expected another name than that of {other}"
+    return msgspec.structs.replace(file, plan=None, fault=fault)
+
+
+class Follower:
+    """Looks at the files again and again; what changed counts when two looks show the same."""
+
+    def __init__(self, sources: tuple[Path, ...]) -> None:
+        self._sources = sources
+        self._shown: dict[Path, bytes] = {}
+        self._reported: dict[Path, str | None] = {}
+
+    def __repr__(self) -> str:
+        return f"<Follower of {', '.join(map(str, self._sources))}>"
+
+    def look(self, running: Mapping[Path, RobotFile], *, twice: bool = True) -> Changes:
+        """Read what may have changed; raise ConfigError if a directory cannot be read.
+
+        twice: leave out what differs from the look before. A fault is given once for each content of a file.
+        """
+        seen = [self._again(path, running.get(path)) for path in paths_of(self._sources)]
+        shown = {file.path: file.content for file in seen}
+        steady = [file for file in seen if not twice or self._shown.get(file.path) == file.content]
+        waiting = {path: running[path] for path in shown if path in running and path not in {f.path for f in steady}}
+        if twice:
+            waiting |= {path: file for path, file in running.items() if path in self._shown and path not in shown}
+        self._shown = shown
+        changes = compare(running, [*steady, *waiting.values()])
+        return msgspec.structs.replace(changes, faulty=tuple(self._new_faults(changes.faulty)))
+
+    def _again(self, path: Path, running: RobotFile | None) -> RobotFile:
+        """Read a file; one that is as it runs is not checked again."""
+        try:
+            if running is not None and path.read_bytes() == running.content:
+                return running
+        except OSError:
+            pass
+        return read(path)
+
+    def _new_faults(self, faulty: Iterable[RobotFile]) -> list[RobotFile]:
+        faults = {file.path: file.fault for file in faulty}
+        new = [file for file in faulty if self._reported.get(file.path) != file.fault]
+        self._reported = dict(faults)
+        return new

@@ -1,0 +1,210 @@
+"""The supervisor's side of its fork server: starts it, asks it, and replaces it when the installation has changed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from zbridge.app.supervisor.installation import HOME, Stamp
+from zbridge.app.supervisor.messages import Fork, Forked, Message, Ready
+from zbridge.app.supervisor.post import Post, close_all
+from zbridge.errors import NotReady
+
+log = logging.getLogger("zbridge.app.supervisor")
+
+READY_S = 60.0
+"""Longest time in which a fork server imports everything."""
+LOOK_S = 2.0
+"""Least time between two looks at the installation, which take 25 ms, for the sake of forks."""
+FORK_S = 10.0
+"""Longest time for one fork."""
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""What numpy's libraries must be told, before they are loaded, to start no threads."""
+_NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+
+
+class _Server:
+    """One running fork server. Answers come in the order of the requests."""
+
+    def __init__(self, command: Sequence[str], stamp: Stamp) -> None:
+        self.stamp = stamp
+        self._answers: asyncio.Queue[Message | None] = asyncio.Queue()
+        self._post, far = Post.pair()
+        environment = {**os.environ, **ONE_THREAD}
+        for name in _NOT_INHERITED:
+            environment.pop(name, None)
+        with far:
+            try:
+                self._process = subprocess.Popen(
+                    [*command, str(far.fileno())],
+                    pass_fds=[far.fileno()],
+                    stdin=subprocess.DEVNULL,
+                    env=environment,
+                    start_new_session=True,
+                )
+            except OSError:
+                self._post.close()
+                raise
+        self.alive = True
+        asyncio.get_running_loop().add_reader(self._post.fileno(), self._hear)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def ready(self) -> None:
+        """Wait until it can fork; raise NotReady with the reason if it cannot."""
+        answer = await self._answer(READY_S)
+        if not isinstance(answer, Ready) or answer.threads != 1:
+            more = f": it has {answer.threads} threads" if isinstance(answer, Ready) else ""
+            raise NotReady(f"the fork server did not start{more}")
+
+    async def fork(self, request: Fork, descriptors: Sequence[int]) -> int:
+        """Fork a gateway and return its process id; raise NotReady with the reason."""
+        if not self._post.send(request, descriptors):
+            raise NotReady("the fork server takes no request")
+        answer = await self._answer(FORK_S)
+        if not isinstance(answer, Forked) or not answer.pid:
+            raise NotReady((isinstance(answer, Forked) and answer.reason) or "the fork server is gone")
+        return answer.pid
+
+    async def _answer(self, within_s: float) -> Message | None:
+        try:
+            async with asyncio.timeout(within_s):
+                return await self._answers.get()
+        except TimeoutError:
+            self.close()
+            return None
+
+    def _hear(self) -> None:
+        try:
+            received = self._post.receive()
+        except (BlockingIOError, ValueError):
+            return
+        if received is None:
+            self.close()
+            self._answers.put_nowait(None)
+            return
+        message, descriptors = received
+        close_all(descriptors)
+        self._answers.put_nowait(message)
+
+    def close(self) -> None:
+        """Let it end; idempotent. The gateways that it forked live on."""
+        if self.alive:
+            self.alive = False
+            asyncio.get_running_loop().remove_reader(self._post.fileno())
+            self._post.close()
+
+    def kill(self) -> None:
+        """End it now."""
+        self.close()
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+        self._process.wait()
+
+    @property
+    def ended(self) -> bool:
+        """Whether its process has ended; reaps it."""
+        return self._process.poll() is not None
+
+
+class Forks:
+    """Forks gateways by the code that is installed now. One request at a time."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+        self._server: _Server | None = None
+        self._refused: Stamp | None = None
+        """The installation whose fork server did not start."""
+        self._leaving: list[_Server] = []
+        self._looked_at = -math.inf
+        self._turn = asyncio.Lock()
+
+    def __repr__(self) -> str:
+        return f"<Forks by {self._server.pid if self._server is not None else None}>"
+
+    @property
+    def pid(self) -> int | None:
+        """The process id of the fork server."""
+        return self._server.pid if self._server is not None else None
+
+    async def fork(
+        self, request: Fork, post: socket.socket, take_over: int | None = None, *, at_once: bool = False
+    ) -> int:
+        """Fork a gateway and return its process id; raise NotReady with the reason.
+
+        post: the gateway's end. take_over: descriptor of the socket by which it takes over. at_once: do not look
+        whether the installation has changed.
+        """
+        descriptors = [post.fileno()] if take_over is None else [post.fileno(), take_over]
+        loop = asyncio.get_running_loop()
+        async with self._turn:
+            looks = not at_once and loop.time() >= self._looked_at + LOOK_S
+            if looks or self._server is None or not self._server.alive:
+                await self._renew()
+            assert self._server is not None
+            return await self._server.fork(request, descriptors)
+
+    async def renew(self) -> None:
+        """Start the fork server, or another one if the installation has changed; raise NotReady if there is none.
+
+        A new one that does not start is reported, and the old one goes on.
+        """
+        async with self._turn:
+            await self._renew()
+
+    async def _renew(self) -> None:
+        self._looked_at = asyncio.get_running_loop().time()
+        self._leaving = [each for each in self._leaving if not each.ended]
+        old, stamp = self._server, await asyncio.to_thread(Stamp)
+        if old is not None and old.alive:
+            if stamp == old.stamp or stamp == self._refused or not stamp.settled:
+                return
+            log.info("the installation has changed: its code is loaded")
+        try:
+            server = await _started(self._command, stamp)
+        except NotReady as error:
+            if old is None or not old.alive:
+                raise
+            self._refused = stamp
+            log.error("%s: the code of before goes on", error)
+            return
+        self._server = server
+        if old is not None:
+            old.close()
+            self._leaving.append(old)
+
+    def close(self) -> None:
+        """End the fork server."""
+        for each in (self._server, *self._leaving):
+            if each is not None:
+                each.kill()
+
+
+async def _started(command: Sequence[str], stamp: Stamp) -> _Server:
+    """Start a fork server and wait until it can fork; raise NotReady with the reason."""
+    try:
+        server = _Server(command, stamp)
+    except OSError as error:
+        raise NotReady(f"the fork server did not start: {error.strerror or error}") from error
+    try:
+        await server.ready()
+    except NotReady:
+        server.kill()
+        raise
+    return server
+
+
+def fork_server_command() -> list[str]:
+    """Give the command that starts a fork server of the installed code; its last argument is still missing."""
+    here = Path.cwd() == HOME.parent  # the folder is searched for modules then
+    return [sys.executable, *([] if here else ["-P"]), "-m", "zbridge.cli.fork_server"]

@@ -1,0 +1,257 @@
+"""``zbridge run DIR``: keeps the gateways of many robot files running, one process each.
+
+Theory of operation. The supervisor opens no bus and serves no robot. Its processes are forked by a fork server
+(:mod:`zbridge.app.supervisor.fork_server`) and are its children, since it is the reaper of its descendants. One timer
+watches the beats of all processes: it fires at the earliest deadline, first takes what the processes told meanwhile,
+and kills those that are silent. Each robot has a :class:`Runner`, a task of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ctypes
+import logging
+import random
+import signal
+import time
+from collections import Counter
+from collections.abc import Coroutine, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from zbridge.app.host import HostSettings
+from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, paths_of, read
+from zbridge.app.supervisor.forks import Forks
+from zbridge.app.supervisor.notify import Systemd
+from zbridge.app.supervisor.process import GatewayProcess
+from zbridge.app.supervisor.runner import Runner
+from zbridge.errors import ConfigError, NotReady
+
+log = logging.getLogger("zbridge.app.supervisor")
+
+WATCH_S = 2.0
+"""Seconds between two looks at the files, with ``--watch``."""
+LATE_S = 0.05
+"""A timer that fires so much later was held up by the machine."""
+STATUS_S = 1.0
+"""Least time between two status lines."""
+READY_S = 0.2
+"""The same until the service is ready."""
+FORKED_S = 5.0
+"""Seconds between two attempts to start a fork server."""
+JITTER = 0.5
+"""Part of the time between two starts that is left to chance."""
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+class Supervisor:
+    """Runs the gateways of robot files. command: of the fork server. host: how gateways run on this host."""
+
+    def __init__(
+        self, sources: tuple[Path, ...], host: HostSettings, command: Sequence[str], *, watch: bool, verbose: bool
+    ) -> None:
+        self._sources = sources
+        self._host = host
+        self._watch = watch
+        self._verbose = verbose
+        self._forks = Forks(command)
+        self._follower = Follower(sources)
+        self._systemd = Systemd()
+        self._runners: dict[Path, Runner] = {}
+        self._leaving: set[Runner] = set()
+        """Those whose file is gone, until their process has ended."""
+        self._faults: dict[Path, str] = {}
+        self._running: set[asyncio.Task[None]] = set()
+        self._timer: asyncio.TimerHandle | None = None
+        self._told: asyncio.TimerHandle | None = None
+        self._reload = asyncio.Event()
+        self._all_started = False
+        self._is_ready = False
+
+    def __repr__(self) -> str:
+        return f"<Supervisor of {len(self._runners)} robots>"
+
+    async def run(self) -> None:
+        """Keep the gateways running until cancelled; then end all of them, each with its robot's stop.
+
+        Raise ConfigError where two files name one robot, or no file is sound.
+        """
+        files = first_look(self._sources)
+        loop = asyncio.get_running_loop()
+        _become_reaper()
+        loop.add_signal_handler(signal.SIGCHLD, self._reap)
+        loop.add_signal_handler(signal.SIGHUP, self._reload.set)
+        try:
+            await self._start_forks()
+            for task in (self._follow(), self._live()):
+                self._run(task)
+            self._look_at_hearts()
+            await self._apply(compare({}, files), first=True)
+            self._all_started = True
+            self._state_changed()
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.shield(self._end())
+            loop.remove_signal_handler(signal.SIGCHLD)
+            loop.remove_signal_handler(signal.SIGHUP)
+
+    async def _start_forks(self) -> None:
+        while True:
+            try:
+                return await self._forks.renew()
+            except NotReady as error:
+                log.error("%s; next attempt in %g s", error, FORKED_S)
+                await asyncio.sleep(FORKED_S)
+
+    async def _end(self) -> None:
+        self._systemd.tell("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
+        await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+        for timer in (self._timer, self._told):
+            if timer is not None:
+                timer.cancel()
+        self._forks.close()
+
+    def _run(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.ensure_future(work)
+        self._running.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("%s", error, exc_info=error)
+
+    # Files
+
+    async def _follow(self) -> None:
+        """Follow the files: at SIGHUP, and with ``watch`` every WATCH_S."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(WATCH_S if self._watch else None):
+                    await self._reload.wait()
+            asked = self._reload.is_set()
+            self._reload.clear()
+            if asked:
+                self._systemd.tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
+            try:
+                running = {path: runner.file for path, runner in self._runners.items()}
+                await self._apply(self._follower.look(running, twice=not asked))
+                await self._forks.renew()
+            except (ConfigError, NotReady) as error:
+                log.error("%s", error)
+            if asked:
+                self._systemd.tell("READY=1")
+
+    async def _apply(self, changes: Changes, *, first: bool = False) -> None:
+        """Start, restart and end what the files ask for; report the faulty ones."""
+        for path, file in changes.moved:
+            self._runners[file.path] = runner = self._runners.pop(path)
+            runner.file = file
+        for file in changes.faulty:
+            runs = "its robot goes on as before" if file.path in self._runners else "no robot runs by it"
+            log.error("%s: %s", file.fault, runs)
+            self._faults[file.path] = str(file.fault)
+        for path in changes.gone:
+            log.info("%s: is gone: its robot's gateway ends", path)
+            self._run(self._leave(self._runners.pop(path)))
+        for file in changes.changed:
+            log.info("%s: has changed", file.path)
+            self._run(self._runners[file.path].restart(file))
+        for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
+            self._faults.pop(path, None)
+        for number, file in enumerate(changes.came):
+            if number and self._host.stagger_s:
+                await asyncio.sleep(self._host.stagger_s * random.uniform(1 - JITTER, 1 + JITTER))
+            if not first:
+                log.info("%s: is new", file.path)
+            self._runners[file.path] = runner = Runner(
+                file, self._forks, verbose=self._verbose, changed=self._state_changed
+            )
+            self._run(runner.run())
+        self._state_changed()
+
+    async def _leave(self, runner: Runner) -> None:
+        self._leaving.add(runner)
+        await runner.end()
+        self._leaving.discard(runner)
+
+    # Processes
+
+    def _processes(self) -> Iterator[GatewayProcess]:
+        for runner in (*self._runners.values(), *self._leaving):
+            yield from runner.processes
+
+    def _reap(self) -> None:
+        for process in tuple(self._processes()):
+            process.reap()
+
+    def _look_at_hearts(self) -> None:
+        """Kill every process that has been silent for too long; look again at the next deadline."""
+        loop, now = asyncio.get_running_loop(), time.monotonic()
+        late_s = now - self._timer.when() if self._timer is not None else 0.0
+        deadlines = [now + 1.0]
+        for process in tuple(self._processes()):
+            process.hear()
+            process.reap()
+            if late_s > LATE_S:
+                process.heart.excuse(late_s)
+            if not process.over.done() and now >= process.heart.deadline:
+                process.kill(f"gave no sign of life for {process.heart.silent_s(now):.1f} s")
+            elif not process.over.done():
+                deadlines.append(process.heart.deadline)
+        self._timer = loop.call_at(max(now + 0.01, min(deadlines)), self._look_at_hearts)
+
+    # systemd
+
+    async def _live(self) -> None:
+        """Give systemd signs of life, where it wants them."""
+        while self._systemd.watchdog_s:
+            self._systemd.tell("WATCHDOG=1")
+            await asyncio.sleep(self._systemd.watchdog_s)
+
+    def _state_changed(self) -> None:
+        if self._told is None:
+            delay_s = STATUS_S if self._is_ready else READY_S
+            self._told = asyncio.get_running_loop().call_later(delay_s, self._tell)
+
+    def _tell(self) -> None:
+        self._told = None
+        beaten = all(runner.process is not None and runner.process.heart.beats for runner in self._runners.values())
+        ready = ("READY=1",) if beaten and self._all_started and not self._is_ready else ()
+        if not self._systemd.tell(*ready, f"STATUS={self.status}"):
+            self._state_changed()  # again, later
+        elif ready:
+            self._is_ready = True
+            log.info("ready: %s", self.status)
+
+    @property
+    def status(self) -> str:
+        """One line on the gateways: how many robots are in which state, and how many files are faulty."""
+        states = Counter(runner.state for runner in self._runners.values())
+        parts = [f"{len(self._runners)} robots", *(f"{count} {state}" for state, count in sorted(states.items()))]
+        restarts = sum(runner.restarts for runner in self._runners.values())
+        parts += [f"{restarts} restarts"] * bool(restarts) + [f"{len(self._faults)} faulty files"] * bool(self._faults)
+        return ", ".join(parts)
+
+
+def first_look(sources: tuple[Path, ...]) -> list[RobotFile]:
+    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
+    files = [read(path) for path in paths_of(sources)]
+    if not files:
+        raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
+    sound = [file for file in files if file.fault is None]
+    if not sound:
+        raise ConfigError(files[0].fault or "")
+    for file in compare({}, sound).faulty:
+        raise ConfigError(file.fault or "")
+    return files
+
+
+def _become_reaper() -> None:
+    """Become the parent of what a descendant leaves behind: forked gateways are waited for here."""
+    if ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0):
+        raise OSError(ctypes.get_errno(), "prctl")

@@ -1,0 +1,40 @@
+"""``python -m zbridge.cli.fork_server FD``: the fork server of ``zbridge run DIR``. FD: its end of the post."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from zbridge.app.supervisor.child import Reporter
+from zbridge.app.supervisor.fork_server import Birth, serve
+from zbridge.app.supervisor.post import Post
+from zbridge.cli import give_up, run_gateway, set_up_log
+from zbridge.errors import ConfigError, ZbridgeError
+
+
+def main() -> None:
+    """Serve the supervisor that started this process."""
+    serve(Post.inherited(int(sys.argv[1])), run)
+
+
+def run(birth: Birth) -> int:
+    """Be a gateway; return the exit code."""
+    request = birth.request
+    set_up_log(verbose=request.verbose, robot=request.robot)
+    try:
+        run_gateway(
+            Path(request.file),
+            verbose=request.verbose,
+            take_over=birth.take_over if birth.take_over >= 0 else None,
+            reporter=Reporter(Post.inherited(birth.post), hands_over=True),
+        )
+    except ZbridgeError as error:
+        try:
+            give_up(2, error)
+        except SystemExit:
+            return 2 if isinstance(error, ConfigError) else 1
+    return 0
+
+
+if __name__ == "__main__":
+    main()

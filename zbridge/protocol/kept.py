@@ -1,0 +1,110 @@
+"""What an object hands on to the same object of another process, as values that MessagePack holds. Sans-IO.
+
+Theory of operation. A class names in ``kept`` the attributes that make its state, each with its type. ``export`` writes
+them, ``restore`` puts them into an object that was just made from the same settings. What a class does not name, its
+constructor makes anew. An attribute that is :class:`Kept` itself is restored in place. Times need no conversion: all
+processes of a machine share the clock of their event loops.
+
+A state of another form (a field too few, another type, a name that an enumeration lacks) is refused whole.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import msgspec
+
+from zbridge.errors import ProtocolError
+
+Exported = dict[str, Any]
+"""A state: names and values that MessagePack holds."""
+
+
+class Form(NamedTuple):
+    """How one attribute is written, and read back; for what no type describes."""
+
+    write: Callable[[Any], Any]
+    read: Callable[[Any], Any]
+
+
+class Frame(bytes):
+    """A frame of a kind of its own; every other frame is plain bytes. Subclasses keep their kind when handed on."""
+
+    kinds: ClassVar[dict[str, type[bytes]]] = {"": bytes}
+
+    def __init_subclass__(cls) -> None:
+        Frame.kinds[f"{cls.__module__}.{cls.__qualname__}"] = cls
+
+
+def _write_frame(frame: bytes | None) -> Any:
+    if frame is None:
+        return None
+    kind = "" if type(frame) is bytes else f"{type(frame).__module__}.{type(frame).__qualname__}"
+    return [kind, bytes(frame)]
+
+
+def _read_frame(raw: Any) -> bytes | None:
+    if raw is None:
+        return None
+    kind, data = msgspec.convert(raw, tuple[str, bytes])
+    if kind not in Frame.kinds:
+        raise ValueError(f"frame of an unknown kind {kind!r}")
+    return Frame.kinds[kind](data)
+
+
+FRAME = Form(_write_frame, _read_frame)
+"""One frame, or None."""
+FRAMES = Form(lambda frames: list(map(_write_frame, frames)), lambda raw: tuple(map(_read_frame, raw)))
+"""A tuple, list or deque of frames."""
+
+
+class Kept:
+    """An object whose state another process can take over."""
+
+    kept: ClassVar[Mapping[str, Any]] = {}
+    """Attributes and their types (or a :class:`Form`); those of the base classes are kept too."""
+
+    def export(self) -> Exported:
+        """Write the state."""
+        return {name: _write(getattr(self, name), form) for name, form in _attributes(type(self)).items()}
+
+    def restore(self, state: Exported) -> None:
+        """Take a state over; raise ProtocolError if it has another form. The object must not be used then."""
+        for name, form in _attributes(type(self)).items():
+            try:
+                _restore(self, name, form, state[name])
+            except (KeyError, TypeError, ValueError, msgspec.MsgspecError) as error:
+                raise ProtocolError(f"{type(self).__name__}.{name}: {error or 'missing'}") from error
+
+
+def _attributes(kind: type) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for base in reversed(kind.__mro__):
+        found |= vars(base).get("kept", {})
+    return found
+
+
+def _write(value: Any, form: Any) -> Any:
+    if isinstance(value, Kept):
+        return value.export()
+    if isinstance(form, Form):
+        return form.write(value)
+    return msgspec.to_builtins(list(value) if isinstance(value, deque) else value, builtin_types=(bytes, bytearray))
+
+
+def _restore(owner: object, name: str, form: Any, raw: Any) -> None:
+    present = getattr(owner, name)
+    if isinstance(present, Kept):
+        present.restore(raw)
+        return
+    value = form.read(raw) if isinstance(form, Form) else msgspec.convert(raw, form)
+    if isinstance(present, deque):
+        present.clear()
+        present.extend(value)
+    elif isinstance(present, Counter):
+        present.clear()
+        present.update(value)
+    else:
+        setattr(owner, name, value)

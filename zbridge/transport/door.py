@@ -1,0 +1,108 @@
+"""The sockets of a listener: bound here, or taken over from another process. Knows no session.
+
+A door is open while peers are accepted. One that is shut keeps its sockets: the kernel lets those who come wait in its
+queue, for this process (:meth:`Door.open`) or for one that was handed the sockets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+
+from zbridge.errors import ProtocolError
+from zbridge.protocol.address import Address
+from zbridge.protocol.kept import Exported
+from zbridge.transport.link import Link, Receiver
+from zbridge.transport.parcel import Parcel
+from zbridge.transport.udp import DatagramHub
+
+Accept = Callable[[Receiver], asyncio.BufferedProtocol]
+"""``accept(receiver)``: makes the link of an accepted peer."""
+
+
+class Door:
+    """The sockets of one listener. ``given``, ``parcel``: as another process handed them over; it begins shut then."""
+
+    def __init__(self, given: Exported | None = None, parcel: Parcel | None = None) -> None:
+        self._given = given
+        self._parcel = parcel or Parcel()
+        self._sockets: list[socket.socket] = []
+        self._servers: list[asyncio.Server] = []
+        self._hub: DatagramHub | None = None
+        self._receiver: Callable[[], Receiver]
+        self._accept: Accept
+
+    def __repr__(self) -> str:
+        return f"<Door of {len(self._sockets)} sockets, {'open' if self._servers else 'shut'}>"
+
+    async def bind(
+        self, address: Address, receiver: Callable[[], Receiver], accept: Accept, hub: DatagramHub | None
+    ) -> Address:
+        """Bind the address and open, or take the sockets over; return the address with its port. Raise OSError."""
+        self._receiver, self._accept, self._hub = receiver, accept, hub
+        if self._given is not None:
+            self._take_over(self._given)
+        else:
+            loop = asyncio.get_running_loop()
+            server = await loop.create_server(lambda: accept(receiver()), address.host, address.port)
+            self._servers = [server]
+            self._sockets = [socket.socket(fileno=os.dup(bound.fileno())) for bound in server.sockets]
+        host, port = self._sockets[0].getsockname()[:2]
+        if hub is not None and self._given is None:
+            hub.open(host, port)
+        return Address(host, port, address.tls)
+
+    def _take_over(self, given: Exported) -> None:
+        self._sockets = [socket.socket(fileno=self._parcel.take(number)) for number in given["tcp"]]
+        if not self._sockets or (given["udp"] is None) is not (self._hub is None):
+            raise ProtocolError("other sockets than this listener's")
+        if self._hub is not None:
+            self._hub.take_over(socket.socket(fileno=self._parcel.take(given["udp"])))
+
+    async def open(self) -> None:
+        """Accept peers, again or for the first time; take their datagrams."""
+        loop = asyncio.get_running_loop()
+        for bound in self._sockets if not self._servers else ():
+            copy = bound.dup()
+            copy.setblocking(False)
+            self._servers.append(await loop.create_server(lambda: self._accept(self._receiver()), sock=copy))
+        if self._hub is not None:
+            self._hub.go_on()
+
+    def shut(self) -> None:
+        """Accept nobody until :meth:`open`. Who was accepted in this turn of the loop is attached in the next two."""
+        servers, self._servers = self._servers, []
+        for server in servers:
+            server.close()
+
+    def hold(self) -> None:
+        """Take no datagrams until :meth:`open`."""
+        if self._hub is not None:
+            self._hub.hold()
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        """Put the sockets into a parcel; describe them for the process that gets it."""
+        udp = parcel.put(self._hub.fileno()) if self._hub is not None else None
+        return {"tcp": [parcel.put(bound.fileno()) for bound in self._sockets], "udp": udp}
+
+    def source(self, link: Link) -> tuple[str, int] | None:
+        """Return the source of an accepted peer's datagrams."""
+        return self._hub.source(link) if self._hub is not None else None
+
+    async def admit(self, number: object, receiver: Receiver, source: tuple[str, int] | None) -> None:
+        """Attach an accepted peer that was handed over, with the source of its datagrams."""
+        connection = socket.socket(fileno=self._parcel.take(number))
+        connection.setblocking(False)
+        _, link = await asyncio.get_running_loop().create_connection(lambda: self._accept(receiver), sock=connection)
+        if source is not None and self._hub is not None:
+            self._hub.bind(link, receiver, source)  # type: ignore[arg-type]
+
+    def close(self) -> None:
+        """Close the sockets of this process; idempotent."""
+        self.shut()
+        if self._hub is not None:
+            self._hub.close()
+        for bound in self._sockets:
+            bound.close()

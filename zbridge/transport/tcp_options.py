@@ -1,0 +1,86 @@
+"""The options of TCP sockets, and what the kernel tells of them. Knows no link."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import logging
+import socket
+import struct
+import termios
+import time
+
+from zbridge.transport.backlog import Backlog
+
+log = logging.getLogger("zbridge.link")
+
+KEEPALIVE_S = 1
+"""Seconds of silence after which the kernel asks an accepted peer for a sign of life."""
+_RETRY_MOST_S = 1.0
+"""Longest time between two retransmissions of the kernel to a robot."""
+_TCP_RTO_MAX_MS = 44
+"""Linux 6.15 and newer; Python has no name for it yet."""
+_OUTSTANDING = struct.Struct("=i")
+_SIOCOUTQ = termios.TIOCOUTQ
+"""The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
+
+
+def tune(sock: socket.socket, give_up_s: float) -> None:
+    """Send each write at once; give a connection up that acknowledges nothing for ``give_up_s`` seconds."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        ("TCP_KEEPIDLE", 5),
+        ("TCP_KEEPINTVL", 2),
+        ("TCP_KEEPCNT", 3),
+        ("TCP_USER_TIMEOUT", round(give_up_s * 1000)),
+    ):
+        if hasattr(socket, option):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def keep_alive(sock: socket.socket) -> None:
+    """Ask a silent peer for a sign of life every second; ``tune`` says when the connection ends."""
+    for option, value in (("TCP_KEEPIDLE", KEEPALIVE_S), ("TCP_KEEPINTVL", KEEPALIVE_S), ("TCP_KEEPCNT", 10)):
+        if hasattr(socket, option):
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def bound_retries(sock: socket.socket) -> None:
+    """Bound the time between retransmissions by :data:`_RETRY_MOST_S`, where the kernel can."""
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.IPPROTO_TCP, _TCP_RTO_MAX_MS, round(_RETRY_MOST_S * 1000))
+
+
+_unwatched_warned = False
+
+
+def new_backlog(sock: socket.socket) -> Backlog | None:
+    """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
+    global _unwatched_warned
+    try:
+        queued(sock)
+    except OSError:
+        if not _unwatched_warned:
+            _unwatched_warned = True
+            log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
+        return None
+    backlog = Backlog()
+    if unsent := queued(sock):  # of the process that had the connection before
+        backlog.written(unsent, time.monotonic())
+    return backlog
+
+
+def outstanding(transport: asyncio.Transport) -> int:
+    """Count the unacknowledged bytes: the kernel's and the transport's own."""
+    waiting = 0
+    with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
+        waiting = queued(transport.get_extra_info("socket"))
+    return waiting + transport.get_write_buffer_size()
+
+
+def queued(sock: socket.socket) -> int:
+    """Count the unacknowledged bytes of the kernel; raise OSError where the platform does not tell."""
+    waiting: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
+    return waiting

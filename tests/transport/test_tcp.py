@@ -200,7 +200,7 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkey
     def unknown(*_: object) -> bytes:
         raise OSError("Inappropriate ioctl for device")
 
-    monkeypatch.setattr(tcp.fcntl, "ioctl", unknown)
+    monkeypatch.setattr(tcp_options.fcntl, "ioctl", unknown)
     monkeypatch.setattr(tcp_options, "_unwatched_warned", False)
     for _ in range(2):
         async with connected() as pair:

@@ -17,8 +17,9 @@ from tests.certificates import Authority
 from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
-from zbridge.app.gateway import Gateway, until_signal
+from zbridge.app.gateway import Gateway
 from zbridge.app.joining import RETRY_S, join_bus
+from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import BusError, ConfigError

@@ -52,7 +52,7 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     (
         m.Status("established", links=(m.LinkStatus(**LINK),)),
         {"state": "established", "features": [], "links": [LINK | none("reason")]}
-        | none("reason protocol dialect version"),
+        | none("reason protocol dialect version host"),
     ),
     (
         m.Control("stopped", refusals=(OFFLINE,)),

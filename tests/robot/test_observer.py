@@ -103,11 +103,11 @@ async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
         conversation.attached(link)
 
     async def begin() -> None:
-        assert heir.link.written == [], "nothing is written before the word to go"
+        assert heir.links == [], "no connection is touched before the word to go"
 
     monkeypatch.setattr("zbridge.robot.connection.take_over", take_over)
     heir = Rig()
-    await heir.device.take_over(kept, Parcel())
+    heir.device.take_over(kept, Parcel())
     task = asyncio.ensure_future(heir.device.run(begin))
     await heir.settle()
     await asyncio.sleep(5.0)

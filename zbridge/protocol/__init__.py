@@ -17,8 +17,8 @@ rate_limit      :class:`RateLimit`: how often something may happen.
 exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks, awaits the answer and polls.
 codec           :class:`Codec`: the messages, for the conformance kit.
 kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
-kept            :class:`Kept`: what survives a restart of the gateway; :class:`Form`, ``FRAME``, ``FRAMES`` for what no
-                type describes; :class:`Frame`: a frame of a kind of its own.
+kept            :class:`Kept`: what survives a restart of the gateway, as :class:`Exported`; :class:`Form`, ``FRAME``,
+                ``FRAMES`` for what no type describes; :class:`Frame`: a frame of a kind of its own.
 odometry        :class:`Odometry`: from what the wheels have turned to a pose.
 bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
 errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message

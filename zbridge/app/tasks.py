@@ -1,0 +1,65 @@
+"""Coroutines that run together, until an event, or until a signal: each ends with all that it started."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Coroutine, Mapping
+from typing import Any
+
+
+async def together(*work: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines until all have ended, or one fails: then cancel the others and raise its exception."""
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in tasks:
+            if task.done():
+                task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine until it ends, or an event is set: then cancel it and wait until it has ended."""
+    tasks = (asyncio.ensure_future(work), asyncio.ensure_future(event.wait()))
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if tasks[0].done():
+            tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+
+
+async def until_signal(
+    work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
+) -> None:
+    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then end it. ``on``: what other signals run beside."""
+    task = asyncio.ensure_future(work)
+    loop = asyncio.get_running_loop()
+    asked: list[int] = []
+
+    def end(number: int) -> None:
+        """Cancel once: a second signal must not interrupt the end."""
+        if not asked:
+            task.cancel()
+        asked.append(number)
+
+    beside: set[asyncio.Task[None]] = set()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, end, number)
+    for other, begin in (on or {}).items():
+        loop.add_signal_handler(other, _start_beside, begin, beside)
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
+def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:
+    task = asyncio.ensure_future(begin())
+    tasks.add(task)
+    task.add_done_callback(tasks.discard)

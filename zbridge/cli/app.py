@@ -186,9 +186,7 @@ def foxglove(
     listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
     robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
     drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
-    token: Annotated[
-        Path | None, typer.Option(help="file with the token that viewers must give (?token=)")
-    ] = None,
+    token: Annotated[Path | None, typer.Option(help="file with the token that viewers must give (?token=)")] = None,
     origin: Annotated[list[str], typer.Option(help="Origin of another web page that may connect; once for each")] = [],
     allow: Annotated[list[str], typer.Option(help="network that viewers may connect from; once for each")] = [],
     tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,

@@ -102,8 +102,7 @@ class Commands:
 
     def published_on(self, viewer: Person, channel: ClientChannel) -> None:
         """Accept a channel for Twists or stops; raise Refused for any other."""
-        robot, what = self._aim(channel)
-        if what == CMD_VEL:
+        if self._aim(channel)[1] == CMD_VEL:
             if channel.schema_name not in _TWISTS:
                 raise Unsupported(f"{channel.topic}: schema {channel.schema_name!r}: expected {_TWISTS[0]!r}")
             self._may(viewer)

@@ -221,9 +221,9 @@ class Live(Source):
         """Carry out a service's call."""
         return await self._commands.call(viewer, service_id, payload)
 
-    async def parameters(self, names: tuple[str, ...]) -> Mapping[str, Any]:
+    async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
         """Return the values of parameters, the robots' own where they tell them."""
-        if not self._watching:
+        if ask and not self._watching:
             with contextlib.suppress(BusError):
                 for topic in _SWITCHES:
                     for answer in await self._bus.ask(f"{self._realm}/*/{topic.path}", timeout_s=_ASK_S):

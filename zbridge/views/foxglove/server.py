@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ from zbridge.views.foxglove.commands import Commands
 from zbridge.views.foxglove.front import Front, tls_context
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.live import Live
+from zbridge.views.foxglove.playback import Playback
+from zbridge.views.foxglove.recording import Recording
 from zbridge.views.foxglove.settings import Plan
 from zbridge.views.foxglove.source import Source
 
@@ -42,9 +45,10 @@ async def _serve_bus(plan: Plan, bus: Bus, realm: str, metrics: Metrics, on_read
 
 async def serve_file(plan: Plan, file: Path, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     """Serve a recording; raise ZbridgeError if it cannot be read. on_ready: called when viewers are accepted."""
-    from zbridge.views.foxglove.playback import Playback
-
-    await _serve(plan, Playback(Hub(), file), metrics, on_ready)
+    recording = await asyncio.to_thread(Recording, file)
+    if not recording.whole:
+        log.warning("%s: has no index, as if it was cut off; it is played up to the cut", file)
+    await _serve(plan, Playback(Hub(), recording), metrics, on_ready)
 
 
 async def _serve(plan: Plan, source: Source, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:

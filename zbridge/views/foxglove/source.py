@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import secrets
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from zbridge import __version__
 from zbridge.errors import Unsupported
+from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub
 from zbridge.views.foxglove.replies import Service
 from zbridge.views.foxglove.requests import ClientChannel, PlaybackRequest
@@ -37,6 +40,12 @@ class Source:
 
     def __init__(self, hub: Hub) -> None:
         self.hub = hub
+        self._session_id = secrets.token_hex(8)
+
+    def info(self) -> str:
+        """Return the first message to every viewer. The session's id tells a server that was started anew."""
+        metadata = {"library": f"zbridge {__version__}"}
+        return replies.server_info("zbridge", self.capabilities, self._session_id, metadata, self.times_ns)
 
     async def run(self) -> None:
         """Work until cancelled; a source that is told of everything by others has nothing to do."""
@@ -64,8 +73,8 @@ class Source:
         """Carry out a service's call; return its answer in JSON."""
         raise Unsupported("there are no services")
 
-    async def parameters(self, names: tuple[str, ...]) -> Mapping[str, Any]:
-        """Return the values of these parameters, of all if none is named."""
+    async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
+        """Return the values of these parameters, of all if none is named. ask: ask the robots for theirs first."""
         return {}
 
     async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:

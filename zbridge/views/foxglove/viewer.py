@@ -82,6 +82,7 @@ class Viewer:
 
     async def run(self) -> None:
         """Serve the viewer until it is gone; raise Overrun or TimeoutError if it has to be ended."""
+        self.say(self._source.info())
         self._hub.join(self)
         services = self._source.services()
         if services:
@@ -261,10 +262,10 @@ class Viewer:
             except (Refused, BusError, ProtocolError) as error:
                 self.refuse(error)
         if said.id is not None:
-            await self._tell_parameters(tuple(parameter.name for parameter in said.parameters), said.id)
+            await self._tell_parameters(tuple(parameter.name for parameter in said.parameters), said.id, ask=False)
 
-    async def _tell_parameters(self, names: tuple[str, ...], request_id: str | None) -> None:
-        self.say(replies.parameter_values(await self._source.parameters(names), request_id))
+    async def _tell_parameters(self, names: tuple[str, ...], request_id: str | None, *, ask: bool = True) -> None:
+        self.say(replies.parameter_values(await self._source.parameters(names, ask=ask), request_id))
 
     async def _leave(self) -> None:
         self._hub.leave(self)

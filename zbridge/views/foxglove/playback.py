@@ -11,6 +11,7 @@ import asyncio
 import contextlib
 import itertools
 from collections.abc import Iterator
+from typing import cast
 
 from zbridge.views.foxglove import replies
 from zbridge.views.foxglove.hub import Hub, Receiver
@@ -79,7 +80,7 @@ class Playback(Source):
         viewer.say(self._state(sought=sought, request_id=request.request_id))
         others = self._state(sought=sought, request_id="")
         for other in self.hub.viewers:
-            if other != viewer:
+            if other is not cast(Receiver, viewer):
                 other.say(others)
         self._changed.set()
 

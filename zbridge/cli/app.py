@@ -202,11 +202,12 @@ def foxglove(
     viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
     connect: Connect = [],
     realm: Realm = "fleet",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
     """Serve robots live, or a recording, to Foxglove until SIGTERM or SIGINT."""
     from zbridge.cli.foxglove import run_foxglove
 
-    set_up_log(verbose=False)
+    set_up_log(verbose=verbose)
     given: dict[str, object] = {
         "listen": listen,
         "robots": robot,

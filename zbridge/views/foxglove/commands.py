@@ -100,19 +100,14 @@ class Commands:
 
     # Topics
 
-    def published_on(self, viewer: Person, channel: ClientChannel) -> None:
-        """Accept a channel for Twists or stops; raise Refused for any other."""
-        if self._aim(channel)[1] == CMD_VEL:
-            if channel.schema_name not in _TWISTS:
-                raise Unsupported(f"{channel.topic}: schema {channel.schema_name!r}: expected {_TWISTS[0]!r}")
-            self._may(viewer)
-
     def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
-        """Drive or stop a robot."""
+        """Drive or stop a robot; raise Refused for any other channel."""
         robot, what = self._aim(channel)
         if what == STOP:
             self._stop_soon(viewer, robot)
             return
+        if channel.schema_name not in _TWISTS:
+            raise Unsupported(f"{channel.topic}: schema {channel.schema_name!r:.80}: expected {_TWISTS[0]!r}")
         self._may(viewer)
         self._pilot(viewer, robot).drive(read_twist(payload, self._scales.of(robot)))
 

@@ -205,10 +205,6 @@ class Live(Source):
         """Return the services of all robots."""
         return self._commands.services()
 
-    def published_on(self, viewer: Person, channel: ClientChannel) -> None:
-        """Accept a channel for Twists or stops; raise Refused for any other."""
-        self._commands.published_on(viewer, channel)
-
     def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
         """Drive or stop a robot."""
         self._commands.published(viewer, channel, payload)

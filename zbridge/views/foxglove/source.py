@@ -58,10 +58,6 @@ class Source:
     def greet(self, viewer: Person) -> None:
         """Tell a new viewer what it has to know besides channels and services."""
 
-    def published_on(self, viewer: Person, channel: ClientChannel) -> None:
-        """Take note of a channel on which a viewer will publish."""
-        raise Unsupported(f"{channel.topic}: nothing can be published here")
-
     def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
         """Take a message of a viewer."""
         raise Unsupported(f"{channel.topic}: nothing can be published here")

@@ -158,6 +158,7 @@ class Viewer:
     def refuse(self, why: Exception) -> None:
         """Count what was not carried out, and tell the person."""
         self.counts["refused"] += 1
+        log.debug("%s: %s", self.name, why)
         self.warn(str(why))
 
     def _take(self, message: str | bytes) -> None:
@@ -179,13 +180,14 @@ class Viewer:
     def _subscribe(self, said: requests.Subscribe) -> None:
         for wish in said.subscriptions:
             if wish.id in self._channels or wish.channel_id in self._subscribed:
-                raise Unsupported(f"channel {wish.channel_id} or subscription {wish.id} is subscribed already")
-            if len(self._channels) >= SUBSCRIPTIONS:
-                raise Unsupported(f"more than {SUBSCRIPTIONS} subscriptions")
-            if not self._hub.subscribe(self, wish.id, wish.channel_id):
-                raise Unsupported(f"there is no channel {wish.channel_id}")
-            self._channels[wish.id] = wish.channel_id
-            self._subscribed.add(wish.channel_id)
+                self.refuse(Unsupported(f"channel {wish.channel_id} or subscription {wish.id} is subscribed already"))
+            elif len(self._channels) >= SUBSCRIPTIONS:
+                self.refuse(Unsupported(f"more than {SUBSCRIPTIONS} subscriptions"))
+            elif not self._hub.subscribe(self, wish.id, wish.channel_id):
+                self.refuse(Unsupported(f"there is no channel {wish.channel_id}"))
+            else:
+                self._channels[wish.id] = wish.channel_id
+                self._subscribed.add(wish.channel_id)
 
     def _unsubscribe(self, said: requests.Unsubscribe) -> None:
         for subscription in said.subscription_ids:
@@ -196,11 +198,12 @@ class Viewer:
                 self._outbox.forget(subscription)
 
     def _advertise(self, said: requests.Advertise) -> None:
+        """Take note of any channel: viewers announce some that they never use. What comes on it is judged then."""
         for channel in said.channels:
             if channel.id in self._published or len(self._published) >= PUBLISHED:
-                raise Unsupported(f"channel {channel.id} is there already, or there are {PUBLISHED}")
-            self._source.published_on(self, channel)
-            self._published[channel.id] = channel
+                self.refuse(Unsupported(f"channel {channel.id} is there already, or there are {PUBLISHED}"))
+            else:
+                self._published[channel.id] = channel
 
     def _unadvertise(self, said: requests.Unadvertise) -> None:
         for channel_id in said.channel_ids:

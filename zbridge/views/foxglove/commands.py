@@ -41,7 +41,8 @@ _UNTOUCHED: Mapping[str, Any] = {"light": False, "lidar": False, "camera": False
 class Commands:
     """Carries out what viewers tell the robots of a fleet. who: what drivers are called first."""
 
-    def __init__(self, fleet: Fleet, scales: Scales, who: str) -> None:
+    def __init__(self, hub: Hub, fleet: Fleet, scales: Scales, who: str) -> None:
+        self._hub = hub
         self._fleet = fleet
         self._scales = scales
         self._who = who
@@ -67,29 +68,26 @@ class Commands:
 
     # Robots come and go
 
-    def robot_came(self, robot: str, hub: Hub) -> None:
+    def robot_came(self, robot: str) -> None:
         """Offer the services and parameters of a robot."""
         self._robots[robot] = dict(_UNTOUCHED)
         services = [self._add(robot, what) for what in (STOP, *_SWITCHES, "mode")]
-        hub.say(replies.advertise_services(services))
-        self._tell(hub, robot)
+        self._hub.say(replies.advertise_services(services))
+        self._hub.parameters_changed({f"{robot}.{name}": value for name, value in self._robots[robot].items()})
 
-    def robot_left(self, robot: str, hub: Hub) -> None:
+    def robot_left(self, robot: str) -> None:
         """Withdraw the services of a robot."""
         self._robots.pop(robot, None)
         gone = [number for number, (owner, _, _) in self._services.items() if owner == robot]
         for number in gone:
             del self._services[number]
-        hub.say(replies.unadvertise_services(gone))
+        self._hub.say(replies.unadvertise_services(gone))
 
-    def noted(self, robot: str, name: str, value: Any, hub: Hub) -> None:
+    def noted(self, robot: str, name: str, value: Any) -> None:
         """Take note of a parameter's value."""
         if robot in self._robots and self._robots[robot].get(name) != value:
             self._robots[robot][name] = value
-            hub.parameters_changed({f"{robot}.{name}": value})
-
-    def _tell(self, hub: Hub, robot: str) -> None:
-        hub.parameters_changed({f"{robot}.{name}": value for name, value in self._robots[robot].items()})
+            self._hub.parameters_changed({f"{robot}.{name}": value})
 
     def _add(self, robot: str, what: str) -> Service:
         number = next(self._ids)
@@ -218,8 +216,7 @@ class Commands:
             target = self._fleet[robot]
             switch = {"light": target.set_light, "lidar": target.set_lidar, "camera": target.set_camera}[what]
             await switch(value is True)
-        if robot in self._robots:
-            self._robots[robot][what] = value
+        self.noted(robot, what, value)  # what the robot then tells of it wins
 
     async def _set_mode(self, viewer: Person, robot: str, mode: str) -> None:
         for (other, held), pilot in self._pilots.items():

@@ -126,11 +126,11 @@ class Live(Source):
         channels = {channel.path: channel for path in _OFFERED for channel in channels_of(name, path)}
         channels[_SENSORS] = Channel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
         self._offer(shown, channels.values())
-        self._commands.robot_came(name, self.hub)
+        self._commands.robot_came(name)
 
     def _hide(self, name: str) -> None:
         shown = self._shown[name]
-        self._commands.robot_left(name, self.hub)
+        self._commands.robot_left(name)
         self.hub.withdraw([channel.topic for channel in shown.offered.values()])
         del self._shown[name]
         for handle in shown.handles.values():
@@ -249,7 +249,7 @@ class Live(Source):
         except PayloadError:
             self._malformed.value += 1
             return
-        self._commands.noted(split[1], split[2], switch.on, self.hub)
+        self._commands.noted(split[1], split[2], switch.on)
 
     async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
         """Change a parameter: send the robot a command."""

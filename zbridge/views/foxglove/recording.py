@@ -94,8 +94,6 @@ class Recording:
         """Read channels and times from the index; False where there is none."""
         try:
             summary = SeekingReader(file, record_size_limit=RECORD_BYTES).get_summary()
-        except OSError:
-            raise
         except Exception:  # whatever a damaged index makes the library raise: the messages may still be good
             return False
         if summary is None or summary.statistics is None or not summary.chunk_indexes:

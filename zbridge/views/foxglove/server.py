@@ -34,8 +34,9 @@ async def serve_live(
 
 
 async def _serve_bus(plan: Plan, bus: Bus, realm: str, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
-    commands = Commands(Fleet(bus, realm), plan.scales, plan.policy.who)
-    live = Live(Hub(), bus, realm, plan.robots, commands, metrics)
+    hub = Hub()
+    commands = Commands(hub, Fleet(bus, realm), plan.scales, plan.policy.who)
+    live = Live(hub, bus, realm, plan.robots, commands, metrics)
     live.start()
     try:
         await _serve(plan, live, metrics, on_ready)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
         from zbridge.views.foxglove.settings import Options, plan
     except ImportError as error:
         raise ConfigError(f"{error}: expected what `pip install 'zbridge[foxglove]'` installs") from error
+    gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     options: Options = Options(**given)  # type: ignore[arg-type]
     planned, metrics = plan(options), Metrics()
 

@@ -131,7 +131,11 @@ class Commands:
     def _pilot(self, viewer: Person, robot: str) -> Pilot:
         pilot = self._pilots.get((viewer, robot))
         if pilot is None:
-            pilot = Pilot(self._fleet[robot], viewer.name, self._who, viewer.warn)
+
+            def mode_ended(mode: str) -> None:
+                self.noted(robot, "mode", mode)
+
+            pilot = Pilot(self._fleet[robot], viewer.name, self._who, viewer.warn, mode_ended)
             self._pilots[viewer, robot] = pilot
         return pilot
 

@@ -28,11 +28,15 @@ WAIT_S = 2.0
 class Pilot:
     """Holds a robot for a viewer, from its first Twist or mode on.
 
-    who, name: as for :meth:`zbridge.client.Robot.control`. tell: tells the person what was not carried out.
+    who, name: as for :meth:`zbridge.client.Robot.control`. tell: tells the person what was not carried out. on_mode:
+    called when the mode that the viewer has set ends with the lease.
     """
 
-    def __init__(self, robot: Robot, who: str, name: str, tell: Callable[[str], None]) -> None:
+    def __init__(
+        self, robot: Robot, who: str, name: str, tell: Callable[[str], None], on_mode: Callable[[str], None]
+    ) -> None:
         self.mode = "none"
+        self._on_mode = on_mode
         self._robot = robot
         self._who = who
         self._name = name
@@ -108,6 +112,8 @@ class Pilot:
             failed = BusError(describe(error))
             self._tell(describe(error))
         finally:
+            if self.mode != "none":
+                self._on_mode("none")
             self.mode, self._drive = "none", None
             while not self._modes.empty():
                 _, done = self._modes.get_nowait()

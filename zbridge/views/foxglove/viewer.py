@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from typing import Any, Protocol
@@ -67,6 +68,7 @@ class Viewer:
         self._clock = clock
         self._outbox = Outbox()
         self._filled = asyncio.Event()
+        self._sending_since = math.inf
         self._rate = RateLimit(RATE_HZ)
         self._told = RateLimit(TOLD_HZ)
         self._channels: dict[int, int] = {}
@@ -88,15 +90,16 @@ class Viewer:
         if services:
             self.say(replies.advertise_services(services))
         self._source.greet(self)
-        reading, writing = asyncio.create_task(self._read()), asyncio.create_task(self._write())
+        work = [asyncio.create_task(part()) for part in (self._read, self._write, self._watch_writing)]
         try:
-            done, _ = await asyncio.wait((reading, writing), return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         finally:
-            for task in (reading, writing, *self._calls):
+            work += self._calls
+            for task in work:
                 task.cancel()
-            await asyncio.gather(reading, writing, *self._calls, return_exceptions=True)
+            await asyncio.gather(*work, return_exceptions=True)
             await self._leave()
 
     # To the viewer
@@ -135,8 +138,15 @@ class Viewer:
             await self._filled.wait()
             self._filled.clear()
             while (message := outbox.next()) is not None:
-                async with asyncio.timeout(SEND_S):
-                    await send(message)
+                self._sending_since = self._clock()
+                await send(message)
+            self._sending_since = math.inf
+
+    async def _watch_writing(self) -> None:
+        """Raise TimeoutError when the viewer takes nothing; a timer for each message would cost more than the message."""
+        while self._clock() - self._sending_since < SEND_S:
+            await asyncio.sleep(SEND_S / 4)
+        raise TimeoutError
 
     # From the viewer
 

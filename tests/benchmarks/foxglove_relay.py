@@ -14,7 +14,7 @@ from websockets.exceptions import ConnectionClosed
 
 
 async def main(endpoint: str, port: int) -> None:
-    """Relay the scans until killed."""
+    """Relay the poses until killed."""
     loop, queues = asyncio.get_running_loop(), set[asyncio.Queue[bytes]]()
 
     def give(data: bytes) -> None:
@@ -38,7 +38,7 @@ async def main(endpoint: str, port: int) -> None:
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     with zenoh.open(config) as session:
-        subscriber = session.declare_subscriber("fleet/r0/scan", take)
+        subscriber = session.declare_subscriber("fleet/r1/pose", take)
         async with serve(view, "127.0.0.1", port, compression=None):
             print("relaying", flush=True)
             await asyncio.Event().wait()

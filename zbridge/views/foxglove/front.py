@@ -15,6 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHeader
 from websockets.headers import parse_subprotocol
 from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
+from websockets.protocol import State
 from websockets.typing import Subprotocol
 
 from zbridge.errors import ConfigError
@@ -128,6 +129,7 @@ class Front:
         return connection.respond(decision.status, decision.text + "\n")
 
     async def _serve(self, connection: ServerConnection) -> None:
+        assert isinstance(connection, _Guarded)
         admitted: Admitted = connection.admitted  # type: ignore[attr-defined]
         policy = self._admission.policy
         if len(self.viewers) >= policy.viewers:  # others came during its handshake
@@ -158,10 +160,21 @@ class Front:
 
 
 class _Guarded(ServerConnection):
-    """A connection that is closed before it costs anything, if the admission says so."""
+    """A connection that is closed before it costs anything, if the admission says so.
+
+    It sends without a task where the socket takes it: each turn of the event loop less is a tenth of the latency.
+    """
 
     owner: Front
     _counted = False
+
+    def send_now(self, message: bytes) -> bool:
+        """Send a binary message without waiting; False if it would have to wait, or the connection ends."""
+        if self.protocol.state is not State.OPEN or self.transport.get_write_buffer_size():
+            return False
+        self.protocol.send_binary(message)
+        self.transport.write(b"".join(self.protocol.data_to_send()))
+        return True
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer: Any = transport.get_extra_info("peername")

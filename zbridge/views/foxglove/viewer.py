@@ -48,6 +48,9 @@ class Connection(Protocol):
     def __aiter__(self) -> AsyncIterator[str | bytes]:
         """Give what the viewer says, until it is gone."""
 
+    def send_now(self, message: bytes) -> bool:
+        """Send a message without waiting; False if it would have to wait."""
+
     async def send(self, message: str | bytes) -> None:
         """Send a message; wait until there is room for the next."""
 
@@ -110,9 +113,10 @@ class Viewer:
         self._filled.set()
 
     def show(self, subscription: int, message: bytes) -> None:
-        """Send a message of a channel; the newest wins where the viewer is slow."""
-        self._outbox.show(subscription, message)
-        self._filled.set()
+        """Send a message of a channel: at once where nothing waits, else the newest wins."""
+        if self._outbox or not self._connection.send_now(message):
+            self._outbox.show(subscription, message)
+            self._filled.set()
 
     def ended(self, subscription: int) -> None:
         """Forget a subscription: its channel is withdrawn."""
@@ -143,8 +147,8 @@ class Viewer:
             self._sending_since = math.inf
 
     async def _watch_writing(self) -> None:
-        """Raise TimeoutError when the viewer takes nothing; a timer for each message would cost more than the message."""
-        while self._clock() - self._sending_since < SEND_S:
+        """Raise TimeoutError when the viewer takes nothing; a timer for each message would cost more than it."""
+        for _ in iter(lambda: self._clock() - self._sending_since < SEND_S, False):
             await asyncio.sleep(SEND_S / 4)
         raise TimeoutError
 

@@ -59,6 +59,7 @@ def main(modules: Path, pictures: Path) -> None:
             played(opened, player.port, pictures)
         with contextlib.closing(page(f"ds=remote-file&ds.url={PAGE}/recording.mcap")) as opened:
             opened.wait_for_timeout(LOAD_S * 1000)
+            tidy(opened)
             opened.screenshot(path=pictures / "file.png", timeout=_WAIT_MS)
 
 
@@ -67,22 +68,33 @@ def live(page: Page, bench: Bench, pictures: Path) -> None:
     stop = page.get_by_role("button", name="STOP")
     stop.wait_for(timeout=_WAIT_MS)
     page.wait_for_timeout(LOAD_S * 1000)
+    tidy(page)
     page.screenshot(path=pictures / "live.png", timeout=_WAIT_MS)
     began = at(bench)
     x, y = teleop(page)
     page.mouse.move(x, y)
     page.mouse.down()
-    until(lambda: (bench.fleet.last("r1/control").get("holder") or "").startswith("foxglove."), 20, what="a lease")
+    holder = until(lambda: bench.fleet.last("r1/control").get("holder"), 20, what="a lease")
+    assert holder.startswith("foxglove."), holder
     page.wait_for_timeout(DRIVE_S * 1000)
     page.screenshot(path=pictures / "driven.png", timeout=_WAIT_MS)
     moved_m = math.dist(at(bench), began)
-    print(f"driven {moved_m:.2f} m by Teleop, held by {bench.fleet.last('r1/control')['holder']}")
+    print(f"driven {moved_m:.2f} m by Teleop, held by {holder}")
     assert moved_m > 0.05
     page.mouse.up()
     until(lambda: bench.fleet.last("r1/control").get("holder") is None, 20, what="a free robot")
     stop.click()
     until(lambda: bench.fleet.last("r1/control").get("state") == "stopped", 20, what="a stopped robot")
     print("stopped by the STOP button")
+
+
+def tidy(page: Page) -> None:
+    """Close the list of topics, and the hint that covers a part of the picture."""
+    page.mouse.click(25, 25)
+    hint = page.get_by_text("Open settings to configure")
+    if hint.count():
+        hint.locator("xpath=following::button[1]").click(timeout=_WAIT_MS)
+    page.wait_for_timeout(1000)
 
 
 def teleop(page: Page) -> tuple[float, float]:
@@ -97,6 +109,7 @@ def teleop(page: Page) -> tuple[float, float]:
 def played(page: Page, port: int, pictures: Path) -> None:
     """Look at a recording that our server plays; another program presses its buttons."""
     page.wait_for_timeout(LOAD_S * 1000)
+    tidy(page)
     with viewing(port) as control:
         control.play(speed=2.0)
         page.wait_for_timeout(6000)

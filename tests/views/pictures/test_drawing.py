@@ -84,7 +84,7 @@ def test_a_map_is_a_grid_of_colours_with_its_first_cell_at_the_origin() -> None:
     message = Map(rows=2, columns=3, cell=0.05, origin=(-1.0, -2.0), cells=cells)
     fields = read(foxglove_schema("Grid"), drawing.grid(message, "r1/map", STAMP_NS))
     assert (fields["frame_id"], fields["timestamp"]) == ("r1/map", STAMP)
-    assert fields["pose"]["position"] == {"x": -1.0, "y": -2.0, "z": 0.0}
+    assert fields["pose"]["position"] == {"x": -1.0, "y": -2.0, "z": -0.02}
     assert (fields["column_count"], fields["row_stride"], fields["cell_stride"]) == (3, 12, 4)
     assert fields["cell_size"] == {"x": 0.05, "y": 0.05}
     assert [(field["name"], field["offset"], field["type"]) for field in fields["fields"]] == [

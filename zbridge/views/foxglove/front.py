@@ -7,6 +7,7 @@ import contextlib
 import http
 import logging
 import ssl
+from collections import Counter
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -55,6 +56,7 @@ class Front:
         self.viewers: set[Viewer] = set()
         self.open = 0
         """Connections, those in their handshake too."""
+        self.refused: Counter[str] = Counter()
         self._source = source
         self._admission = Admission(policy)
         self._metrics = metrics
@@ -102,10 +104,15 @@ class Front:
         finally:
             server.close()
             await server.wait_closed()
+            if self.refused:
+                refused = ", ".join(f"{reason} {count}" for reason, count in sorted(self.refused.items()))
+                log.info("connections refused: %s", refused)
 
-    def turn_away(self, reason: str) -> None:
-        """Count a connection that is refused."""
+    def turn_away(self, reason: str, host: str, what: str = "") -> None:
+        """Count a connection that is refused. what: of it people need to know, from the peer."""
         self._metrics.count("foxglove_refused", reason=reason).value += 1
+        self.refused[reason] += 1
+        log.debug("%s turned away: %s %s", host, reason, shown(what))
 
     def early_refusal(self, host: str) -> str | None:
         """Return why a connection is closed at once."""
@@ -120,12 +127,12 @@ class Front:
             asked = Request(request.path, request.headers.get_all("Origin"), offered)
             decision = self._admission.admit(asked, _host(connection), len(self.viewers))
         except (InvalidHeader, ValueError):
-            self.turn_away("malformed")
+            self.turn_away("malformed", _host(connection))
             return connection.respond(http.HTTPStatus.BAD_REQUEST, "malformed\n")
         if isinstance(decision, Admitted):
             connection.admitted = decision  # type: ignore[attr-defined]
             return None
-        self.turn_away(decision.reason)
+        self.turn_away(decision.reason, _host(connection), " ".join(asked.origins))
         return connection.respond(decision.status, decision.text + "\n")
 
     async def _serve(self, connection: ServerConnection) -> None:
@@ -133,7 +140,7 @@ class Front:
         admitted: Admitted = connection.admitted  # type: ignore[attr-defined]
         policy = self._admission.policy
         if len(self.viewers) >= policy.viewers:  # others came during its handshake
-            self.turn_away("full")
+            self.turn_away("full", _host(connection))
             return
         self._numbers += 1
         name = f"{policy.who}.{admitted.label}.{self._numbers}"
@@ -178,9 +185,10 @@ class _Guarded(ServerConnection):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         peer: Any = transport.get_extra_info("peername")
-        refused = self.owner.early_refusal(str(peer[0]) if peer else "")
+        host = str(peer[0]) if peer else ""
+        refused = self.owner.early_refusal(host)
         if refused is not None:
-            self.owner.turn_away(refused)
+            self.owner.turn_away(refused, host)
             transport.abort()  # type: ignore[attr-defined]
             return
         self._counted = True

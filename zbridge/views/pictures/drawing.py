@@ -43,6 +43,8 @@ _NO_TURN = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 _HERE = fox.Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=_NO_TURN)
 _TRAIL_COLOR = Color(r=0.2, g=0.6, b=1.0, a=0.9)
 _TRAIL_M = 0.03
+_MAP_Z_M = -0.02
+"""A map lies below what is drawn on it: viewers show one of two things in the same plane by chance."""
 _CELL_COLORS = np.array([(127, 127, 127, 64), (240, 240, 240, 255), (20, 20, 20, 255), (255, 0, 255, 255)], np.uint8)
 """Red, green, blue, alpha of an unknown, a free and an occupied cell, and of one with another value."""
 _UINT8 = PackedElementFieldNumericType.Uint8
@@ -88,7 +90,7 @@ def grid(map_: Map, frame: str, stamp_ns: int) -> bytes:
     return Grid(
         timestamp=_time(stamp_ns),
         frame_id=frame,
-        pose=fox.Pose(position=Vector3(x=x, y=y, z=0.0), orientation=_NO_TURN),
+        pose=fox.Pose(position=Vector3(x=x, y=y, z=_MAP_Z_M), orientation=_NO_TURN),
         column_count=map_.columns,
         cell_size=Vector2(x=map_.cell, y=map_.cell),
         row_stride=map_.columns * len(_CELL_FIELDS),

@@ -54,11 +54,11 @@ def main(modules: Path, pictures: Path) -> None:
         server = Server(bench, "--connect", bench.endpoint, "--drive", "--origin", PAGE)
         with contextlib.closing(page(f"ds=foxglove-websocket&ds.url=ws://localhost:{server.port}")) as opened:
             live(opened, bench, pictures)
-        player = Server(bench, str(recording))
+        player = Server(bench, str(recording), "--origin", PAGE)
         with contextlib.closing(page(f"ds=foxglove-websocket&ds.url=ws://localhost:{player.port}")) as opened:
             played(opened, player.port, pictures)
         with contextlib.closing(page(f"ds=remote-file&ds.url={PAGE}/recording.mcap")) as opened:
-            opened.wait_for_timeout(LOAD_S * 1000)
+            opened.wait_for_timeout(2 * LOAD_S * 1000)
             tidy(opened)
             opened.screenshot(path=pictures / "file.png", timeout=_WAIT_MS)
 

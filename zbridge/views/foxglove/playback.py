@@ -104,8 +104,8 @@ class Playback(Source):
             if self._look_back:
                 await self._show_last()
                 continue
-            if self._from_ns is not None:
-                entries, ahead, self._from_ns = self._recording.messages(self._from_ns), [], None
+            if self._from_ns is not None:  # what was recorded at this very time was shown as the last before it
+                entries, ahead, self._from_ns = self._recording.messages(self._from_ns + 1), [], None
             if not ahead:
                 ahead = await self._read(entries)
                 if self._from_ns is not None:  # a seek came meanwhile

@@ -177,6 +177,11 @@ def test_switches_are_parameters_that_follow_the_robot(bench: Bench, server: Ser
         until(lambda: (holder(bench) or "").startswith("foxglove."), what="a lease that is held for the mode")
         viewer.call("/r1/mode", 2, mode="none")
         stays_free(bench)
+        viewer.call("/r1/mode", 3, mode="manual")
+        viewer.until(lambda: viewer.answers.get(3) == b'{"ok":true}', "the mode again")
+        viewer.socket.socket.shutdown(socket.SHUT_RDWR)  # gone, without a word: what it held for the mode is released
+        stays_free(bench)
+        other.until(lambda: values(other)["r1.mode"] == "none", "the end of the mode")
 
 
 def test_foreign_origins_and_missing_tokens_are_turned_away(bench: Bench) -> None:

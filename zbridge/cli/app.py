@@ -256,6 +256,54 @@ def router(
 
 
 @app.command()
+def foxglove(
+    file: Annotated[
+        Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
+    ] = None,
+    listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
+    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
+    drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
+    token: Annotated[Path | None, typer.Option(help="file with the token that viewers must give (?token=)")] = None,
+    origin: Annotated[list[str], typer.Option(help="Origin of another web page that may connect; once for each")] = [],
+    allow: Annotated[list[str], typer.Option(help="network that viewers may connect from; once for each")] = [],
+    tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="its key (PEM)")] = None,
+    insecure: Annotated[bool, typer.Option("--insecure", help="serve other machines without TLS")] = False,
+    speed_full_mps: Annotated[
+        list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
+    ] = [],
+    turn_full_radps: Annotated[
+        list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
+    ] = [],
+    who: Annotated[str, typer.Option(help="what drivers are called first; access rules know them by it")] = "foxglove",
+    viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
+    connect: Connect = [],
+    realm: Realm = "fleet",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
+) -> None:
+    """Serve robots live, or a recording, to Foxglove until SIGTERM or SIGINT."""
+    from zbridge.cli.foxglove import run_foxglove
+
+    set_up_log(verbose=verbose)
+    given: dict[str, object] = {
+        "listen": listen,
+        "robots": robot,
+        "drive": drive,
+        "token": token,
+        "origins": origin,
+        "allow": allow,
+        "tls_certificate": tls_certificate,
+        "tls_key": tls_key,
+        "insecure": insecure,
+        "speed_full_mps": speed_full_mps,
+        "turn_full_radps": turn_full_radps,
+        "who": who,
+        "viewers": viewers,
+    }
+    run_foxglove(bus_settings(connect), realm, file, given)
+
+
+@app.command()
 def ls(
     connect: Connect = [],
     tls: TlsFolder = None,

@@ -1,0 +1,106 @@
+"""Decides which connections become viewers, and which viewers may drive. Sans-IO.
+
+A web page of anybody that is open in an operator's browser can connect to loopback; its Origin tells, and a browser
+does not let it lie. A program can send any Origin, or none: only the token tells programs apart.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+from collections.abc import Sequence
+from http import HTTPStatus
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+
+from zbridge.fleet.topics import escape
+from zbridge.hq.admission import Arrivals
+from zbridge.hq.settings import Network
+from zbridge.views.foxglove.replies import SUBPROTOCOL
+
+FOXGLOVE_ORIGINS = ("https://app.foxglove.dev",)
+"""The Origin of Foxglove's own page. Native programs send none."""
+ACCEPT_HZ = 20.0
+"""Connections a second that are accepted from one address."""
+LABEL = 24
+"""Characters that are kept of what a viewer calls itself."""
+
+
+class Policy(msgspec.Struct, frozen=True):
+    """Who may connect, and who may drive.
+
+    networks: empty for all. token: needed by everybody, None: by nobody. drive: whether anybody may drive at all.
+    who: what drivers are called first; access rules know them by it.
+    """
+
+    origins: tuple[str, ...] = FOXGLOVE_ORIGINS
+    networks: tuple[Network, ...] = ()
+    token: str | None = None
+    drive: bool = False
+    viewers: int = 32
+    who: str = "foxglove"
+
+
+class Request(msgspec.Struct, frozen=True):
+    """The opening handshake of a connection. origins, subprotocols: of all headers of that name."""
+
+    path: str
+    origins: Sequence[str]
+    subprotocols: Sequence[str]
+
+
+class Turned(msgspec.Struct, frozen=True):
+    """A connection that is turned away. reason: one word, for counters; text: for people."""
+
+    status: HTTPStatus
+    reason: str
+    text: str
+
+
+class Admitted(msgspec.Struct, frozen=True):
+    """A connection that becomes a viewer. label: what it calls itself, or its address."""
+
+    label: str
+    may_drive: bool
+
+
+class Admission:
+    """Admits connections as the policy says."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self._arrivals = Arrivals(ACCEPT_HZ)
+
+    def __repr__(self) -> str:
+        return f"<Admission {self._arrivals!r}>"
+
+    def refusal(self, host: str, connections: int, now: float) -> str | None:
+        """Return why a connection is closed before it says anything, as one word; None if it may go on."""
+        if self.policy.networks and not self._is_near(host):
+            return "network"
+        if not self._arrivals.admit(host, now):
+            return "arrivals"
+        return "full" if connections >= 2 * self.policy.viewers else None
+
+    def admit(self, request: Request, host: str, viewers: int) -> Admitted | Turned:
+        """Decide about an opening handshake."""
+        if any(origin not in self.policy.origins for origin in request.origins):
+            return Turned(HTTPStatus.FORBIDDEN, "origin", "this Origin is not allowed")
+        query = parse_qs(urlsplit(request.path).query, max_num_fields=16)
+        if self.policy.token is not None:
+            given = query.get("token", [""])[0]
+            if not hmac.compare_digest(given.encode(), self.policy.token.encode()):
+                return Turned(HTTPStatus.UNAUTHORIZED, "token", "the token is missing or wrong")
+        if viewers >= self.policy.viewers:
+            return Turned(HTTPStatus.SERVICE_UNAVAILABLE, "full", "as many viewers as there can be")
+        if SUBPROTOCOL not in request.subprotocols:
+            return Turned(HTTPStatus.BAD_REQUEST, "subprotocol", f"expected the subprotocol {SUBPROTOCOL}")
+        trusted = self.policy.token is not None or bool(request.origins)
+        name = escape(query.get("name", [""])[0] or host)[:LABEL]
+        return Admitted(name, self.policy.drive and trusted)
+
+    def _is_near(self, host: str) -> bool:
+        address = ipaddress.ip_address(host.partition("%")[0])
+        address = getattr(address, "ipv4_mapped", None) or address
+        return any(address in network for network in self.policy.networks)

@@ -1,0 +1,251 @@
+"""What viewers may tell robots: topics they publish on, services they call, parameters they set.
+
+| topic | service | parameter | does |
+|---|---|---|---|
+| `/r1/cmd_vel` (`geometry_msgs/Twist`) | | | drives, through the lease |
+| `/r1/stop` (any message) | `/r1/stop`, `/stop` | `r1.stop` = true | stops the robot, or all; open to every viewer |
+| | `/r1/light`, `/r1/lidar`, `/r1/camera` `{"on": true}` | `r1.light`, `r1.lidar`, `r1.camera` | switches |
+| | `/r1/mode` `{"mode": "manual"}` | `r1.mode` | who moves the robot: holds the lease until it is ``none`` |
+
+All but stops need a viewer that may drive.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from zbridge.client import Fleet
+from zbridge.errors import Held, Malformed, Unsupported, ZbridgeError
+from zbridge.fleet.topics import is_name
+from zbridge.views.foxglove import replies
+from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.pilot import Pilot
+from zbridge.views.foxglove.replies import Service
+from zbridge.views.foxglove.requests import ClientChannel
+from zbridge.views.foxglove.source import Person
+from zbridge.views.foxglove.twist import Scales, read_twist
+
+CMD_VEL, STOP = "cmd_vel", "stop"
+_TWISTS = ("geometry_msgs/Twist", "geometry_msgs/msg/Twist")
+_SWITCHES = ("light", "lidar", "camera")
+_MODES = ("none", "manual", "autonomous")
+_UNTOUCHED: Mapping[str, Any] = {"light": False, "lidar": False, "camera": False, "mode": "none", STOP: False}
+"""A robot's parameters before anything is known of them."""
+
+
+class Commands:
+    """Carries out what viewers tell the robots of a fleet. who: what drivers are called first."""
+
+    def __init__(self, hub: Hub, fleet: Fleet, scales: Scales, who: str) -> None:
+        self._hub = hub
+        self._fleet = fleet
+        self._scales = scales
+        self._who = who
+        self._pilots: dict[tuple[Person, str], Pilot] = {}
+        self._robots: dict[str, dict[str, Any]] = {}
+        """The parameters of each robot."""
+        self._services: dict[int, tuple[str, str, Service]] = {}
+        """Robot, what is called, and the service."""
+        self._ids = itertools.count(1)
+        self._stops: dict[str, asyncio.Task[None]] = {}
+        self._stop_again: set[str] = set()
+        self._releases: set[asyncio.Task[None]] = set()
+        self._add("", STOP)
+
+    def __repr__(self) -> str:
+        return f"<Commands of {len(self._robots)} robots, {len(self._pilots)} pilots>"
+
+    async def close(self) -> None:
+        """Release all robots; stops that are on their way arrive."""
+        pilots = [pilot.end() for pilot in self._pilots.values()]
+        await asyncio.gather(*pilots, *self._stops.values(), *self._releases, return_exceptions=True)
+        self._pilots.clear()
+
+    # Robots come and go
+
+    def robot_came(self, robot: str) -> None:
+        """Offer the services and parameters of a robot."""
+        self._robots[robot] = dict(_UNTOUCHED)
+        services = [self._add(robot, what) for what in (STOP, *_SWITCHES, "mode")]
+        self._hub.say(replies.advertise_services(services))
+        self._hub.parameters_changed({f"{robot}.{name}": value for name, value in self._robots[robot].items()})
+
+    def robot_left(self, robot: str) -> None:
+        """Withdraw the services of a robot."""
+        self._robots.pop(robot, None)
+        gone = [number for number, (owner, _, _) in self._services.items() if owner == robot]
+        for number in gone:
+            del self._services[number]
+        self._hub.say(replies.unadvertise_services(gone))
+
+    def noted(self, robot: str, name: str, value: Any) -> None:
+        """Take note of a parameter's value."""
+        if robot in self._robots and self._robots[robot].get(name) != value:
+            self._robots[robot][name] = value
+            self._hub.parameters_changed({f"{robot}.{name}": value})
+
+    def _add(self, robot: str, what: str) -> Service:
+        number = next(self._ids)
+        name = f"/{robot}/{what}" if robot else f"/{what}"
+        service = Service(number, name, f"zbridge/{what.capitalize()}", _ASKED[what], _ANSWERED)
+        self._services[number] = (robot, what, service)
+        return service
+
+    # Topics
+
+    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
+        """Drive or stop a robot; raise Refused for any other channel."""
+        robot, what = self._aim(channel)
+        if what == STOP:
+            self._stop_soon(viewer, robot)
+            return
+        if channel.schema_name not in _TWISTS:
+            raise Unsupported(f"{channel.topic}: schema {channel.schema_name!r:.80}: expected {_TWISTS[0]!r}")
+        self._may(viewer)
+        self._pilot(viewer, robot).drive(read_twist(payload, self._scales.of(robot)))
+
+    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
+        """Release the robot that was driven on a channel."""
+        robot, _, what = channel.topic.strip("/").partition("/")
+        pilot = self._pilots.pop((viewer, robot), None) if what == CMD_VEL else None
+        if pilot is not None:
+            task = asyncio.get_running_loop().create_task(pilot.end())
+            self._releases.add(task)
+            task.add_done_callback(self._releases.discard)
+
+    def _aim(self, channel: ClientChannel) -> tuple[str, str]:
+        """Return the robot and what is published for it; raise Refused for anything else."""
+        robot, _, what = channel.topic.strip("/").partition("/")
+        if what not in (CMD_VEL, STOP) or not is_name(robot):
+            raise Unsupported(f"{channel.topic}: expected /<robot>/{CMD_VEL} or /<robot>/{STOP}")
+        if channel.encoding != "json":
+            raise Unsupported(f"{channel.topic}: encoding {channel.encoding!r}: expected 'json'")
+        self._known(robot)
+        return robot, what
+
+    def _pilot(self, viewer: Person, robot: str) -> Pilot:
+        pilot = self._pilots.get((viewer, robot))
+        if pilot is None:
+
+            def mode_ended(mode: str) -> None:
+                self.noted(robot, "mode", mode)
+
+            pilot = Pilot(self._fleet[robot], viewer.name, self._who, viewer.warn, mode_ended)
+            self._pilots[viewer, robot] = pilot
+        return pilot
+
+    def _stop_soon(self, viewer: Person, robot: str) -> None:
+        """Stop a robot on a task. One runs for each robot; a stop that comes meanwhile makes it stop once more."""
+        self._stopped([robot])
+        if robot in self._stops:
+            self._stop_again.add(robot)
+        else:
+            self._stops[robot] = asyncio.get_running_loop().create_task(self._stop_and_tell(viewer, robot))
+
+    async def _stop_and_tell(self, viewer: Person, robot: str) -> None:
+        try:
+            await self._stop([robot])
+            while robot in self._stop_again:
+                self._stop_again.discard(robot)
+                await self._stop([robot])
+        except ZbridgeError as error:
+            viewer.warn(str(error))
+        finally:
+            self._stop_again.discard(robot)
+            del self._stops[robot]
+
+    def _stopped(self, robots: list[str]) -> None:
+        for (_, robot), pilot in self._pilots.items():
+            if robot in robots:
+                pilot.stopped()
+
+    async def _stop(self, robots: list[str]) -> None:
+        """Stop robots; raise Refused or BusError for the first that was not confirmed."""
+        self._stopped(robots)
+        for error in (await self._fleet.stop(robots)).values():
+            if error is not None:
+                raise error
+
+    # Services and parameters
+
+    def services(self) -> list[Service]:
+        """Return the services there are."""
+        return [service for _, _, service in self._services.values()]
+
+    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
+        """Carry out a call; raise Refused or BusError."""
+        if service_id not in self._services:
+            raise Unsupported(f"there is no service {service_id}")
+        robot, what, service = self._services[service_id]
+        try:
+            asked = msgspec.json.decode(payload or b"{}", type=dict[str, Any])
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            raise Malformed(f"{service.name}: {error}") from error
+        if not robot:
+            await self._stop(sorted(self._robots))
+        else:
+            await self._carry_out(viewer, robot, what, asked.get("mode" if what == "mode" else "on"))
+        return b'{"ok":true}'
+
+    def parameters(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """Return the parameters of these names, or all."""
+        known = {f"{robot}.{name}": value for robot, values in self._robots.items() for name, value in values.items()}
+        return {name: known[name] for name in names if name in known} if names else known
+
+    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
+        """Send the command that a parameter stands for; raise Refused or BusError."""
+        robot, _, what = name.rpartition(".")
+        if what not in _UNTOUCHED:
+            raise Unsupported(f"{name}: there is no such parameter")
+        self._known(robot)
+        if what != STOP or value is True:
+            await self._carry_out(viewer, robot, what, value)
+
+    async def _carry_out(self, viewer: Person, robot: str, what: str, value: Any) -> None:
+        if what == STOP:
+            await self._stop([robot])
+            return
+        self._may(viewer)
+        expected = _MODES if what == "mode" else (True, False)
+        if not isinstance(value, bool | str) or value not in expected:
+            raise Malformed(f"{what} = {value!r:.40}: expected one of {', '.join(map(repr, expected))}")
+        if what == "mode":
+            await self._set_mode(viewer, robot, str(value))
+        else:
+            target = self._fleet[robot]
+            switch = {"light": target.set_light, "lidar": target.set_lidar, "camera": target.set_camera}[what]
+            await switch(value is True)
+        self.noted(robot, what, value)  # what the robot then tells of it wins
+
+    async def _set_mode(self, viewer: Person, robot: str, mode: str) -> None:
+        for (other, held), pilot in self._pilots.items():
+            if held == robot and other is not viewer and pilot.at_work:
+                raise Held(f"{robot} is driven by {other.name}", holder=other.name)
+        await self._pilot(viewer, robot).set_mode(mode)
+
+    async def left(self, viewer: Person) -> None:
+        """Release all robots of a viewer that is gone."""
+        gone = [key for key in self._pilots if key[0] is viewer]
+        await asyncio.gather(*(self._pilots.pop(key).end() for key in gone))
+
+    def _known(self, robot: str) -> None:
+        if robot not in self._robots:
+            raise Unsupported(f"there is no robot {robot!r:.40}")
+
+    def _may(self, viewer: Person) -> None:
+        if not viewer.may_drive:
+            raise Unsupported("you may look and stop, not drive: that needs --drive, and a token or a listed Origin")
+
+
+_SWITCH = {"type": "object", "properties": {"on": {"type": "boolean"}}}
+_ASKED: Mapping[str, Mapping[str, Any]] = {
+    STOP: {"type": "object", "properties": {}},
+    "mode": {"type": "object", "properties": {"mode": {"type": "string", "enum": list(_MODES)}}},
+    **dict.fromkeys(_SWITCHES, _SWITCH),
+}
+_ANSWERED = {"type": "object", "properties": {"ok": {"type": "boolean"}}}

@@ -1,0 +1,160 @@
+"""The channels that viewers are offered, and who subscribed to which. Sans-IO.
+
+Work on demand: the source is told when the first viewer subscribes to a channel and when the last one leaves it, and
+publishes what is wanted only. The last message of a channel that keeps it is shown to whoever subscribes later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Protocol
+
+import msgspec
+
+from zbridge.views.foxglove import replies
+from zbridge.views.pictures import Channel
+
+CHANNELS = 8192
+"""Most channels at a time."""
+
+
+class Receiver(Protocol):
+    """A viewer, as the hub needs it."""
+
+    def say(self, message: str | bytes) -> None:
+        """Send an answer or news."""
+
+    def show(self, subscription: int, message: bytes) -> None:
+        """Send a message of a channel."""
+
+    def ended(self, subscription: int) -> None:
+        """Forget a subscription: its channel is withdrawn."""
+
+    def parameters_changed(self, values: Mapping[str, Any]) -> None:
+        """Tell parameters, where the viewer watches them."""
+
+
+class _Offer:
+    def __init__(self, channel_id: int, channel: Channel) -> None:
+        self.id = channel_id
+        self.channel = channel
+        self.entry: msgspec.Raw = replies.channel_entry(channel_id, channel)
+        self.wanted_by: dict[Receiver, int] = {}
+        self.last: tuple[int, bytes] | None = None
+
+
+class Hub:
+    """Knows channels and viewers.
+
+    on_wanted: called with a channel when its first viewer comes (True) or its last one goes (False). on_subscribed:
+    called with a channel when a viewer subscribes to one that others had subscribed to already.
+    """
+
+    def __init__(self) -> None:
+        self.on_wanted: Callable[[Channel, bool], None] = lambda channel, wanted: None
+        self.on_subscribed: Callable[[Channel, Receiver, int], None] = lambda channel, viewer, subscription: None
+        self.viewers: set[Receiver] = set()
+        self._offers: dict[int, _Offer] = {}
+        self._by_topic: dict[str, _Offer] = {}
+        self._next_id = 1
+
+    def __repr__(self) -> str:
+        return f"<Hub of {len(self._offers)} channels, {len(self.viewers)} viewers>"
+
+    # The source's side
+
+    def offer(self, channels: Iterable[Channel]) -> int:
+        """Offer channels to all viewers; those that are offered already are left. Return how many had no place."""
+        new, left_out = [], 0
+        for channel in channels:
+            if channel.topic in self._by_topic:
+                continue
+            if len(self._offers) >= CHANNELS:
+                left_out += 1
+                continue
+            offer = _Offer(self._next_id, channel)
+            self._next_id += 1
+            self._offers[offer.id] = self._by_topic[channel.topic] = offer
+            new.append(offer.entry)
+        if new:
+            self._tell(replies.advertise(new))
+        return left_out
+
+    def withdraw(self, topics: Iterable[str]) -> None:
+        """Withdraw channels; their subscriptions end."""
+        gone = [offer for topic in topics if (offer := self._by_topic.pop(topic, None)) is not None]
+        for offer in gone:
+            del self._offers[offer.id]
+            for viewer, subscription in offer.wanted_by.items():
+                viewer.ended(subscription)
+            if offer.wanted_by:
+                self.on_wanted(offer.channel, False)
+        if gone:
+            self._tell(replies.unadvertise([offer.id for offer in gone]))
+
+    def publish(self, topic: str, stamp_ns: int, payload: bytes) -> None:
+        """Show a message to the viewers of a channel."""
+        offer = self._by_topic.get(topic)
+        if offer is None:
+            return
+        if offer.channel.keeps_last and offer.wanted_by:
+            offer.last = (stamp_ns, payload)
+        for viewer, subscription in offer.wanted_by.items():
+            viewer.show(subscription, replies.message_data(subscription, stamp_ns, payload))
+
+    def say(self, message: str | bytes) -> None:
+        """Tell all viewers."""
+        self._tell(message)
+
+    def parameters_changed(self, values: Mapping[str, Any]) -> None:
+        """Tell the viewers that watch these parameters."""
+        for viewer in self.viewers:
+            viewer.parameters_changed(values)
+
+    def wanted(self) -> list[Channel]:
+        """Return the channels that viewers subscribed to."""
+        return [offer.channel for offer in self._offers.values() if offer.wanted_by]
+
+    # The viewers' side
+
+    def join(self, viewer: Receiver) -> None:
+        """Show a viewer the channels there are."""
+        self.viewers.add(viewer)
+        if self._offers:
+            viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
+
+    def leave(self, viewer: Receiver) -> None:
+        """End a viewer's subscriptions; idempotent."""
+        self.viewers.discard(viewer)
+        for offer in list(self._offers.values()):
+            self._leave(viewer, offer)
+
+    def subscribe(self, viewer: Receiver, subscription: int, channel_id: int) -> bool:
+        """Subscribe a viewer to a channel it is not subscribed to; False for an unknown channel."""
+        offer = self._offers.get(channel_id)
+        if offer is None:
+            return False
+        first = not offer.wanted_by
+        offer.wanted_by[viewer] = subscription
+        if first:
+            self.on_wanted(offer.channel, True)
+        else:
+            if offer.last is not None:
+                viewer.show(subscription, replies.message_data(subscription, *offer.last))
+            self.on_subscribed(offer.channel, viewer, subscription)
+        return True
+
+    def unsubscribe(self, viewer: Receiver, channel_id: int) -> None:
+        """End one subscription of a viewer."""
+        offer = self._offers.get(channel_id)
+        if offer is not None:
+            self._leave(viewer, offer)
+
+    def _leave(self, viewer: Receiver, offer: _Offer) -> None:
+        if offer.wanted_by.pop(viewer, None) is not None and not offer.wanted_by:
+            offer.last = None  # nothing renews it any more
+            self.on_wanted(offer.channel, False)
+
+    def _tell(self, message: str | bytes) -> None:
+        for viewer in self.viewers:
+            viewer.say(message)

@@ -1,0 +1,264 @@
+"""The robots of the bus, live: offers their channels, and subscribes on the bus to what viewers subscribed to.
+
+A robot's channels are there while its gateway is. The readings of sensors that nobody announced are found while
+somebody looks at the channel ``/<robot>/sensors``, which shows all of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from zbridge.bus import Bus, Handle, Sample
+from zbridge.errors import BusError, PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Devices, FleetMessage, Reading, Switch
+from zbridge.fleet.topics import KeySpace, Topic, is_name, split_key, unescape
+from zbridge.metrics import Metrics
+from zbridge.views.foxglove.commands import Commands
+from zbridge.views.foxglove.hub import Hub
+from zbridge.views.foxglove.replies import Service
+from zbridge.views.foxglove.requests import ClientChannel
+from zbridge.views.foxglove.source import Person, Source
+from zbridge.views.pictures import Channel, RobotPictures, Schema, channels_of, json_schema, sources_of
+
+ROBOTS = 256
+"""Most robots that are shown at a time."""
+SENSORS = 1024
+"""Most sensors of one robot that have a channel."""
+_SENSORS = "sensors"
+_ALL_SENSORS = "sensor/*"
+_OFFERED = tuple(
+    topic.path
+    for topic in vars(topics).values()
+    if isinstance(topic, Topic) and topic.delivery in (topics.Delivery.STREAM, topics.Delivery.STATE)
+)
+"""The paths that every robot may have."""
+
+_SWITCHES = (topics.LIDAR, topics.CAMERA)
+"""What robots tell of their parameters."""
+_ASK_S = 0.3
+
+
+class NamedReading(Reading, frozen=True):
+    """A reading, and the name of its sensor."""
+
+    sensor: str = ""
+
+
+_encode = msgspec.json.Encoder().encode
+
+
+class _Shown:
+    """One robot that is shown: its pictures, and what is subscribed to on the bus for it."""
+
+    def __init__(self, keys: KeySpace) -> None:
+        self.keys = keys
+        self.pictures = RobotPictures(keys.robot)
+        self.offered: dict[str, Channel] = {}
+        self.wanted: set[str] = set()
+        """Paths of the channels that somebody subscribed to."""
+        self.handles: dict[str, Handle] = {}
+        """By path or expression on the bus."""
+        self.sensors = 0
+
+
+class Live(Source):
+    """Shows the robots of a realm. robots: names of those that are shown, empty for all."""
+
+    def __init__(
+        self, hub: Hub, bus: Bus, realm: str, robots: frozenset[str], commands: Commands, metrics: Metrics
+    ) -> None:
+        super().__init__(hub)
+        self.capabilities = ("clientPublish", "services", "parameters", "parametersSubscribe")
+        self._bus = bus
+        self._realm = realm
+        self._robots = robots
+        self._commands = commands
+        self._shown: dict[str, _Shown] = {}
+        self._handles: list[Handle] = []
+        self._watching: list[Handle] = []
+        self._watchers = 0
+        self._malformed = metrics.count("foxglove_malformed")
+        self._left_out = metrics.count("foxglove_channels_left_out")
+        hub.on_wanted = self._on_wanted
+
+    def __repr__(self) -> str:
+        return f"<Live {self._realm}, {len(self._shown)} robots>"
+
+    def start(self) -> None:
+        """Begin to watch for robots."""
+        self._handles = [
+            self._bus.watch_alive(f"{self._realm}/*/@alive/gateway", self._on_gateway),
+            self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
+        ]
+
+    async def close(self) -> None:
+        """End all that is held and declared; idempotent."""
+        handles, self._handles, self._watching = [*self._handles, *self._watching], [], []
+        for handle in handles:
+            handle.close()
+        for name in list(self._shown):
+            self._hide(name)
+        await self._commands.close()
+
+    # Robots come and go
+
+    def _on_gateway(self, key: str, alive: bool) -> None:
+        split = split_key(key)
+        if split is None or not is_name(name := split[1]) or (self._robots and name not in self._robots):
+            return
+        if alive and name not in self._shown:
+            if len(self._shown) >= ROBOTS:
+                self._left_out.value += 1
+                return
+            self._show(name)
+        elif not alive and name in self._shown:
+            self._hide(name)
+
+    def _show(self, name: str) -> None:
+        self._shown[name] = shown = _Shown(KeySpace(self._realm, name))
+        channels = {channel.path: channel for path in _OFFERED for channel in channels_of(name, path)}
+        channels[_SENSORS] = Channel(f"/{name}/{_SENSORS}", _SENSORS, _sensors_schema())
+        self._offer(shown, channels.values())
+        self._commands.robot_came(name)
+
+    def _hide(self, name: str) -> None:
+        shown = self._shown[name]
+        self._commands.robot_left(name)
+        self.hub.withdraw([channel.topic for channel in shown.offered.values()])
+        del self._shown[name]
+        for handle in shown.handles.values():
+            handle.close()
+
+    def _offer(self, shown: _Shown, channels: Any) -> None:
+        new = [channel for channel in channels if channel.path not in shown.offered]
+        shown.offered.update((channel.path, channel) for channel in new)
+        self._left_out.value += self.hub.offer(new)
+
+    def _on_devices(self, sample: Sample) -> None:
+        """Offer a channel for each sensor that a robot announces."""
+        split = split_key(sample.key)
+        if split is None or (shown := self._shown.get(split[1])) is None:
+            return
+        try:
+            devices = payloads.decode(Devices, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        for device in devices.devices:
+            self._found(shown, topics.SENSOR(device.name).path)
+
+    def _found(self, shown: _Shown, path: str) -> None:
+        if path not in shown.offered and shown.sensors < SENSORS:
+            shown.sensors += 1
+            self._offer(shown, channels_of(shown.keys.robot, path))
+
+    # Work on demand
+
+    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+        shown = self._shown.get(channel.topic.split("/")[1])
+        if shown is None:
+            return
+        (shown.wanted.add if wanted else shown.wanted.discard)(channel.path)
+        needed = {source for path in shown.wanted for source in self._sources(shown.offered[path])}
+        if _ALL_SENSORS in needed:
+            needed = {source for source in needed if source == _ALL_SENSORS or not source.startswith("sensor/")}
+        for source in shown.handles.keys() - needed:
+            shown.handles.pop(source).close()
+        for source in needed - shown.handles.keys():
+            topic = topics.find(source)
+            kept = topic is not None and topic.qos.keeps_last
+            shown.handles[source] = self._bus.subscribe(
+                shown.keys.key(source), lambda sample: self._take(shown, sample), history=kept
+            )
+
+    def _sources(self, channel: Channel) -> tuple[str, ...]:
+        return (_ALL_SENSORS,) if channel.path == _SENSORS else sources_of(channel)
+
+    def _take(self, shown: _Shown, sample: Sample) -> None:
+        path = shown.keys.path(sample.key)
+        topic = topics.find(path)
+        if topic is None:
+            return
+        try:
+            message: FleetMessage = payloads.decode(topic.message, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        now_ns = time.time_ns()
+        if isinstance(message, Reading) and _SENSORS in shown.wanted:
+            self._found(shown, path)
+            named = NamedReading(**msgspec.structs.asdict(message), sensor=unescape(path.rpartition("/")[2]))
+            self.hub.publish(f"/{shown.keys.robot}/{_SENSORS}", now_ns, _encode(named))
+        for picture in shown.pictures.draw(topic, message, now_ns, shown.wanted):
+            self.hub.publish(picture.channel.topic, now_ns, picture.payload)
+
+    # Commands
+
+    def services(self) -> list[Service]:
+        """Return the services of all robots."""
+        return self._commands.services()
+
+    def published(self, viewer: Person, channel: ClientChannel, payload: bytes) -> None:
+        """Drive or stop a robot."""
+        self._commands.published(viewer, channel, payload)
+
+    def unpublished(self, viewer: Person, channel: ClientChannel) -> None:
+        """Release the robot that was driven on a channel."""
+        self._commands.unpublished(viewer, channel)
+
+    async def call(self, viewer: Person, service_id: int, payload: bytes) -> bytes:
+        """Carry out a service's call."""
+        return await self._commands.call(viewer, service_id, payload)
+
+    async def parameters(self, names: tuple[str, ...], *, ask: bool = True) -> Mapping[str, Any]:
+        """Return the values of parameters, the robots' own where they tell them."""
+        if ask and not self._watching:
+            with contextlib.suppress(BusError):
+                for topic in _SWITCHES:
+                    for answer in await self._bus.ask(f"{self._realm}/*/{topic.path}", timeout_s=_ASK_S):
+                        if answer.error is None:
+                            self._on_switch(Sample(answer.key, answer.payload))
+        return self._commands.parameters(names)
+
+    def watch_parameters(self, watched: bool) -> None:
+        """Subscribe to the switches of robots while somebody watches parameters."""
+        self._watchers += 1 if watched else -1
+        if self._watchers and not self._watching:
+            self._watching = [
+                self._bus.subscribe(f"{self._realm}/*/{topic.path}", self._on_switch, history=True)
+                for topic in _SWITCHES
+            ]
+        elif not self._watchers:
+            watching, self._watching = self._watching, []
+            for handle in watching:
+                handle.close()
+
+    def _on_switch(self, sample: Sample) -> None:
+        split = split_key(sample.key)
+        if split is None:
+            return
+        try:
+            switch = payloads.decode(Switch, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        self._commands.noted(split[1], split[2], switch.on)
+
+    async def set_parameter(self, viewer: Person, name: str, value: Any) -> None:
+        """Change a parameter: send the robot a command."""
+        await self._commands.set_parameter(viewer, name, value)
+
+    async def left(self, viewer: Person) -> None:
+        """Release what a viewer drove."""
+        await self._commands.left(viewer)
+
+
+def _sensors_schema() -> Schema:
+    return json_schema(NamedReading)

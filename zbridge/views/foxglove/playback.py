@@ -1,0 +1,171 @@
+"""A recording as a source: plays, pauses and seeks as viewers say; all viewers see the same time.
+
+Messages are read ahead on a thread, ``BATCH`` at a time, and shown when the clock of the playback reaches their times.
+After a seek, and when a channel is first wanted, viewers are shown the last message of it before that time: of streams
+those of the last ``RECENT_S``, of what changes rarely (``RARE``) those of any time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Iterator
+from typing import cast
+
+from zbridge.views.foxglove import replies
+from zbridge.views.foxglove.hub import Hub, Receiver
+from zbridge.views.foxglove.playback_clock import PlaybackClock
+from zbridge.views.foxglove.recording import Message, Recording
+from zbridge.views.foxglove.replies import PlaybackStatus
+from zbridge.views.foxglove.requests import PlaybackRequest
+from zbridge.views.foxglove.source import Person, Source
+from zbridge.views.pictures import Channel
+
+BATCH = 64
+"""Messages that are read at once."""
+TICK_S = 1 / 30
+"""The time is told so often while the recording runs."""
+LATE_S = 0.25
+"""How far what is shown may be behind the clock before the clock waits for it."""
+RECENT_S = 5.0
+RARE = ("foxglove.Grid", "zbridge.Status.v1", "zbridge.Control.v1", "zbridge.Scanner.v1", "zbridge.Devices.v1")
+"""Schemas of what is shown however old it is."""
+_S_NS = 1_000_000_000
+
+
+class Playback(Source):
+    """Plays a recording."""
+
+    def __init__(self, hub: Hub, recording: Recording) -> None:
+        super().__init__(hub)
+        self.capabilities = ("time", "playbackControl")
+        self.times_ns = (recording.begin_ns, recording.end_ns)
+        self._recording = recording
+        self._clock = PlaybackClock(recording.begin_ns, recording.end_ns)
+        self._loop = asyncio.get_running_loop()
+        self._changed = asyncio.Event()
+        self._look_back: set[str] = set()
+        """Topics whose last message before now is to be shown."""
+        self._from_ns: int | None = recording.begin_ns
+        """Where reading begins anew; None while it goes on."""
+        hub.offer(recording.channels.values())
+        hub.on_wanted = self._on_wanted
+        hub.on_subscribed = self._on_subscribed
+
+    def __repr__(self) -> str:
+        return f"<Playback {self._recording!r} {self._clock!r}>"
+
+    # What viewers do
+
+    def greet(self, viewer: Person) -> None:
+        """Tell a new viewer what is being played."""
+        viewer.say(self._state(sought=False, request_id=""))
+        viewer.say(replies.time(self._now_ns()))
+
+    def play(self, viewer: Person, request: PlaybackRequest) -> None:
+        """Play or pause, from another time if one is named. The others are told without the id of the request."""
+        now = self._loop.time()
+        sought = request.seek_ns is not None or (request.play and self._clock.ended)
+        if request.seek_ns is not None:
+            self._clock.seek(request.seek_ns, now)
+        if request.play:
+            self._clock.play(request.speed, now)
+        else:
+            self._clock.pause(now)
+            self._clock.speed = request.speed
+        if sought:
+            self._from_ns = self._clock.now_ns(now)
+            self._look_back.update(channel.topic for channel in self.hub.wanted())
+        viewer.say(self._state(sought=sought, request_id=request.request_id))
+        others = self._state(sought=sought, request_id="")
+        for other in self.hub.viewers:
+            if other is not cast(Receiver, viewer):
+                other.say(others)
+        self._changed.set()
+
+    def _on_wanted(self, channel: Channel, wanted: bool) -> None:
+        if wanted:
+            self._look_back.add(channel.topic)
+            self._changed.set()
+
+    def _on_subscribed(self, channel: Channel, viewer: Receiver, subscription: int) -> None:
+        self._on_wanted(channel, True)
+
+    # What is shown
+
+    async def run(self) -> None:
+        """Show messages when their time comes, until cancelled."""
+        ahead: list[Message] = []
+        entries: Iterator[Message] = iter(())
+        told_at = 0.0
+        while True:
+            self._changed.clear()
+            if self._look_back:
+                await self._show_last()
+                continue
+            if self._from_ns is not None:  # what was recorded at this very time was shown as the last before it
+                entries, ahead, self._from_ns = self._recording.messages(self._from_ns + 1), [], None
+            if not ahead:
+                ahead = await self._read(entries)
+                if self._from_ns is not None:  # a seek came meanwhile
+                    continue
+                ahead.reverse()
+            now = self._loop.time()
+            self._hold_back(ahead, now)
+            while ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) <= 0:
+                message = ahead.pop()
+                self.hub.publish(message.topic, message.log_ns, message.payload)
+            if self._clock.playing and now - told_at >= TICK_S:
+                told_at = now
+                self._tell_time(ended=not ahead)
+            await self._rest(ahead)
+
+    async def _rest(self, ahead: list[Message]) -> None:
+        """Wait for the next message, the next tick, or a viewer."""
+        wait_s: float | None = None
+        if self._clock.playing:
+            wait_s = TICK_S
+            if ahead:
+                wait_s = max(0.0, min(TICK_S, self._clock.wait_s(ahead[-1].log_ns, self._loop.time())))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(wait_s):
+                await self._changed.wait()
+
+    def _hold_back(self, ahead: list[Message], now: float) -> None:
+        """Let the clock wait where reading cannot keep up with it."""
+        if ahead and self._clock.playing and self._clock.wait_s(ahead[-1].log_ns, now) < -LATE_S:
+            self._clock.seek(ahead[-1].log_ns, now)
+
+    def _tell_time(self, *, ended: bool) -> None:
+        now_ns = self._now_ns()
+        self.hub.say(replies.time(now_ns))
+        if ended and now_ns >= self._clock.end_ns:
+            self._clock.pause(self._loop.time())
+            self.hub.say(self._state(sought=False, request_id=""))
+
+    async def _show_last(self) -> None:
+        """Show the last messages before now of the channels that wait for them."""
+        topics, self._look_back = self._look_back, set()
+        channels = self._recording.channels
+        rare = {topic for topic in topics if channels[topic].schema.name in RARE}
+        at_ns = self._now_ns()
+        recent_ns = max(self._clock.begin_ns, at_ns - int(RECENT_S * _S_NS))
+        for group, since_ns in ((rare, self._clock.begin_ns), (topics - rare, recent_ns)):
+            for message in await asyncio.to_thread(self._recording.last_before, group, at_ns, since_ns):
+                self.hub.publish(message.topic, message.log_ns, message.payload)
+        if not self._clock.playing:
+            self.hub.say(replies.time(at_ns))
+
+    async def _read(self, entries: Iterator[Message]) -> list[Message]:
+        return await asyncio.to_thread(lambda: list(itertools.islice(entries, BATCH)))
+
+    def _now_ns(self) -> int:
+        return self._clock.now_ns(self._loop.time())
+
+    def _state(self, *, sought: bool, request_id: str) -> bytes:
+        clock, now_ns = self._clock, self._now_ns()
+        status = PlaybackStatus.PLAYING if clock.playing else PlaybackStatus.PAUSED
+        if clock.ended:
+            status = PlaybackStatus.ENDED
+        return replies.playback_state(status, now_ns, clock.speed, sought=sought, request_id=request_id)

@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
-from zbridge.cli import certs, give_up, run_gateway, run_loop, set_up_log
+from zbridge.cli import certs, give_up, recordings, run_gateway, run_loop, set_up_log
+from zbridge.cli.options import Connect, Realm, check_name
 from zbridge.client import bus_settings
-from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
@@ -23,18 +23,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
+app.add_typer(recordings.app)
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
-Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
-Connect = Annotated[
-    list[str],
-    typer.Option(
-        help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
-        envvar="ZBRIDGE_CONNECT",
-        show_default=False,
-    ),
-]
 
 
 @app.command()
@@ -242,9 +234,3 @@ def stop(
         check_name("ROBOT", robot)
     if not run_loop(bus.stop(bus_settings(connect), realm, robot or None)):
         raise typer.Exit(1)
-
-
-def check_name(argument: str, name: str) -> None:
-    """End the process with exit code 2 if ``name`` cannot be a robot's name."""
-    if not is_name(name):
-        give_up(2, f"{argument} = {name!r}: expected letters, digits, '_', '.' and '-' only")

@@ -15,8 +15,10 @@ from zbridge.bus import Handle
 from zbridge.control.context import RobotContext
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.protocol.plugin import Translate
+from zbridge.protocol.session import Datagram
 from zbridge.robot.connection import Connection, Links
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries
@@ -98,7 +100,10 @@ class Telemetry:
         """Publish the raw frames of one direction while somebody listens."""
 
         def listened(anybody: bool) -> None:
-            connection.watch(direction, publisher.put if anybody else None)
+            connection.watch(direction, show if anybody else None)
+
+        def show(frame: bytes) -> None:
+            publisher.put(frame, topics.WIRE_DATAGRAM if type(frame) is Datagram else None)
 
         key = self._context.keys.key(f"@wire/{connection.name}/{direction}")
         publisher = self._bus.frames(key, listened)

@@ -23,8 +23,6 @@ MSGPACK, OCTETS, JSON = "msgpack", "octet-stream", "json"
 JSONSCHEMA = "jsonschema"
 SENT = "/@sent"
 """Ends the topic that stands beside a command's."""
-DATAGRAM = b"datagram"
-"""Attachment of a raw frame that went by datagram."""
 _TRANSPORT = "transport"
 
 

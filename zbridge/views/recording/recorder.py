@@ -21,7 +21,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Status
 from zbridge.fleet.topics import Delivery, Topic, split_key
-from zbridge.views.recording.channels import DATAGRAM, SENT, ChannelKind, Sent, channel_of, is_command, read_sender
+from zbridge.views.recording.channels import SENT, ChannelKind, Sent, channel_of, is_command, read_sender
 from zbridge.views.recording.files import CHANNELS, Tape
 from zbridge.views.recording.intake import Arrival, Intake, Losses
 from zbridge.views.recording.pictures import Pictures
@@ -187,7 +187,7 @@ class Recorder:
     # One message
 
     def _write(self, arrival: Arrival) -> None:
-        track = self._tracks.get((arrival.key, arrival.attachment == DATAGRAM)) or self._track(
+        track = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM)) or self._track(
             arrival.key, arrival.attachment
         )
         self.messages += 1
@@ -231,7 +231,7 @@ class Recorder:
 
     def _track(self, key: str, attachment: bytes | None) -> _Track:
         """Describe a key that is new. Only so many are remembered: a robot may invent names without end."""
-        datagram = attachment == DATAGRAM
+        datagram = attachment == topics.WIRE_DATAGRAM
         split = split_key(key)
         topic = topics.find(split[2]) if split is not None else None
         if topic is not None and topic.delivery is Delivery.QUERY:

@@ -108,3 +108,53 @@ def mark(
 
     set_up_log(verbose=False, level=logging.ERROR)
     run_loop(put_mark(bus_settings(connect), realm, text, who or None))
+
+
+@app.command()
+def replay(
+    file: Recorded,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay"),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
+    since: Since = "",
+    until: Until = "",
+    pause: Annotated[bool, typer.Option("--pause", help="wait; Enter goes on, and pauses again")] = False,
+    hq: Annotated[
+        list[str] | None,
+        typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
+    ] = None,
+    as_robot: Annotated[
+        str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
+    ] = "",
+    listen: Annotated[
+        list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
+    ] = None,
+    connect: Connect = [],  # noqa: B006
+    realm: Realm = "fleet",
+) -> None:
+    """Replay a recording onto the bus under another name, or to a gateway as the legacy robot itself."""
+    from zbridge.cli import replayed
+
+    set_up_log(verbose=False, level=logging.WARNING)
+    if bool(as_robot) != bool(listen):
+        give_up(2, "--as-robot and --listen belong together")
+    if as_robot:
+        if hq or loop or pause or since or until:
+            give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
+        run_loop(replayed.run_wire(file, as_robot, listen or [], robot or [], speed, realm))
+        return
+    options = replayed.ReplayOptions(
+        path=file,
+        realm=realm,
+        robots=tuple(robot or ()),
+        speed=speed,
+        loop=loop,
+        since=since,
+        until=until,
+        pause=pause,
+        hq=tuple(hq or ()),
+    )
+    run_loop(replayed.run_replay(bus_settings(connect), options))

@@ -118,7 +118,7 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     names = found.robot(found.options(), len(addresses), Metrics()).link_names
     keys = KeySpace(realm, robots[0] if robots else seen[0])
     links = [WireLink(path, keys, name, speed, lambda text: errors.print(shown(text))) for name in names]
-    ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # type: ignore[misc] # noqa: T201
+    ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
     for link in links:
         late = f", {link.unanswered} of them although the gateway said less" if link.unanswered else ""

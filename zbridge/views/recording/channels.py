@@ -59,11 +59,6 @@ class ChannelKind(msgspec.Struct, frozen=True):
     schema: Schema | None = None
     metadata: tuple[tuple[str, str], ...] = ()
 
-    @property
-    def datagram(self) -> bool:
-        """Whether its frames went by datagram."""
-        return (_TRANSPORT, "datagram") in self.metadata
-
 
 def message_of(key: str) -> type[FleetMessage] | None:
     """Return what travels on a key; None for raw frames and unknown keys."""

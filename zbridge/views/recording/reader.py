@@ -49,6 +49,11 @@ class Channel(msgspec.Struct, frozen=True):
     schema_encoding: str = ""
     metadata: dict[str, str] = {}
 
+    @property
+    def datagram(self) -> bool:
+        """Whether its raw frames went by datagram."""
+        return self.metadata.get("transport") == "datagram"
+
     def __hash__(self) -> int:
         return hash((self.topic, self.encoding, self.schema))
 

@@ -103,7 +103,7 @@ def plan_names(robots: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def plan_listeners(wanted: list[str]) -> tuple[ListenerPlan, ...]:
+def plan_listeners(wanted: Sequence[str]) -> tuple[ListenerPlan, ...]:
     """Return the listeners that were asked for; raise ConfigError.
 
     wanted: ``PROTOCOL:PORT``, ``PROTOCOL:HOST:PORT``, or a configuration with ``[[hq]]`` tables.

@@ -112,11 +112,15 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     found = find_protocol(protocol)
     if len(addresses) > found.links:
         raise ConfigError(f"listen: a {found.name} robot has at most {found.links} links")
-    seen = survey(path).robots
-    if len(robots) > 1 or (len(seen) > 1 and not robots) or (robots and robots[0] not in seen):
-        raise ConfigError(f"robot: the recording has {', '.join(seen)}: name one by --robot")
+    seen = survey(path)
+    known = seen.robots
+    if len(robots) > 1 or (len(known) > 1 and not robots) or (robots and robots[0] not in known):
+        raise ConfigError(f"robot: the recording has {', '.join(known)}: name one by --robot")
     names = found.robot(found.options(), len(addresses), Metrics()).link_names
-    keys = KeySpace(realm, robots[0] if robots else seen[0])
+    keys = KeySpace(realm, robots[0] if robots else known[0])
+    if missing := set(names) - set(seen.links.get(keys.robot, ())):
+        there = ", ".join(seen.links.get(keys.robot, ())) or "none: record it with --wire"
+        raise ConfigError(f"as-robot: no raw frames of link {', '.join(sorted(missing))}; the recording has {there}")
     links = [WireLink(path, keys, name, speed, lambda text: errors.print(shown(text))) for name in names]
     ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))

@@ -30,6 +30,7 @@ from zbridge.views.recording.reader import Message, Reader, open_recording
 from zbridge.views.recording.replayed_robot import KEYS, PROTOCOL, ReplayedRobot
 from zbridge.views.recording.selection import Selection
 from zbridge.views.recording.summary import robots_of
+from zbridge.views.recording.wire_tape import wire_links
 
 CLAIM_S = 5.0
 """Longest time until the name of a replayed robot is claimed."""
@@ -53,10 +54,11 @@ class ReplayPlan(msgspec.Struct, frozen=True):
 
 
 class Survey(msgspec.Struct, frozen=True):
-    """What a recording has: its robots, and the first status of each that was established."""
+    """What a recording has: its robots, the first status of each that was established, its links with raw frames."""
 
     robots: tuple[str, ...]
     statuses: dict[str, Status]
+    links: dict[str, list[str]]
 
 
 def survey(path: Path) -> Survey:
@@ -78,7 +80,9 @@ def survey(path: Path) -> Survey:
     robots = robots_of(keys)
     if not robots:
         raise ConfigError(f"{path}: no robot in it{f': {reader.fault}' if reader.fault else ''}")
-    return Survey(tuple(robots), statuses)
+    realms = {topic.partition("/")[0] for topic in keys}
+    links = {robot: [link for realm in realms for link in wire_links(KeySpace(realm, robot), keys)] for robot in robots}
+    return Survey(tuple(robots), statuses, links)
 
 
 def plan_names(robots: Sequence[str], wanted: Sequence[str]) -> dict[str, str]:

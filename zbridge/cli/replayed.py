@@ -125,5 +125,5 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
     for link in links:
-        late = f", {link.unanswered} of them although the gateway said less" if link.unanswered else ""
-        errors.print(shown(f"{link.link}: {link.frames} frames{late}"))
+        less = f"; in {link.unanswered} conversations the gateway said less than then" if link.unanswered else ""
+        errors.print(shown(f"{link.link}: {link.frames} frames{less}"))

@@ -1,9 +1,10 @@
 """Shows the raw frames of one link to those who listen (``@wire``). Knows no bus.
 
-Theory of operation. Who listens from the start may still be heard of after the first frames of a connection: those of
-the handshake are kept, in order, and the first listener is shown them first, whenever it comes. A listener of one
-direction appears shortly before the listener of the other one, so that what is kept is shown :data:`SETTLE_S` after the
-first appeared; what comes meanwhile waits behind it. While nobody listens and nothing is kept the session calls nobody.
+Theory of operation. Who listens from the start may still be heard of after the first frames of a connection: these are
+kept, in order, to the end of the handshake, and the first listener is shown them first, whenever it comes. A listener
+of one direction appears shortly before the listener of the other one, so that what is kept is shown :data:`SETTLE_S`
+after the first appeared; what comes meanwhile waits behind it. While nobody listens and nothing more is kept the
+session calls nobody.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from zbridge.protocol.session import Session, State
 
 log = logging.getLogger("zbridge.link")
 
+FIRST = 16
+"""First frames of a conversation that are kept, also where there is no handshake."""
 KEPT = 64
-"""Frames of a handshake that are kept."""
+"""Most frames that are kept while the handshake goes on."""
 KEPT_BYTES = 65_536
-"""Bytes of a handshake that are kept."""
+"""Bytes that are kept."""
 SETTLE_S = 0.02
 """Seconds between the first listener and what was kept: both directions have theirs by then."""
 _LOGGED = 64
@@ -77,10 +80,10 @@ class WireTap:
 
     @property
     def _keeps(self) -> bool:
-        """Whether the handshake goes on, within the bounds of what is kept."""
+        """Whether the conversation has just begun, within the bounds of what is kept."""
         session = self._session
         begins = session is not None and session.state in (State.CONNECTING, State.HANDSHAKING)
-        return begins and len(self._kept) < KEPT and self._kept_bytes < KEPT_BYTES
+        return len(self._kept) < (KEPT if begins else FIRST) and self._kept_bytes < KEPT_BYTES
 
     def _show_kept(self) -> None:
         waiting, self._waiting = self._waiting or (), None

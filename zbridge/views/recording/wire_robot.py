@@ -24,7 +24,7 @@ from zbridge.views.recording.wire_tape import Step, steps
 log = logging.getLogger("zbridge.views.recording")
 
 ANSWER_S = 2.0
-"""Longest time that a frame of the handshake waits for the gateway."""
+"""Longest time that a frame of the handshake waits for the gateway; then no other one of the conversation waits."""
 LINGER_S = 0.5
 """Seconds between the last frame of a conversation and its end."""
 _READ = 65_536
@@ -39,7 +39,7 @@ class WireLink:
         self.link = link
         self.frames = 0
         self.unanswered = 0
-        """Frames of a handshake that went although the gateway had said less than in the recording."""
+        """Conversations in which the gateway said less than in the recording."""
         self._path = path
         self._keys = keys
         self._speed = speed
@@ -132,10 +132,8 @@ class WireLink:
         self._heard += size
         self._news.set()
 
-    async def hear(self, size: int) -> float:
-        """Wait until the gateway has said so many bytes; return the seconds that took."""
-        loop = asyncio.get_running_loop()
-        began = loop.time()
+    async def hear(self, size: int) -> bool:
+        """Wait until the gateway has said so many bytes; False where it did not in time."""
         try:
             async with asyncio.timeout(ANSWER_S):
                 while self._heard < size:
@@ -143,7 +141,8 @@ class WireLink:
                     await self._news.wait()
         except TimeoutError:
             self.unanswered += 1
-        return loop.time() - began
+            return False
+        return True
 
     def send_datagram(self, data: bytes, writer: asyncio.StreamWriter) -> None:
         """Send a datagram to the gateway."""
@@ -159,13 +158,16 @@ class _Conversation:
         self._writer = writer
         self._began = began
         self._speed = speed
+        self._answered = True
 
     async def play(self, step: Step) -> None:
         """Send a frame when it is due."""
         loop = asyncio.get_running_loop()
         await asyncio.sleep(max(0.0, self._began + step.at_s / self._speed - loop.time()))
-        if step.answers:
-            self._began += await self._link.hear(step.heard)
+        if step.answers and self._answered:
+            due = loop.time()
+            self._answered = await self._link.hear(step.heard)
+            self._began += loop.time() - due
         if step.datagram:
             self._link.send_datagram(step.frame, self._writer)
         elif not self._writer.is_closing():

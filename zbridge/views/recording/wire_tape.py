@@ -1,8 +1,9 @@
 """The raw frames of one link of a recorded robot, as its conversations: what it sent, and what it was sent. Sans-IO.
 
-Theory of operation. A conversation begins with the first frame after the robot's status showed the link as offline or
-connecting. Until the status shows it as established the two sides answer each other: a frame of the robot's waits for
-what the gateway had said before it. From then on only the time counts.
+Theory of operation. A conversation begins with the first frame after the robot's status showed the link as no longer
+offline. (``status`` overtakes frames: the last frames of a conversation may come after it.) At its begin the two sides
+answer each other: for :data:`HANDSHAKE_S` a frame of the robot's waits for what the gateway had said before it. From
+then on only the time counts. A recording that began later has the handshake, too, all at one time.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from zbridge.fleet.messages import Status
 from zbridge.fleet.topics import KeySpace
 from zbridge.views.recording.reader import Message
 
-HANDSHAKE_S = 3.0
-"""For so long a conversation whose status was not recorded is taken for a handshake."""
+HANDSHAKE_S = 5.0
+"""For so long the begin of a conversation lasts."""
 
 
 class Step(msgspec.Struct, frozen=True):
@@ -47,22 +48,21 @@ def steps(messages: Iterable[Message], keys: KeySpace, link: str) -> Iterator[St
     """Yield what one link of the robot sent."""
     incoming, outgoing = keys.key(f"@wire/{link}/in"), keys.key(f"@wire/{link}/out")
     status = keys.key(topics.STATUS.path)
-    number, began_ns, heard, established, fresh = 0, 0, 0, False, True
+    number, began_ns, heard, fresh, offline = 0, 0, 0, True, False
     for message in messages:
         topic = message.channel.topic
         if topic == status:
             state = _state(message.data, link)
-            established = established or (state == "established" and not fresh)
-            fresh = fresh or state in ("offline", "connecting")
+            fresh = fresh or (offline and state != "offline")
+            offline = state == "offline"
         elif topic in (incoming, outgoing):
             if fresh:
-                number, began_ns, heard, established, fresh = number + 1, message.log_ns, 0, False, False
+                number, began_ns, heard, fresh = number + 1, message.log_ns, 0, False
             at_s = max(0.0, (message.log_ns - began_ns) / 1e9)
             if topic == outgoing:
                 heard += len(message.data)
             else:
-                answers = not established and at_s < HANDSHAKE_S
-                yield Step(number, at_s, message.data, message.channel.datagram, heard, answers)
+                yield Step(number, at_s, message.data, message.channel.datagram, heard, at_s < HANDSHAKE_S)
 
 
 def _state(payload: bytes, link: str) -> str | None:

@@ -92,14 +92,14 @@ class Recording:
 
     def _take(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
         """Store a sample; on Zenoh's threads. The intake counts what it drops."""
-        self._intake.put(key, look(), shown)
+        self._intake.put_seen(key, size, look, shown)
         if self._asking and len(self._live) < LIVE_KEYS:
             self._live.add(key)
         return None
 
     def _store(self, sample: Sample) -> None:
         """Store a sample of a bus that has no lanes."""
-        self._take(sample.key, sample.attachment, 0, lambda: sample.payload)
+        self._take(sample.key, sample.attachment, len(sample.payload), lambda: sample.payload)
 
     def _on_token(self, key: str, alive: bool) -> None:
         self._intake.put(key, payloads.encode(Alive(alive=alive)))

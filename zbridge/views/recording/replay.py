@@ -174,12 +174,11 @@ class Replay:
             raise Held(f"{name} is alive: replay it under another name")
         ownership = Ownership(self._bus, keys)
         try:
-            async with asyncio.timeout(CLAIM_S):
-                await ownership.take()
-        except TimeoutError:
-            ownership.release()
-            raise Held(f"{name} is alive: replay it under another name") from None
-        try:
+            try:
+                async with asyncio.timeout(CLAIM_S):
+                    await ownership.take()
+            except TimeoutError:
+                raise Held(f"{name} is alive: replay it under another name") from None
             yield ownership
         finally:
             ownership.release()
@@ -214,7 +213,7 @@ class Replay:
     def _target(self, message: Message) -> tuple[ReplayedRobot, str] | None:
         topic, target = message.channel.topic, None
         split = split_key(topic)
-        if split is not None and message.channel.encoding == MSGPACK and split[1] in self.robots:
+        if split is not None and split[0] and message.channel.encoding == MSGPACK and split[1] in self.robots:
             target = (self.robots[split[1]], split[2])
         self._targets[topic] = target  # as many as the file has channels
         return target

@@ -77,12 +77,13 @@ class Summary(msgspec.Struct):
     @property
     def robots(self) -> list[str]:
         """The robots whose keys it has."""
-        return robots_of(key.topic for key in self.keys if not key.topic.startswith("/"))
+        return robots_of(key.topic for key in self.keys)
 
 
 def robots_of(topics: Iterable[str]) -> list[str]:
     """Return the names of robots in keys."""
-    return sorted({split[1] for topic in topics if (split := split_key(topic)) and not split[1].startswith(("@", "*"))})
+    splits = filter(None, map(split_key, topics))
+    return sorted({robot for realm, robot, _ in splits if realm and not robot.startswith(("@", "*"))})
 
 
 def summarize(path: Path) -> Summary:

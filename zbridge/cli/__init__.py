@@ -1,4 +1,4 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs, record...``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs`` and more.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
 ``app`` declares the commands, ``certs`` those of ``zbridge certs``, ``recordings`` those of recordings; ``bus``,

@@ -86,7 +86,8 @@ def _keys(player: Player) -> Iterator[None]:
     def pressed() -> None:
         if not os.read(stdin, 1024):
             loop.remove_reader(stdin)
-        elif player.paused:
+            return
+        if player.paused:
             player.resume()
         else:
             player.pause()

@@ -129,6 +129,19 @@ async def test_a_part_begins_with_the_states_from_before_it(recording: Path) -> 
         assert stage.bus.values("fleet/again/map") == [MAP]
 
 
+async def test_a_paused_replay_shows_the_robot_and_plays_when_it_is_told(recording: Path) -> None:
+    stage = Stage(recording, paused=True)
+    replay = Replay(stage.bus.join("2"), stage.plan)
+    task = asyncio.ensure_future(replay.run())
+    await stage.soon(lambda: len(stage.bus.values("fleet/again/status")) > 1)  # repeated after a second
+    assert (replay.player.paused, replay.player.played, stage.last("map")) == (True, 0, {})
+    replay.player.resume()
+    await stage.soon(lambda: stage.last("map"))
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
 async def test_a_name_that_is_alive_is_refused(recording: Path) -> None:
     stage = Stage(recording)
     stage.bus.announce("fleet/again/@alive/gateway")

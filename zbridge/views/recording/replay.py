@@ -142,6 +142,8 @@ class Replay:
         self.player = Player(
             plan.path, plan.selection, self._play, self._on_end, speed=plan.speed, loop=plan.loop, skip=self._skip
         )
+        if plan.paused:
+            self.player.pause()
 
     def __repr__(self) -> str:
         return f"<Replay {self.player!r}>"
@@ -161,8 +163,6 @@ class Replay:
                 watching.append(self._watch(ownership, name))
             serving = [self._serve_hq(recorded) for recorded in self._plan.names if self._plan.listeners]
             stack.callback(self.player.close)
-            if self._plan.paused:
-                self.player.pause()
             self.player.start()
             await _first(self._ended.wait(), *watching, *serving)
 

@@ -1,11 +1,12 @@
 """The command line: ``zbridge run, check, init, simulate, probe, demo, router, foxglove, ls, health, echo, drive, stop,
-restart, certs``.
+restart, certs, record, info, export, mark, replay``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo`` (with ``secure_demo`` and
-``processes``), ``drive``, ``foxglove``, ``health``, ``probe``, ``restart``, ``router`` and ``supervise`` carry theirs
-out, ``keyboard`` turns keys into drives, ``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked
-from. Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration; those of ``health`` are for monitoring programs.
+``app`` declares the commands, ``certs`` those of ``zbridge certs``, ``recordings`` those of recordings; ``bus``,
+``demo`` (with ``secure_demo`` and ``processes``), ``drive``, ``foxglove``, ``health``, ``probe``, ``recorded``,
+``replayed``, ``restart``, ``router`` and ``supervise`` carry theirs out, ``keyboard`` turns keys into drives,
+``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2
+wrong arguments or configuration; those of ``health`` are for monitoring programs.
 """
 
 from __future__ import annotations

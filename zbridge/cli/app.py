@@ -11,12 +11,12 @@ import typer
 from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
-from zbridge.bus.tls.files import TLS_VARIABLE, ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, hand_on_tls, run_gateway, run_loop, run_together, set_up_log
+from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
+from zbridge.cli import certs, give_up, hand_on_tls, recordings, run_gateway, run_loop, run_together, set_up_log
+from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
-from zbridge.fleet.topics import is_name
 from zbridge.protocol.address import Address, parse_device_address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
@@ -28,38 +28,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
+app.add_typer(recordings.app)
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
 Files = Annotated[
     list[Path], typer.Argument(help="a gateway's configuration (TOML), several, or a directory", show_default=False)
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="log every frame")]
-Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
-Connect = Annotated[
-    list[str],
-    typer.Option(
-        help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
-        envvar="ZBRIDGE_CONNECT",
-        show_default=False,
-    ),
-]
-TlsFolder = Annotated[
-    Path | None,
-    typer.Option(
-        "--tls",
-        help="for a secure bus: a folder as `zbridge certs bundle` makes it; its endpoints are used without --connect",
-        envvar=TLS_VARIABLE,
-        show_default=False,
-    ),
-]
-FileTls = Annotated[
-    Path | None,
-    typer.Option(
-        "--tls",
-        help=f"for a FILE without bus.tls: a folder as `zbridge certs bundle` makes it; or {TLS_VARIABLE}",
-        show_default=False,
-    ),
-]
 
 
 @app.command()
@@ -275,9 +250,12 @@ def foxglove(
     turn_full_radps: Annotated[
         list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
     ] = [],
-    who: Annotated[str, typer.Option(help="what drivers are called first; access rules know them by it")] = "foxglove",
+    who: Annotated[
+        str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
+    ] = "",
     viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
     connect: Connect = [],
+    tls: TlsFolder = None,
     realm: Realm = "fleet",
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
 ) -> None:
@@ -300,7 +278,7 @@ def foxglove(
         "who": who,
         "viewers": viewers,
     }
-    run_foxglove(bus_settings(connect), realm, file, given)
+    run_foxglove(bus_settings(connect, tls), realm, file, given)
 
 
 @app.command()
@@ -411,9 +389,3 @@ def restart(
         check_name("ROBOT", robot)
     if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
         raise typer.Exit(1)
-
-
-def check_name(argument: str, name: str) -> None:
-    """End the process with exit code 2 if ``name`` cannot be a robot's name."""
-    if not is_name(name):
-        give_up(2, f"{argument} = {name!r}: expected letters, digits, '_', '.' and '-' only")

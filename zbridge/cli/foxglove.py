@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings
+from zbridge.bus.tls.member import own_name
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
@@ -25,6 +26,7 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
     except ImportError as error:
         raise ConfigError(f"{error}: expected what `pip install 'zbridge[foxglove]'` installs") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
+    given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
     options: Options = Options(**given)  # type: ignore[arg-type]
     planned, metrics = plan(options), Metrics()
 

@@ -111,6 +111,9 @@ SETTING_BYTES = 16_384
 LARGE_BYTES = 65_536
 """Bound of a scan (16 000 points), a text and a raw message."""
 
+WIRE_DATAGRAM = b"datagram"
+"""Attachment of a raw frame (``@wire``) that went by datagram; others have none."""
+
 _NAME = re.compile(r"[A-Za-z0-9_.-]+")
 _ESCAPED = re.compile(rb"[^A-Za-z0-9_.-]")
 

@@ -38,7 +38,7 @@ from zbridge.wire.frames import FrameBuffer, FrameEnd
 M = TypeVar("M")
 
 Tap = Callable[[str, bytes], None]
-"""``tap("in" or "out", frame)``: is shown every frame while it is set."""
+"""``tap("in" or "out", frame)``: is shown every frame while it is set; a :class:`Datagram` where it went by one."""
 
 LINGER_S = 0.5
 """Seconds that a closing session waits for its last frames to be written."""
@@ -185,7 +185,7 @@ class Session(KeptSession, ABC, Generic[M]):
         self.traffic.frames_in += 1
         self.traffic.bytes_in += len(datagram)
         if self.tap is not None:
-            self.tap("in", datagram)
+            self.tap("in", Datagram(datagram))
         try:
             end = self.frame_end(datagram, 0)
             if end != len(datagram):

@@ -17,8 +17,9 @@ from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Exported
-from zbridge.protocol.session import Session, State, Tap
+from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
+from zbridge.robot.wire_tap import WireTap
 from zbridge.transport import Conversation, Link, Parcel, take_over
 from zbridge.transport.fair_share import FairShare
 
@@ -27,7 +28,6 @@ log = logging.getLogger("zbridge.link")
 Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError where there is no connection to be had."""
 
-_LOGGED = 64
 _STATES: dict[State, RobotState] = {
     State.CONNECTING: "connecting",
     State.HANDSHAKING: "handshaking",
@@ -119,7 +119,7 @@ class Connection:
         """Cleared while another process may get the link: nothing is connected then."""
         self._free.set()
         self._given: tuple[Exported, Parcel] | None = None
-        self._watchers: dict[str, Callable[[bytes], object]] = {}
+        self._wire = WireTap(label)
 
     def __repr__(self) -> str:
         return f"<Connection {self.name} {self.address} {self.state}>"
@@ -203,24 +203,8 @@ class Connection:
         return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
 
     def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
-        """Show the raw frames of one direction (``in`` or ``out``) from now on; None: show none."""
-        if show is not None:
-            self._watchers[direction] = show
-        else:
-            self._watchers.pop(direction, None)
-        if self.conversation is not None:
-            self.conversation.session.tap = self._tap
-
-    @property
-    def _tap(self) -> Tap | None:
-        return self._show if self._watchers or log.isEnabledFor(logging.DEBUG) else None
-
-    def _show(self, direction: str, frame: bytes) -> None:
-        if log.isEnabledFor(logging.DEBUG):
-            log.debug("%s %s %s", "<" if direction == "in" else ">", self._label, frame[:_LOGGED].hex(" "))
-        show = self._watchers.get(direction)
-        if show is not None:
-            show(frame)
+        """Show the raw frames of one direction (``in`` or ``out``), those of the handshake first; None: show none."""
+        self._wire.watch(direction, show)
 
     async def _converse(self) -> tuple[str, bool]:
         """Hold one conversation to its end; return why it ended and whether it was ever established."""
@@ -245,7 +229,8 @@ class Connection:
 
     def _make_conversation(self, session: Session[Any]) -> Conversation:
         hooks = self._hooks
-        session.name, session.tap = self.name, self._tap
+        session.name = self.name
+        self._wire.begin(session)
         return Conversation(
             session,
             asyncio.get_running_loop(),

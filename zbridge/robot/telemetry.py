@@ -15,8 +15,10 @@ from zbridge.bus import Handle, Publisher
 from zbridge.control.context import RobotContext
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
 from zbridge.fleet.topics import Delivery, Topic
 from zbridge.protocol.plugin import Translate
+from zbridge.protocol.session import Datagram
 from zbridge.robot.connection import Connection, Links
 from zbridge.robot.on_demand import Listened, OnDemand
 from zbridge.robot.publishers import RobotPublishers
@@ -110,7 +112,10 @@ class Telemetry:
         """Publish the raw frames of one direction while somebody listens."""
 
         def listened(publisher: Publisher, anybody: bool) -> None:
-            connection.watch(direction, publisher.put if anybody else None)
+            def show(frame: bytes) -> None:
+                publisher.put(frame, topics.WIRE_DATAGRAM if type(frame) is Datagram else None)
+
+            connection.watch(direction, show if anybody else None)
 
         return listened
 

@@ -1,0 +1,86 @@
+"""What ``zbridge record`` and ``zbridge replay`` refuse before they touch the bus, with the option."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.views.recording import files
+from zbridge.bus import BusSettings
+from zbridge.cli.recorded import RecordOptions, run_record, show_info
+from zbridge.cli.replayed import ReplayOptions, run_replay, run_wire
+from zbridge.errors import ConfigError
+
+NOWHERE = BusSettings(connect=("tcp/127.0.0.1:1",), multicast=False)
+RECORD: dict[str, Any] = {
+    "robots": (), "keys": None, "only": None, "wire": False, "split": None, "keep": None, "duration": None,
+    "compression": "zstd", "configs": (), "buffer": "64MiB", "realm": "fleet",
+}  # fmt: skip
+REPLAY: dict[str, Any] = {
+    "realm": "fleet", "robots": (), "speed": 1.0, "loop": False, "since": "", "until": "", "pause": False, "hq": (),
+}  # fmt: skip
+REFUSED = [
+    ({"only": "x"}, "only = 'x'"),
+    ({"split": "1 parsec"}, "split = '1 parsec'"),
+    ({"keep": 3}, "keep: needs --split"),
+    ({"compression": "rar"}, "compression = 'rar'"),
+    ({"duration": "long"}, "duration = 'long'"),
+    ({"buffer": "1kB"}, "'1kB'"),
+    ({"realm": "a/b"}, "realm = 'a/b'"),
+    ({"configs": (Path("/none.toml"),)}, "none.toml"),
+]
+
+
+@pytest.mark.parametrize(("given", "why"), REFUSED)
+async def test_a_recording_with_a_wrong_option_is_refused(tmp_path: Path, given: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        await run_record(NOWHERE, RecordOptions(output=tmp_path / "a.mcap", **{**RECORD, **given}))
+    assert not any(tmp_path.glob("*"))  # noqa: ASYNC240
+
+
+async def test_a_file_that_exists_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").touch()
+    with pytest.raises(ConfigError, match="exists"):
+        await run_record(NOWHERE, RecordOptions(output=tmp_path / "a.mcap", **RECORD))
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"robots": ("x",)}, "give r1=x"),
+        ({"since": "noon"}, "from = 'noon'"),
+        ({"hq": ("tcpudp:11002",)}, "choose one by --robot"),
+        ({"robots": ("r1=x",), "hq": ("tcpudp",)}, "hq = 'tcpudp'"),
+    ],
+)
+async def test_a_replay_with_a_wrong_option_is_refused(tmp_path: Path, given: dict[str, Any], why: str) -> None:
+    path = files.written(tmp_path / "a.mcap", [(f"fleet/{robot}/pose", 0.0, b"\x80") for robot in ("r1", "r2")])
+    with pytest.raises(ConfigError, match=why):
+        await run_replay(NOWHERE, ReplayOptions(path=path, **{**REPLAY, **given}))
+
+
+@pytest.mark.parametrize(
+    ("listen", "robots", "why"),
+    [
+        (["udp:1"], [], "listen = "),
+        (["tcp://127.0.0.1:0", "tcp://127.0.0.1:0"], [], "at most 1 link"),
+        (["tcp://127.0.0.1:0"], ["r9"], "the recording has r1"),
+        (["tcp://127.0.0.1:0"], [], "no raw frames of link robot; the recording has other"),
+    ],
+)
+async def test_a_robot_that_cannot_be_replayed_is_refused(
+    tmp_path: Path, listen: list[str], robots: list[str], why: str
+) -> None:
+    path = files.written(tmp_path / "a.mcap", [("fleet/r1/@wire/other/in", 0.0, b"x")])
+    with pytest.raises(ConfigError, match=why):
+        await run_wire(path, "tcpudp", listen, robots, 1.0, "fleet")
+
+
+def test_information_is_printed_whatever_the_file_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = "fleet/r1/\x1b[2Jpose[red]"
+    show_info(files.written(tmp_path / "a.mcap", [(hostile, 0.0, b"\x80")]), as_json=False)
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown
+    assert "pose[red]" in shown

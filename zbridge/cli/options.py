@@ -1,0 +1,45 @@
+"""Options that several commands have, and what checks them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zbridge.bus.tls.files import TLS_VARIABLE
+from zbridge.cli import give_up
+from zbridge.fleet.topics import is_name
+
+Realm = Annotated[str, typer.Option(help="first chunk of all keys")]
+Connect = Annotated[
+    list[str],
+    typer.Option(
+        help="Zenoh endpoint, for example tcp/192.168.0.2:7447; without it: multicast and the router on this machine",
+        envvar="ZBRIDGE_CONNECT",
+        show_default=False,
+    ),
+]
+TlsFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls",
+        help="for a secure bus: a folder as `zbridge certs bundle` makes it; its endpoints are used without --connect",
+        envvar=TLS_VARIABLE,
+        show_default=False,
+    ),
+]
+FileTls = Annotated[
+    Path | None,
+    typer.Option(
+        "--tls",
+        help=f"for a FILE without bus.tls: a folder as `zbridge certs bundle` makes it; or {TLS_VARIABLE}",
+        show_default=False,
+    ),
+]
+
+
+def check_name(argument: str, name: str) -> None:
+    """End the process with exit code 2 if ``name`` cannot be a robot's name."""
+    if not is_name(name):
+        give_up(2, f"{argument} = {name!r}: expected letters, digits, '_', '.' and '-' only")

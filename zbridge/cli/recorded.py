@@ -1,0 +1,211 @@
+"""Carries out ``zbridge record, info, export, mark``."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.table import Table
+
+import zbridge
+from zbridge.app import until_signal
+from zbridge.bus import BusSettings
+from zbridge.bus.tls.member import own_name
+from zbridge.cli.bus import cell, console, errors, joined
+from zbridge.client.driver import default_who
+from zbridge.errors import ConfigError, ZbridgeError
+from zbridge.fleet.printable import as_json as to_json
+from zbridge.fleet.printable import shown
+from zbridge.fleet.topics import is_name
+from zbridge.views.recording import amounts, marks
+from zbridge.views.recording.configuration import describe_configuration
+from zbridge.views.recording.export import export_arrays, export_tables, first_ns
+from zbridge.views.recording.files import Tape, TapeSettings
+from zbridge.views.recording.intake import Intake
+from zbridge.views.recording.pictures import Pictures
+from zbridge.views.recording.record import Recording, RecordPlan
+from zbridge.views.recording.recorder import Recorder
+from zbridge.views.recording.selection import Selection
+from zbridge.views.recording.summary import Summary, summarize
+
+_LOSSES = 20
+"""Keys with losses that are printed."""
+_LEAST_BUFFER = 2**20
+_TABLE = 180
+"""Characters of a line of a table, at least, also where the terminal has fewer."""
+
+
+class RecordOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """The options of ``zbridge record`` as they were written."""
+
+    output: Path
+    robots: tuple[str, ...]
+    keys: str | None
+    only: str | None
+    wire: bool
+    split: str | None
+    keep: int | None
+    duration: str | None
+    compression: str
+    configs: tuple[Path, ...]
+    buffer: str
+    realm: str
+
+
+def _tape_settings(options: RecordOptions) -> TapeSettings:
+    split_bytes, split_s = amounts.read_split(options.split) if options.split else (None, None)
+    if options.keep and not options.split:
+        raise ConfigError("keep: needs --split")
+    if options.compression not in ("zstd", "lz4", "none"):
+        raise ConfigError(f"compression = {options.compression!r}: expected one of 'zstd', 'lz4', 'none'")
+    settings = TapeSettings(options.output, options.compression, split_bytes, split_s, options.keep)  # type: ignore[arg-type]
+    taken = settings.file(1)
+    if taken.exists():
+        raise ConfigError(f"{taken} exists: give another name")
+    return settings
+
+
+def _metadata(options: RecordOptions) -> dict[str, dict[str, str]]:
+    made = {
+        "version": zbridge.__version__,
+        "realm": options.realm,
+        "robots": ", ".join(options.robots) or options.keys or "all",
+        "wire": str(options.wire).lower(),
+        "only": options.only or "",
+        "began": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
+    configurations = {f"configuration/{path.name}": describe_configuration(path) for path in options.configs}
+    return {"zbridge": made, **configurations}
+
+
+async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
+    """Record until a signal, the end of the duration, or of the disk; False where the recording failed."""
+    if options.only not in (None, "fleet", "foxglove"):
+        raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
+    if not is_name(options.realm):
+        raise ConfigError(f"realm = {options.realm!r}: expected letters, digits, '_', '.' and '-' only")
+    duration_s = amounts.read_seconds("duration", options.duration) if options.duration else None
+    tape = Tape(_tape_settings(options))
+    buffer, _ = amounts.read_split(options.buffer)
+    if buffer is None or buffer < _LEAST_BUFFER:
+        raise ConfigError(f"buffer = {options.buffer!r}: expected a size of 1MiB or more")
+    intake, full, loop = Intake(buffer), asyncio.Event(), asyncio.get_running_loop()
+    recorder = Recorder(
+        tape,
+        intake,
+        _metadata(options),
+        fleet=options.only != "foxglove",
+        pictures=Pictures() if options.only != "fleet" else None,
+        failed=lambda: loop.call_soon_threadsafe(full.set),
+    )
+    plan = RecordPlan(options.realm, options.robots, options.keys, options.wire)
+    async with joined(settings, options.realm) as bus:
+        recorder.start()
+        recording = Recording(bus, plan, intake)
+        recording.open()
+        errors.print(shown(f"recording {', '.join(plan.key_exprs)} to {tape.files[0]}"))
+        begun = time.monotonic()
+        try:
+            await until_signal(_until(full, duration_s))
+        finally:
+            recording.close()
+            await asyncio.to_thread(recorder.close)
+            _tell_end(recorder, tape, time.monotonic() - begun)
+    return recorder.error is None
+
+
+async def _until(full: asyncio.Event, duration_s: float | None) -> None:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(duration_s):
+            await full.wait()
+
+
+def _tell_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
+    if recorder.error is not None:
+        errors.print(shown(recorder.error))
+    files = ", ".join(map(str, tape.files[-3:]))
+    errors.print(shown(f"{recorder.messages} messages in {seconds:.1f} s, {tape.bytes_written} bytes: {files}"))
+    losses = recorder.losses()
+    for reason, by_key in losses.items():
+        errors.print(shown(f"lost, {reason}: {sum(by_key.values())}"))
+        for key, count in sorted(by_key.items(), key=lambda item: -item[1])[:_LOSSES]:
+            errors.print(shown(f"  {key} {count}"))
+    if not losses:
+        errors.print("nothing lost")
+
+
+async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
+    """Put a mark on the bus."""
+    async with joined(settings, realm) as bus:
+        await marks.put(bus, realm, text, who or own_name(settings.tls) or default_who())
+
+
+def show_info(path: Path, *, as_json: bool) -> None:
+    """Print what a recording holds."""
+    summary = summarize(path)
+    if not summary.messages and summary.fault == "this is no MCAP file":
+        raise ConfigError(f"{path}: {summary.fault}")
+    if as_json:
+        console.print(to_json(_as_dict(summary)))
+    else:
+        _print_info(summary)
+
+
+def _as_dict(summary: Summary) -> dict[str, Any]:
+    fields: dict[str, Any] = msgspec.to_builtins(summary)
+    fields["keys"] = [
+        {**entry, "rate_hz": key.rate_hz} for entry, key in zip(fields["keys"], summary.keys, strict=True)
+    ]
+    return {**fields, "robots": summary.robots, "duration_s": summary.duration_s}
+
+
+def _print_info(summary: Summary) -> None:
+    began = _day(summary.begin_ns)
+    console.print(shown(f"{summary.path}: {summary.size} bytes, {summary.messages} messages"))
+    console.print(shown(f"from {began}, {summary.duration_s:.3f} s"))
+    console.print(shown("ended properly" if summary.fault is None else f"not ended properly: {summary.fault}"))
+    console.print(shown(f"robots: {', '.join(summary.robots) or 'none'}"))
+    for name, pairs in summary.metadata:
+        console.print(shown(f"{name}: " + ", ".join(f"{key} {value}" for key, value in pairs.items() if value)))
+    console.width = max(console.width, _TABLE)
+    table = Table("key", "messages", "Hz", "longest pause s", "gaps", "bytes", "schema", box=None)
+    for column in table.columns:
+        column.no_wrap = True
+    for key in summary.keys:
+        numbers = (key.count, f"{key.rate_hz:.2f}", f"{key.gap_s:.3f}", key.gaps or "", key.bytes)
+        table.add_row(*map(cell, map(str, (key.topic, *numbers, key.schema or key.encoding))))
+    console.print(table, crop=False)
+
+
+def _day(stamp_ns: int) -> str:
+    try:
+        return datetime.fromtimestamp(stamp_ns / 1e9).astimezone().isoformat(timespec="milliseconds")
+    except (ValueError, OverflowError, OSError):
+        return f"{stamp_ns} ns"
+
+
+def run_export(path: Path, output: Path | None, keys: str, since: str, until: str, *, arrays: bool) -> None:
+    """Write a recording as tables or arrays."""
+    begin_ns = first_ns(path)
+    selection = Selection(
+        keys or None,
+        amounts.read_moment("from", since, begin_ns) if since else 0,
+        amounts.read_moment("to", until, begin_ns) if until else 2**64,
+    )
+    output = output or path.with_suffix(".npz" if arrays else "")
+    if output == path or (arrays and output.exists()):
+        raise ConfigError(f"{output} exists: give another name with -o")
+    try:
+        done = (export_arrays if arrays else export_tables)(path, output, selection)
+    except OSError as error:
+        raise ZbridgeError(f"{error.filename or output}: {error.strerror or error}") from error
+    errors.print(
+        shown(f"{done.messages} messages to {output}, {done.files} files, {done.skipped} without a form there")
+    )
+    if done.fault is not None:
+        errors.print(shown(f"the recording is not whole: {done.fault}"))

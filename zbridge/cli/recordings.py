@@ -1,0 +1,163 @@
+"""Declares ``zbridge record, info, export, mark, replay``; ``recorded`` and ``replayed`` carry them out."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from zbridge.cli import give_up, run_loop, set_up_log
+from zbridge.cli.options import Connect, Realm, TlsFolder, check_name
+from zbridge.client import bus_settings
+
+app = typer.Typer()
+
+Recorded = Annotated[Path, typer.Argument(help="a recording (MCAP)", show_default=False)]
+Since = Annotated[str, typer.Option("--from", help="begin here: 12.5, 1:30, or a time of day: 2026-11-22T05:00:00")]
+Until = Annotated[str, typer.Option("--to", help="end here; written as --from")]
+
+
+@app.command()
+def record(
+    robots: Annotated[list[str] | None, typer.Argument(help="names of robots", show_default=False)] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="the file to write (MCAP)", show_default=False)] = ...,  # type: ignore[assignment]
+    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    keys: Annotated[str, typer.Option(help="a key expression instead of robots")] = "",
+    only: Annotated[str, typer.Option(help="fleet: messages as they were; foxglove: their pictures; else both")] = "",
+    wire: Annotated[bool, typer.Option("--wire", help="raw legacy frames too")] = False,
+    split: Annotated[str, typer.Option(help="begin another file after this size or time: 1GB, 10min")] = "",
+    keep: Annotated[int, typer.Option(help="keep the last N files; with --split", min=0)] = 0,
+    duration: Annotated[str, typer.Option(help="end after this time: 90s, 10min, 1h")] = "",
+    compression: Annotated[str, typer.Option(help="zstd, lz4 or none")] = "zstd",
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(help="a gateway's configuration, to be kept in the recording without its secrets"),
+    ] = None,
+    buffer: Annotated[str, typer.Option(help="how much may wait for a slow disk")] = "64MiB",
+    connect: Connect = [],  # noqa: B006
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Record robots, or all of them, until SIGTERM or SIGINT: every key, commands and refusals too."""
+    from zbridge.cli.recorded import RecordOptions, run_record
+
+    set_up_log(verbose=False, level=logging.WARNING)
+    if sum(map(bool, (robots, everything, keys))) != 1:
+        give_up(2, "name ROBOTs, or give --all or --keys")
+    for robot in robots or ():
+        check_name("ROBOT", robot)
+    options = RecordOptions(
+        output=output,
+        robots=tuple(dict.fromkeys(robots or ())),
+        keys=keys or None,
+        only=only or None,
+        wire=wire,
+        split=split or None,
+        keep=keep or None,
+        duration=duration or None,
+        compression=compression,
+        configs=tuple(config or ()),
+        buffer=buffer,
+        realm=realm,
+    )
+    if not run_loop(run_record(bus_settings(connect, tls), options)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def info(
+    file: Recorded,
+    json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
+) -> None:
+    """Say what a recording holds: robots, keys, counts, rates, gaps, and whether it was cut off."""
+    from zbridge.cli.recorded import show_info
+
+    show_info(file, as_json=json)
+
+
+@app.command()
+def export(
+    file: Recorded,
+    csv: Annotated[bool, typer.Option("--csv", help="a table for each key")] = False,
+    npz: Annotated[bool, typer.Option("--npz", help="scans and poses as numpy arrays")] = False,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="folder of the tables, or file of the arrays")
+    ] = None,
+    keys: Annotated[str, typer.Option(help="only keys that this expression matches")] = "",
+    since: Since = "",
+    until: Until = "",
+) -> None:
+    """Write a recording as tables or as numpy arrays."""
+    from zbridge.cli.recorded import run_export
+
+    if csv == npz:
+        give_up(2, "give either --csv or --npz")
+    run_export(file, output, keys, since, until, arrays=npz)
+
+
+@app.command()
+def mark(
+    text: Annotated[str, typer.Argument(help="what happened", show_default=False)],
+    who: Annotated[str, typer.Option(help="who says so; user@host by default")] = "",
+    connect: Connect = [],  # noqa: B006
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Write an event into all running recordings of the realm."""
+    from zbridge.cli.recorded import put_mark
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    run_loop(put_mark(bus_settings(connect, tls), realm, text, who or None))
+
+
+@app.command()
+def replay(
+    file: Recorded,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay"),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
+    loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,
+    since: Since = "",
+    until: Until = "",
+    pause: Annotated[bool, typer.Option("--pause", help="wait; Enter goes on, and pauses again")] = False,
+    hq: Annotated[
+        list[str] | None,
+        typer.Option(help="serve old HQ programs: PROTOCOL:PORT, PROTOCOL:HOST:PORT or a file with [[hq]]"),
+    ] = None,
+    as_robot: Annotated[
+        str, typer.Option("--as-robot", help="be the legacy robot itself, from its raw frames; the protocol's name")
+    ] = "",
+    listen: Annotated[
+        list[str] | None, typer.Option(help="where the legacy robot listens, tcp://host:port; once for each link")
+    ] = None,
+    connect: Connect = [],  # noqa: B006
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Replay a recording onto the bus under another name, or to a gateway as the legacy robot itself."""
+    from zbridge.cli import replayed
+
+    set_up_log(verbose=False, level=logging.WARNING)
+    if bool(as_robot) != bool(listen):
+        give_up(2, "--as-robot and --listen belong together")
+    if as_robot:
+        if hq or loop or pause or since or until:
+            give_up(2, "--as-robot replays a recording once and whole: no --hq, --loop, --pause, --from, --to")
+        run_loop(replayed.run_wire(file, as_robot, listen or [], robot or [], speed, realm))
+        return
+    options = replayed.ReplayOptions(
+        path=file,
+        realm=realm,
+        robots=tuple(robot or ()),
+        speed=speed,
+        loop=loop,
+        since=since,
+        until=until,
+        pause=pause,
+        hq=tuple(hq or ()),
+    )
+    run_loop(replayed.run_replay(bus_settings(connect, tls), options))

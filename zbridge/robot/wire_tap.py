@@ -1,0 +1,92 @@
+"""Shows the raw frames of one link to those who listen (``@wire``). Knows no bus.
+
+Theory of operation. Who listens from the start may still be heard of after the first frames of a connection: these are
+kept, in order, to the end of the handshake, and the first listener is shown them first, whenever it comes. A listener
+of one direction appears shortly before the listener of the other one, so that what is kept is shown :data:`SETTLE_S`
+after the first appeared; what comes meanwhile waits behind it. While nobody listens and nothing more is kept the
+session calls nobody.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from zbridge.protocol.session import Session, State
+
+log = logging.getLogger("zbridge.link")
+
+FIRST = 16
+"""First frames of a conversation that are kept, also where there is no handshake."""
+KEPT = 64
+"""Most frames that are kept while the handshake goes on."""
+KEPT_BYTES = 65_536
+"""Bytes that are kept."""
+SETTLE_S = 0.02
+"""Seconds between the first listener and what was kept: both directions have theirs by then."""
+_LOGGED = 64
+
+Show = Callable[[bytes], object]
+
+
+class WireTap:
+    """Follows the conversations of one link. label: of the link in the log."""
+
+    def __init__(self, label: str) -> None:
+        self._label = label
+        self._session: Session[Any] | None = None
+        self._shows: dict[str, Show] = {}
+        self._kept: list[tuple[str, bytes]] = []
+        self._kept_bytes = 0
+        self._waiting: list[tuple[str, bytes]] | None = None
+        """What the first listener is to be shown: what was kept before it appeared, and what came since."""
+
+    def __repr__(self) -> str:
+        return f"<WireTap {self._label} shown {sorted(self._shows)}, {len(self._kept)} kept>"
+
+    def begin(self, session: Session[Any]) -> None:
+        """Follow a new conversation from its first frame."""
+        self._session, self._kept, self._kept_bytes = session, [], 0
+        session.tap = self._take
+
+    def watch(self, direction: str, show: Show | None) -> None:
+        """Show the frames of one direction (``in`` or ``out``) from now on, the kept ones first; None: show none."""
+        if show is None:
+            self._shows.pop(direction, None)
+            return
+        if not self._shows and self._waiting is None:
+            self._waiting = list(self._kept)
+            asyncio.get_running_loop().call_later(SETTLE_S, self._show_kept)
+        self._shows[direction] = show
+        if self._session is not None:
+            self._session.tap = self._take
+
+    def _take(self, direction: str, frame: bytes) -> None:
+        debug = log.isEnabledFor(logging.DEBUG)
+        if debug:
+            log.debug("%s %s %s", "<" if direction == "in" else ">", self._label, frame[:_LOGGED].hex(" "))
+        if self._waiting is not None:
+            if len(self._waiting) < 2 * KEPT:
+                self._waiting.append((direction, frame))
+        elif show := self._shows.get(direction):
+            show(frame)
+        if self._keeps:
+            self._kept.append((direction, frame))
+            self._kept_bytes += len(frame)
+        elif not (debug or self._shows or self._waiting is not None) and self._session is not None:
+            self._session.tap = None
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether the conversation has just begun, within the bounds of what is kept."""
+        session = self._session
+        begins = session is not None and session.state in (State.CONNECTING, State.HANDSHAKING)
+        return len(self._kept) < (KEPT if begins else FIRST) and self._kept_bytes < KEPT_BYTES
+
+    def _show_kept(self) -> None:
+        waiting, self._waiting = self._waiting or (), None
+        for direction, frame in waiting:
+            if show := self._shows.get(direction):
+                show(frame)

@@ -1,0 +1,91 @@
+"""Carries what arrives on the bus to the writing thread, within a bound in bytes. Knows no file and no bus.
+
+Bus threads put, the writing thread takes all at once. What does not fit is dropped and counted by key: the newest, so
+that what is recorded has one hole instead of many.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+import msgspec
+
+BOUND_BYTES = 64 * 2**20
+"""Bytes that may wait for the disk."""
+OVERHEAD_BYTES = 200
+"""What a message costs in memory besides its payload, about."""
+KEYS = 4096
+"""Keys whose losses are counted apart; those of all others are counted together."""
+OTHERS = "(other keys)"
+
+
+class Arrival(msgspec.Struct, frozen=True, gc=False):
+    """One message as it came in. arrived_ns: Unix time."""
+
+    arrived_ns: int
+    key: str
+    payload: bytes
+    attachment: bytes | None = None
+
+
+class Losses:
+    """Messages lost, by key. One thread adds."""
+
+    def __init__(self) -> None:
+        self.by_key: dict[str, int] = {}
+
+    def __repr__(self) -> str:
+        return f"<Losses {self.total} of {len(self.by_key)} keys>"
+
+    @property
+    def total(self) -> int:
+        """Messages lost on all keys."""
+        return sum(self.by_key.values())
+
+    def add(self, key: str, count: int = 1) -> None:
+        """Count lost messages of one key."""
+        if key not in self.by_key and len(self.by_key) >= KEYS:
+            key = OTHERS
+        self.by_key[key] = self.by_key.get(key, 0) + count
+
+
+class Intake:
+    """The queue between bus and disk. ``clock_ns``: Unix time."""
+
+    def __init__(self, bound_bytes: int = BOUND_BYTES, clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self.dropped = Losses()
+        self._bound = bound_bytes
+        self._clock_ns = clock_ns
+        self._lock = threading.Lock()
+        self._waiting: list[Arrival] = []
+        self._bytes = 0
+        self._taken = 0
+
+    def __repr__(self) -> str:
+        return f"<Intake {len(self._waiting)} waiting, {self.dropped.total} dropped>"
+
+    def put(self, key: str, payload: bytes, attachment: bytes | None = None) -> bool:
+        """Queue a message, from any thread; False where it was dropped. Arrival times rise along the queue."""
+        size = len(payload) + (len(attachment) if attachment is not None else 0)
+        return self.put_seen(key, size, lambda: payload, attachment)
+
+    def put_seen(self, key: str, size: int, look: Callable[[], bytes], attachment: bytes | None) -> bool:
+        """Queue a message of ``size`` bytes, whose payload is looked at only where there is room for it."""
+        size += OVERHEAD_BYTES
+        with self._lock:
+            if self._bytes + size > self._bound:
+                self.dropped.add(key)
+                return False
+            self._bytes += size
+            self._waiting.append(Arrival(self._clock_ns(), key, look(), attachment))
+        return True
+
+    def take(self) -> list[Arrival]:
+        """Take all that waits. The messages taken before count as written now."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+            self._bytes -= self._taken
+            self._taken = self._bytes
+        return waiting

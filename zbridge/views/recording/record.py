@@ -1,0 +1,138 @@
+"""Follows robots on the bus as any viewer does, and gives a recorder all that they and others say.
+
+Theory of operation. Each key expression has one subscription, whose samples the bus's own thread puts into the intake:
+they never wait for the event loop. When a robot's gateway appears its states are asked for, since those that it
+published before are not repeated; an answer older than what came live meanwhile is left out. Session tables are asked
+for every :data:`SESSIONS_S`. Tokens that come and go are recorded as ``Alive``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+
+import msgspec
+
+from zbridge.bus import Bus, Handle, Lane, Look, Sample
+from zbridge.errors import BusError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.topics import split_key
+from zbridge.views.recording.channels import Alive
+from zbridge.views.recording.intake import Intake
+
+SESSIONS_S = 10.0
+"""Seconds between two questions for the session tables."""
+ASK_AFTER_S = (0.0, 0.1, 0.4, 1.5)
+"""Seconds before each question for the states of a robot that does not answer."""
+ASKED_AT_ONCE = 256
+"""Robots that are asked at the same time."""
+LIVE_KEYS = 4096
+"""Keys that are noted as live while robots are asked."""
+
+
+class RecordPlan(msgspec.Struct, frozen=True):
+    """What is recorded. robots: their names; empty: all. keys: a key expression instead. wire: raw frames too."""
+
+    realm: str = "fleet"
+    robots: tuple[str, ...] = ()
+    keys: str | None = None
+    wire: bool = False
+
+    @property
+    def key_exprs(self) -> tuple[str, ...]:
+        """The key expressions that are subscribed to; no key matches two of them."""
+        if self.keys is not None:
+            return (self.keys,)
+        parts = ["**", "@cmd/**", *(["@wire/**"] if self.wire else [])]
+        below = [f"{self.realm}/{robot}/{part}" for robot in self.robots or ("*",) for part in parts]
+        if not self.robots:
+            below[0] = f"{self.realm}/**"  # as access rules allow it
+        return (*below, f"{self.realm}/@mark")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The robots' names, or a wildcard; none where a key expression is recorded."""
+        return () if self.keys is not None else self.robots or ("*",)
+
+
+class Recording:
+    """Gives an intake what the bus carries, from :meth:`open` to :meth:`close`."""
+
+    def __init__(self, bus: Bus, plan: RecordPlan, intake: Intake) -> None:
+        self._bus = bus
+        self._plan = plan
+        self._intake = intake
+        self._handles: list[Handle] = []
+        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._live: set[str] = set()
+        self._sessions: asyncio.Task[None] | None = None
+
+    def __repr__(self) -> str:
+        return f"<Recording {self._plan.key_exprs}>"
+
+    def open(self) -> None:
+        """Subscribe."""
+        for key_expr in self._plan.key_exprs:
+            self._handles.append(self._bus.subscribe(key_expr, self._store, lane=self._take))
+        realm = self._plan.realm
+        for name in self._plan.names:
+            self._handles.append(self._bus.watch_alive(f"{realm}/{name}/@alive/*", self._on_token))
+        if self._plan.names:
+            self._sessions = asyncio.get_running_loop().create_task(self._ask_sessions())
+
+    def close(self) -> None:
+        """Unsubscribe; idempotent."""
+        handles, self._handles = self._handles, []
+        for handle in handles:
+            handle.close()
+        for task in (*self._asking.values(), *((self._sessions,) if self._sessions else ())):
+            task.cancel()
+        self._asking.clear()
+
+    def _take(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        """Store a sample; on Zenoh's threads. The intake counts what it drops."""
+        self._intake.put_seen(key, size, look, shown)
+        if self._asking and len(self._live) < LIVE_KEYS:
+            self._live.add(key)
+        return None
+
+    def _store(self, sample: Sample) -> None:
+        """Store a sample of a bus that has no lanes."""
+        self._take(sample.key, sample.attachment, len(sample.payload), lambda: sample.payload)
+
+    def _on_token(self, key: str, alive: bool) -> None:
+        self._intake.put(key, payloads.encode(Alive(alive=alive)))
+        split = split_key(key)
+        if split is None or split[2] != "@alive/gateway":
+            return
+        asked = self._asking.pop(split[1], None)
+        if asked is not None:
+            asked.cancel()
+        if alive and len(self._asking) < ASKED_AT_ONCE:
+            self._asking[split[1]] = asyncio.get_running_loop().create_task(self._ask_states(split[1]))
+
+    async def _ask_states(self, robot: str) -> None:
+        for after_s in ASK_AFTER_S:
+            await asyncio.sleep(after_s)
+            if await self._asked(f"{self._plan.realm}/{robot}/*", lambda key: key not in self._live):
+                break
+        self._asking.pop(robot, None)
+        if not self._asking:
+            self._live.clear()
+
+    async def _ask_sessions(self) -> None:
+        while True:
+            for name in self._plan.names:
+                await self._asked(f"{self._plan.realm}/{name}/@rpc/sessions/*", lambda key: True)
+            await asyncio.sleep(SESSIONS_S)
+
+    async def _asked(self, key_expr: str, wanted: Callable[[str], bool]) -> bool:
+        """Record the answers of a question; False where nobody answered."""
+        answers = []
+        with contextlib.suppress(BusError):
+            answers = [answer for answer in await self._bus.ask(key_expr) if answer.error is None]
+        for answer in answers:
+            if wanted(answer.key):
+                self._intake.put(answer.key, answer.payload)
+        return bool(answers)

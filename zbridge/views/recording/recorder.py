@@ -1,0 +1,307 @@
+"""The thread that writes what arrives on the bus to the files of a recording.
+
+Theory of operation. Every :data:`PAUSE_S` the thread takes all that waits in the intake. A message goes to the channel
+of its key as it was; a command is followed by its sender; a message that has a picture by its pictures. Log time is the
+time of arrival, publish time the message's ``stamp_ns``. A disk that takes nothing more ends the recording: the files
+are ended with what they hold, ``error`` says why, and what still arrives is counted as lost.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+
+import msgspec
+
+from zbridge.errors import PayloadError, ZbridgeError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control, Status
+from zbridge.fleet.topics import Delivery, Topic, split_key
+from zbridge.views.recording.channels import SENT, ChannelKind, Sent, channel_of, is_command, read_sender
+from zbridge.views.recording.files import CHANNELS, Tape
+from zbridge.views.recording.intake import Arrival, Intake, Losses
+from zbridge.views.recording.pictures import Pictures
+
+log = logging.getLogger("zbridge.views.recording")
+
+PAUSE_S = 0.05
+"""Seconds between two looks at the intake."""
+ROBOTS = 4096
+"""Most robots whose leases, states and descriptions are followed."""
+STATES = 16_384
+"""Most state keys whose last value is repeated at the begin of each file."""
+_LEASES = 16
+"""Leases of one robot whose holders are known."""
+_LATEST_NS = 2**63
+
+
+class _Stamp(msgspec.Struct, gc=False):
+    """The fields of a payload that matter to a recording."""
+
+    stamp_ns: int = -1
+    seq: int = -1
+
+
+_read_stamp = msgspec.msgpack.Decoder(_Stamp).decode
+
+
+class _Track:
+    """One key of the recording. channel: its id in the file of ``number``."""
+
+    __slots__ = ("channel", "count", "kind", "number", "pictured", "seen", "seq", "topic")
+
+    def __init__(self, kind: ChannelKind, topic: Topic | None) -> None:
+        self.kind = kind
+        self.topic = topic
+        self.number = 0
+        self.channel: int | None = None
+        self.count = 0
+        self.seq = -1
+
+
+class Recorder:
+    """Writes until :meth:`close`. metadata: written at the begin of each file. failed: called when the disk is full.
+
+    fleet: record the messages as they were. pictures: what draws them, None for none. All methods but the thread's own
+    may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        tape: Tape,
+        intake: Intake,
+        metadata: Mapping[str, Mapping[str, str]],
+        *,
+        fleet: bool = True,
+        pictures: Pictures | None = None,
+        failed: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.error: str | None = None
+        self.messages = 0
+        self.missing = Losses()
+        """Messages that a sequence shows as lost before they came here."""
+        self.refused = Losses()
+        """Messages of channels that had no place in a file."""
+        self._tape = tape
+        self._intake = intake
+        self._metadata = dict(metadata)
+        self._fleet = fleet
+        self._pictures = pictures
+        self._failed = failed
+        self._tracks: dict[tuple[str, bool], _Track] = {}
+        self._by_kind: dict[ChannelKind, _Track] = {}
+        self._holders: dict[str, OrderedDict[bytes, str]] = {}
+        self._states: dict[str, Arrival] = {}
+        self._described: dict[str, dict[str, str]] = {}
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="zbridge-record", daemon=True)
+
+    def __repr__(self) -> str:
+        return f"<Recorder {self._tape!r}, {self.messages} messages>"
+
+    def start(self) -> None:
+        """Begin the first file; raise ZbridgeError where that is not possible."""
+        try:
+            self._tape.begin(time.monotonic(), self._metadata)
+        except FileExistsError as error:
+            raise ZbridgeError(f"{error.filename} exists: give another name") from error
+        except OSError as error:
+            raise ZbridgeError(f"{error.filename or 'the file'}: {error.strerror}") from error
+        self._thread.start()
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Write what waits, end the file, and return; idempotent."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+        for arrival in self._intake.take():
+            self._tape.unwritten.add(arrival.key)
+
+    def losses(self) -> dict[str, dict[str, int]]:
+        """Return what was lost, by reason and key."""
+        reasons = {
+            "the disk was too slow": self._intake.dropped,
+            "not written": self._tape.unwritten,
+            "too many channels": self.refused,
+            "missing in the sequence": self.missing,
+        }
+        return {reason: dict(losses.by_key) for reason, losses in reasons.items() if losses.total}
+
+    # The thread
+
+    def _run(self) -> None:
+        try:
+            self._work()
+            self._tape.close()
+        except OSError as error:
+            self._give_up(error.strerror or str(error))
+        except Exception as error:
+            log.exception("the recording failed")
+            self._give_up(f"{type(error).__name__}: {error}")
+
+    def _work(self) -> None:
+        while True:
+            ending = self._ending.wait(PAUSE_S)  # looked at first: what came before it is still written
+            batch = self._intake.take()
+            self._write_batch(batch)
+            if ending:
+                return
+
+    def _write_batch(self, batch: list[Arrival]) -> None:
+        tape = self._tape
+        for done, arrival in enumerate(batch):
+            try:
+                self._write(arrival)
+                if not done % 256:
+                    tape.keep_time(time.monotonic())
+                    if tape.full(time.monotonic()):
+                        self._next_file(arrival.arrived_ns)
+            except OSError:
+                for lost in batch[done + 1 :]:
+                    tape.unwritten.add(lost.key)
+                raise
+        now = time.monotonic()
+        tape.keep_time(now)
+        if tape.full(now):
+            self._next_file(time.time_ns())
+
+    def _give_up(self, why: str) -> None:
+        ended = self._tape.salvage()
+        self.error = f"the recording ends: {why}" + ("" if ended else "; the file has no proper end")
+        self._failed()
+        while not self._ending.wait(PAUSE_S):
+            for arrival in self._intake.take():
+                self._tape.unwritten.add(arrival.key)
+
+    def _next_file(self, now_ns: int) -> None:
+        """Begin another file, with the last value of every state: each file stands for itself."""
+        described = {f"robot/{robot}": pairs for robot, pairs in self._described.items()}
+        self._tape.begin(time.monotonic(), self._metadata | described)
+        for key, last in self._states.items():
+            self._write_own(self._track(key, None), msgspec.structs.replace(last, arrived_ns=now_ns))
+
+    # One message
+
+    def _write(self, arrival: Arrival) -> None:
+        track = self._tracks.get((arrival.key, arrival.attachment == topics.WIRE_DATAGRAM)) or self._track(
+            arrival.key, arrival.attachment
+        )
+        self.messages += 1
+        publish_ns = self._write_own(track, arrival)
+        topic = track.topic
+        if topic is not None:
+            if topic.delivery is Delivery.STATE:
+                self._note_state(topic, arrival)
+            elif topic.delivery is Delivery.COMMAND:
+                self._write_sender(arrival, publish_ns)
+            if self._pictures is not None and topic.delivery is not Delivery.COMMAND:
+                self._draw(topic, arrival)
+
+    def _write_own(self, track: _Track, arrival: Arrival) -> int:
+        """Write a message as it was; return its publish time."""
+        publish_ns = arrival.arrived_ns
+        if track.topic is not None:
+            try:
+                stamp = _read_stamp(arrival.payload)
+            except (msgspec.MsgspecError, ValueError, RecursionError):
+                pass
+            else:
+                if 0 < stamp.stamp_ns < _LATEST_NS:
+                    publish_ns = stamp.stamp_ns
+                if stamp.seq >= 0:
+                    if 0 <= track.seq < stamp.seq - 1:
+                        self.missing.add(arrival.key, stamp.seq - track.seq - 1)
+                    track.seq = stamp.seq
+        if self._fleet:
+            self._put(track, arrival.arrived_ns, publish_ns, arrival.payload)
+        return publish_ns
+
+    def _put(self, track: _Track, log_ns: int, publish_ns: int, data: bytes) -> None:
+        if track.number != self._tape.number:
+            track.number, track.channel = self._tape.number, self._tape.register(track.kind)
+        if track.channel is None:
+            self.refused.add(track.kind.topic)
+            return
+        track.count += 1
+        self._tape.write(track.kind.topic, track.channel, log_ns, publish_ns, track.count & 0xFFFFFFFF, data)
+
+    def _track(self, key: str, attachment: bytes | None) -> _Track:
+        """Describe a key that is new. Only so many are remembered: a robot may invent names without end."""
+        datagram = attachment == topics.WIRE_DATAGRAM
+        split = split_key(key)
+        topic = topics.find(split[2]) if split is not None else None
+        if topic is not None and topic.delivery is Delivery.QUERY:
+            topic = None
+        track = _Track(channel_of(key, datagram=datagram), topic)
+        if len(self._tracks) < 2 * CHANNELS:
+            self._tracks[key, datagram] = track
+        return track
+
+    def _extra(self, kind: ChannelKind) -> _Track:
+        """Return the channel of something that has no key of its own."""
+        track = self._by_kind.get(kind)
+        if track is None:
+            track = _Track(kind, None)
+            if len(self._by_kind) < 2 * CHANNELS:
+                self._by_kind[kind] = track
+        return track
+
+    def _write_sender(self, arrival: Arrival, publish_ns: int) -> None:
+        if not (self._fleet and is_command(arrival.key)):
+            return
+        lease = read_sender(arrival.attachment)
+        holders: Mapping[bytes, str] = self._holders.get(arrival.key.partition("/@cmd/")[0], {})
+        sent = Sent(
+            lease=lease, holder=holders.get(lease) if lease is not None else None, attachment=arrival.attachment or b""
+        )
+        track = self._tracks.get((arrival.key + SENT, False)) or self._track(arrival.key + SENT, None)
+        self._put(track, arrival.arrived_ns, publish_ns, payloads.encode(sent))
+
+    def _note_state(self, topic: Topic, arrival: Arrival) -> None:
+        key = arrival.key
+        if key in self._states or len(self._states) < STATES:
+            self._states[key] = arrival
+        robot = key.rpartition("/")[0]
+        try:
+            if topic is topics.CONTROL:
+                self._note_holder(robot, payloads.decode(Control, arrival.payload))
+            elif topic is topics.STATUS:
+                self._describe(robot, payloads.decode(Status, arrival.payload))
+        except PayloadError:
+            return
+
+    def _note_holder(self, robot: str, control: Control) -> None:
+        if control.lease is None or control.holder is None:
+            return
+        if robot not in self._holders and len(self._holders) >= ROBOTS:
+            return
+        holders = self._holders.setdefault(robot, OrderedDict())
+        holders[control.lease] = control.holder
+        holders.move_to_end(control.lease)
+        if len(holders) > _LEASES:
+            holders.popitem(last=False)
+
+    def _describe(self, robot: str, status: Status) -> None:
+        """Write what a robot is, once it is known, and when it changes."""
+        if status.state != "established":
+            return
+        name = robot.rpartition("/")[2]
+        pairs = {
+            "robot": name,
+            "protocol": status.protocol or "",
+            "dialect": status.dialect or "",
+            "version": status.version or "",
+            "features": ", ".join(status.features),
+        }
+        if self._described.get(name) != pairs and (name in self._described or len(self._described) < ROBOTS):
+            self._described[name] = pairs
+            self._tape.add_metadata(f"robot/{name}", pairs)
+
+    def _draw(self, topic: Topic, arrival: Arrival) -> None:
+        assert self._pictures is not None
+        for kind, publish_ns, data in self._pictures.draw(arrival.key, topic, arrival.payload, arrival.arrived_ns):
+            self._put(self._extra(kind), arrival.arrived_ns, publish_ns, data)

@@ -1,0 +1,207 @@
+"""A recorded robot on the bus under another name. It is seen as a robot, and says that it is a recording.
+
+Theory of operation. ``status`` has the protocol ``replay``; whatever wants to move it, or asks for its lease, is
+refused with ``unsupported`` and shown on ``control``. Streams and states are published as they were, with new stamps;
+``status`` and ``control`` are repeated once a second where the recording does not. Messages come from the player's
+thread, everything else happens on the event loop. A query for map or pose is answered with the last one played.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import msgspec
+
+from zbridge.bus import Bus, Handle, IncomingQuery, Lane, Look, Publisher, Sample
+from zbridge.control.refusal_counts import RefusalCounts
+from zbridge.errors import NotReady, PayloadError, Unsupported
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control, FleetMessage, Query, Status
+from zbridge.fleet.topics import Delivery, KeySpace, Topic
+from zbridge.protocol.rate_limit import RateLimit
+from zbridge.views.recording.reader import Message
+from zbridge.views.recording.stamps import with_stamp
+
+PROTOCOL = "replay"
+"""What ``status`` shows in place of the robot's protocol."""
+BEAT_S = 1.0
+"""Seconds after which ``status`` and ``control`` are repeated."""
+REFUSALS_HZ = 100.0
+"""Commands a second that are refused with a word; those above are only counted."""
+KEYS = 4096
+"""Most keys that a replayed robot publishes."""
+_CONTROL_S = 0.05
+_REFUSED = Unsupported("a recording")
+_LEASE = ("acquire/*", "takeover/*", "renew", "release")
+
+
+class ReplayedRobot:
+    """Publishes what a recording says of one robot. says: the reason that ``status`` shows."""
+
+    def __init__(self, bus: Bus, keys: KeySpace, says: str, clock_ns: Callable[[], int] = time.time_ns) -> None:
+        self.recorded_protocol: str | None = None
+        """The robot's own protocol, as its last status said."""
+        self.unplayed = 0
+        """Messages that could not be read, or whose key has no place."""
+        self._bus = bus
+        self._keys = keys
+        self._says = says
+        self._clock_ns = clock_ns
+        self._publishers: dict[str, Publisher] = {}
+        self._topics: dict[str, Topic | None] = {}
+        self._last: dict[str, bytes] = {}
+        """The last map and pose."""
+        self._status = Status(state="established", protocol=PROTOCOL, reason=says)
+        self._control = Control(state="free")
+        self._told: dict[str, float] = {}
+        self._refusals = RefusalCounts()
+        self._rate = RateLimit(REFUSALS_HZ)
+        self._handles: list[Handle] = []
+        self._beating: asyncio.Task[None] | None = None
+        self._control_due: asyncio.TimerHandle | None = None
+
+    def __repr__(self) -> str:
+        return f"<ReplayedRobot {self._keys.robot}>"
+
+    def begin(self, status: Status | None) -> None:
+        """Show this status of the recording until it is played."""
+        if status is not None:
+            self._note_status(status)
+
+    def open(self) -> None:
+        """Appear on the bus, and refuse commands from now on."""
+        bus, key = self._bus, self._keys.key
+        self._handles = [
+            bus.subscribe(key("@cmd/**"), self._on_command, lane=self._sort),
+            *(bus.answer(key(f"@rpc/control/{name}"), self._on_lease) for name in _LEASE),
+            bus.answer(key("@rpc/control/refused/*"), lambda query: query.answer(payloads.encode(Query()))),
+            bus.answer(key(topics.RPC_MAP.path), self._on_question),
+            bus.answer(key(topics.RPC_POSE.path), self._on_question),
+        ]
+        self._publish_status()
+        self._publish_control()
+        self._beating = asyncio.get_running_loop().create_task(self._beat())
+
+    def close(self) -> None:
+        """Leave the bus; idempotent."""
+        if self._control_due is not None:
+            self._control_due.cancel()
+        if self._beating is not None:
+            self._beating.cancel()
+        handles, self._handles = self._handles, []
+        publishers, self._publishers = self._publishers, {}
+        for each in (*handles, *publishers.values()):
+            each.close()
+
+    # On the player's thread
+
+    def play(self, path: str, message: Message) -> None:
+        """Publish a message of the recording, whose key ends with ``path``."""
+        topic = self._topic(path)
+        if topic is None:
+            return
+        now_ns = self._clock_ns()
+        payload = with_stamp(message.data, now_ns - max(0, message.log_ns - message.publish_ns))
+        if topic is topics.STATUS or topic is topics.CONTROL:
+            self._play_state(topic, payload)
+            return
+        if topic is topics.MAP or topic is topics.POSE:
+            self._last[path] = payload
+        self._put(topic, payload)
+
+    def _play_state(self, topic: Topic, payload: bytes) -> None:
+        try:
+            if topic is topics.STATUS:
+                self._note_status(payloads.decode(Status, payload))
+                self._publish_status()
+            else:
+                self._control = payloads.decode(Control, payload)
+                self._publish_control()
+        except PayloadError:
+            self.unplayed += 1
+
+    def _note_status(self, status: Status) -> None:
+        if status.protocol not in (None, PROTOCOL):
+            self.recorded_protocol = status.protocol
+        reason = f"{self._says}; {status.reason}" if status.reason else self._says
+        self._status = msgspec.structs.replace(status, protocol=PROTOCOL, reason=reason)
+
+    def _topic(self, path: str) -> Topic | None:
+        """Return the topic of what is published of a path; None for commands, queries and what is not known."""
+        if path in self._topics:
+            return self._topics[path]
+        topic = None if path.startswith("@") else topics.find(path)
+        if topic is None or topic.delivery not in (Delivery.STREAM, Delivery.STATE) or len(self._topics) >= KEYS:
+            self.unplayed += not path.startswith("@")
+            topic = None
+        if len(self._topics) < KEYS:
+            self._topics[path] = topic
+        return topic
+
+    def _put(self, topic: Topic, payload: bytes) -> None:
+        publisher = self._publishers.get(topic.path)
+        if publisher is None:
+            publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
+        if topic.delivery is Delivery.STREAM:
+            self._bus.put_all([(publisher, [payload])])
+        else:
+            publisher.put(payload)
+
+    # On the event loop, or the player's thread
+
+    def _publish_status(self) -> None:
+        self._tell(topics.STATUS, msgspec.structs.replace(self._status, stamp_ns=self._clock_ns()))
+
+    def _publish_control(self) -> None:
+        refusals = (*self._control.refusals, *self._refusals.shown())
+        shown = msgspec.structs.replace(self._control, stamp_ns=self._clock_ns(), lease=None, refusals=refusals)
+        self._tell(topics.CONTROL, shown)
+
+    def _tell(self, topic: Topic, message: FleetMessage) -> None:
+        self._told[topic.path] = time.monotonic()
+        self._put(topic, payloads.encode(message))
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(BEAT_S / 4)
+            now = time.monotonic()
+            if now - self._told[topics.STATUS.path] > BEAT_S * 1.2:
+                self._publish_status()
+            if now - self._told[topics.CONTROL.path] > BEAT_S * 1.2:
+                self._publish_control()
+
+    # On the event loop
+
+    def _sort(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+        return Lane.OTHER if self._rate.take(time.monotonic()) else None
+
+    def _on_command(self, sample: Sample) -> None:
+        self._refuse(sample.key.rpartition("@cmd/")[2])
+
+    def _on_lease(self, query: IncomingQuery) -> None:
+        query.refuse(_REFUSED)
+        self._refuse(query.asked.rpartition("@rpc/control/")[2].partition("/")[0])
+
+    def _on_question(self, query: IncomingQuery) -> None:
+        path = query.key.rpartition("@rpc/")[2]
+        payload = self._last.get(path)
+        if payload is None:
+            query.refuse(NotReady("a recording, which has shown none yet"))
+        else:
+            query.answer(payload)
+
+    def _refuse(self, command: str) -> None:
+        """Count a refusal, and show it soon. A refused stop is shown as such at once: a recording is at rest."""
+        self._refusals.add(command, _REFUSED, None, None, 1)
+        if command == "stop":
+            control = msgspec.structs.replace(self._control, state="stopped", refusals=self._refusals.shown())
+            self._tell(topics.CONTROL, msgspec.structs.replace(control, stamp_ns=self._clock_ns(), lease=None))
+        if self._control_due is None:
+            self._control_due = asyncio.get_running_loop().call_later(_CONTROL_S, self._show_refusals)
+
+    def _show_refusals(self) -> None:
+        self._control_due = None
+        self._publish_control()

@@ -2,7 +2,7 @@
 restart, certs, record, info, export, mark, replay``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
-``app`` declares the commands, ``certs`` those of ``zbridge certs``, ``recordings`` those of recordings; ``bus``,
+``app`` declares the commands, ``certs``, ``robots`` and ``recordings`` do for groups of them; ``bus``,
 ``demo`` (with ``secure_demo`` and ``processes``), ``drive``, ``foxglove``, ``health``, ``probe``, ``recorded``,
 ``replayed``, ``restart``, ``router`` and ``supervise`` carry theirs out, ``keyboard`` turns keys into drives,
 ``fork_server`` is the process that gateways of ``zbridge run DIR`` are forked from. Exit codes: 0 done, 1 failed, 2

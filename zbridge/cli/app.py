@@ -12,8 +12,8 @@ from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
-from zbridge.cli import certs, give_up, hand_on_tls, recordings, run_gateway, run_loop, run_together, set_up_log
-from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
+from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
+from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
@@ -28,6 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(certs.app, name="certs")
+app.add_typer(robots.app)
 app.add_typer(recordings.app)
 
 File = Annotated[Path, typer.Argument(help="a gateway's configuration (TOML)", show_default=False)]
@@ -228,164 +229,3 @@ def router(
         "insecure": insecure,
     }
     run_router(file, given, print_config=print_config, print_nftables=print_nftables)
-
-
-@app.command()
-def foxglove(
-    file: Annotated[
-        Path | None, typer.Argument(help="a recording (MCAP) to play, instead of live robots", show_default=False)
-    ] = None,
-    listen: Annotated[str, typer.Option(help="host:port for Foxglove; port 0: any free one")] = "127.0.0.1:8765",
-    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
-    drive: Annotated[bool, typer.Option("--drive", help="let viewers with the token or a listed Origin drive")] = False,
-    token: Annotated[Path | None, typer.Option(help="file with the token that viewers must give (?token=)")] = None,
-    origin: Annotated[list[str], typer.Option(help="Origin of another web page that may connect; once for each")] = [],
-    allow: Annotated[list[str], typer.Option(help="network that viewers may connect from; once for each")] = [],
-    tls_certificate: Annotated[Path | None, typer.Option(help="certificate (PEM), for wss://")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="its key (PEM)")] = None,
-    insecure: Annotated[bool, typer.Option("--insecure", help="serve other machines without TLS")] = False,
-    speed_full_mps: Annotated[
-        list[str], typer.Option(help="m/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    turn_full_radps: Annotated[
-        list[str], typer.Option(help="rad/s at full scale, NUMBER or ROBOT=NUMBER; 1 by default")
-    ] = [],
-    who: Annotated[
-        str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
-    ] = "",
-    viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
-) -> None:
-    """Serve robots live, or a recording, to Foxglove until SIGTERM or SIGINT."""
-    from zbridge.cli.foxglove import run_foxglove
-
-    set_up_log(verbose=verbose)
-    given: dict[str, object] = {
-        "listen": listen,
-        "robots": robot,
-        "drive": drive,
-        "token": token,
-        "origins": origin,
-        "allow": allow,
-        "tls_certificate": tls_certificate,
-        "tls_key": tls_key,
-        "insecure": insecure,
-        "speed_full_mps": speed_full_mps,
-        "turn_full_radps": turn_full_radps,
-        "who": who,
-        "viewers": viewers,
-    }
-    run_foxglove(bus_settings(connect, tls), realm, file, given)
-
-
-@app.command()
-def ls(
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-    sessions: Annotated[bool, typer.Option("--sessions", help="list the sessions with robots and HQ programs")] = False,
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line")] = False,
-) -> None:
-    """List the robots on the bus, or the sessions of their gateways and listeners."""
-    from zbridge.cli import bus
-
-    set_up_log(verbose=False, level=logging.ERROR)
-    show = bus.list_sessions if sessions else bus.list_robots
-    run_loop(show(bus_settings(connect, tls), realm, as_json=json))
-
-
-@app.command()
-def health(
-    robot: Annotated[str, typer.Argument(help="the robot's name; without it: all robots", show_default=False)] = "",
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-    json: Annotated[bool, typer.Option("--json", help="one JSON object")] = False,
-) -> None:
-    """Print how the robots are, for monitoring: exit code 0 ok, 1 warning, 2 critical."""
-    from zbridge.cli.health import report_health
-
-    set_up_log(verbose=False, level=logging.CRITICAL)
-    if robot:
-        check_name("ROBOT", robot)
-    code = run_loop(report_health(bus_settings(connect, tls), realm, robot or None, as_json=json))
-    if code:
-        raise typer.Exit(code)
-
-
-@app.command()
-def echo(
-    key: Annotated[str, typer.Argument(help="key expression, for example fleet/r1/pose or 'fleet/**'")],
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
-    count: Annotated[int, typer.Option(help="end after this many messages; 0: run until interrupted")] = 0,
-) -> None:
-    """Print the messages on a key, decoded."""
-    from zbridge.cli import bus
-
-    set_up_log(verbose=False, level=logging.ERROR)
-    run_loop(until_signal(bus.echo(bus_settings(connect, tls), key, as_json=json, count=count)))
-
-
-@app.command()
-def drive(
-    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)],
-    speed: Annotated[float, typer.Option(help="fraction of full scale", min=0.1, max=1.0)] = 0.3,
-    who: Annotated[str, typer.Option(help="shown to others as the driver; user@host by default")] = "",
-    takeover: Annotated[bool, typer.Option("--takeover", help="take the robot from whoever drives it")] = False,
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-) -> None:
-    """Drive a robot by keyboard: it moves only while a key is held down; space stops it."""
-    from zbridge.cli.drive import drive_robot
-
-    set_up_log(verbose=False, level=logging.ERROR)
-    check_name("ROBOT", robot)
-    work = drive_robot(bus_settings(connect, tls), realm, robot, speed, who=who or None, takeover=takeover)
-    run_loop(until_signal(work))
-
-
-@app.command()
-def stop(
-    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
-    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-) -> None:
-    """Stop a robot, or all of them; open to everyone who can write the key."""
-    from zbridge.cli import bus
-
-    set_up_log(verbose=False, level=logging.ERROR)
-    if bool(robot) == everything:
-        give_up(2, "name one ROBOT, or give --all")
-    if robot:
-        check_name("ROBOT", robot)
-    if not run_loop(bus.stop(bus_settings(connect, tls), realm, robot or None)):
-        raise typer.Exit(1)
-
-
-@app.command()
-def restart(
-    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
-    everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
-    who: Annotated[str, typer.Option(help="the name of your certificate; user@host by default")] = "",
-    connect: Connect = [],
-    tls: TlsFolder = None,
-    realm: Realm = "fleet",
-) -> None:
-    """Restart a robot's gateway, or all of them: robots and HQ programs stay connected; what moves is stopped."""
-    from zbridge.cli.restart import restart as ask
-
-    set_up_log(verbose=False, level=logging.ERROR)
-    if bool(robot) == everything:
-        give_up(2, "name one ROBOT, or give --all")
-    if robot:
-        check_name("ROBOT", robot)
-    if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
-        raise typer.Exit(1)

@@ -16,7 +16,7 @@ from tests.e2e.secure import SecureBus
 from tests.e2e.test_secure_gateway import member
 from tests.simulated import simulated
 from zbridge.app.roles import Member, Roles
-from zbridge.app.router_settings import folder_tls
+from zbridge.bus.tls.files import folder_tls
 from zbridge.client import Fleet
 from zbridge.protocol.plugin import find_protocol
 

@@ -172,6 +172,9 @@ CAPTURES: dict[str, tuple[str, dict[str, tuple[str, int]], str, set[str]]] = {
 }
 
 
+STATES = {"devices", "map", "scanner", "lidar", "camera"}
+
+
 def shown(path: Path, robot: str) -> dict[str, list[dict[str, Any]]]:
     """What a robot published, by key, without what depends on the time; the frames too."""
     seen: dict[str, list[dict[str, Any]]] = {}
@@ -181,7 +184,9 @@ def shown(path: Path, robot: str) -> dict[str, list[dict[str, Any]]]:
             fields = msgpack.unpackb(data)
             told = seen.setdefault(rest, [])
             fields = {name: fields[name] for name in fields if name not in STAMPS}
-            if told[-1:] != [fields]:  # a state that was asked for may come twice
+            if rest in STATES:  # a newer state replaces one that waits to be sent
+                told.clear()
+            if told[-1:] != [fields]:
                 told.append(fields)
     return seen
 

@@ -49,6 +49,7 @@ OFFENCES = {
     "Only the bus imports zenoh": ("zbridge/client/fleet.py", "import zenoh"),
     "Only the command line imports typer and rich": ("zbridge/app/config.py", "import rich"),
     "Only the certificates import cryptography": ("zbridge/app/roles.py", "import cryptography"),
+    "Only the views import what viewers and recordings need": ("zbridge/client/fleet.py", "import foxglove"),
 }
 
 

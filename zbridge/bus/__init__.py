@@ -56,17 +56,20 @@ async def open_bus(
     bounds: SizeBounds = (),
     realm: str | None = None,
     robot: str | None = None,
+    timestamps: bool = False,
 ) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within a second).
 
     The error says which case it is, where that can be found within three more seconds; it is BusRefused where trying
     again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
     bounds: Zenoh drops what comes in on these keys and is larger; nobody can count it. realm, robot: on a secure bus,
-    those in which the router must know our name.
+    those in which the router must know our name. timestamps: Zenoh stamps what is put here, as kept frames need.
     """
     from zbridge.bus.zenoh import open_zenoh
 
-    return await open_zenoh(settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds, realm=realm, robot=robot)
+    return await open_zenoh(
+        settings, metrics, wait_for_peers=wait_for_peers, bounds=bounds, realm=realm, robot=robot, timestamps=timestamps
+    )
 
 
 async def open_router(

@@ -91,7 +91,7 @@ class IncomingQuery(Protocol):
     payload: bytes
     attachment: bytes | None
 
-    def answer(self, payload: bytes) -> None:
+    def answer(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Reply with a payload."""
 
     def refuse(self, refusal: Refused) -> None:
@@ -160,6 +160,9 @@ class Bus(Protocol):
     def zid(self) -> str:
         """The id of this session on the bus."""
 
+    def routers(self) -> list[str]:
+        """Return the ids of the routers that this session is connected to."""
+
     def publisher(self, key: str, topic: Topic) -> Publisher:
         """Declare that ``key`` will be written."""
 
@@ -185,8 +188,18 @@ class Bus(Protocol):
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        lane: Lane | Sort = Lane.OTHER,
+        complete: bool = False,
+    ) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.
+
+        complete: this session answers for the whole key, so that queries to complete answerers alone find it.
+        """
 
     async def ask(self, key_expr: str, payload: bytes = b"", *, timeout_s: float = 1.0) -> list[Answer]:
         """Query ``key_expr`` and collect the replies of ``timeout_s`` seconds, bounded in number."""
@@ -206,8 +219,14 @@ class Bus(Protocol):
     async def flush(self) -> None:
         """Wait until all queued states and answers are handed to Zenoh (streams excluded); raise BusError after 2 s."""
 
-    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
+    def frames(
+        self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
+    ) -> Publisher:
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes.
+
+        best_effort: links may lose frames. kept: last frames that Zenoh's advanced subscribers get when they come late;
+        needs a bus with timestamps.
+        """
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""

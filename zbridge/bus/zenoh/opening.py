@@ -25,7 +25,9 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 """The place in Zenoh's source at the end of its error texts; cut off."""
 
 
-def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = ()) -> zenoh.Config:
+def zenoh_config(
+    settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = (), timestamps: bool = False
+) -> zenoh.Config:
     """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses."""
     values: dict[str, Any] = {
         "mode": settings.effective_mode,
@@ -37,6 +39,8 @@ def zenoh_config(settings: BusSettings, *, wait_for_peers: bool = False, bounds:
         # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
     }
+    if timestamps:
+        values["timestamping/enabled"] = True
     if settings.listen:
         values["listen/endpoints"] = settings.listen
     if bounds:

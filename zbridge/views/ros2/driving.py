@@ -110,7 +110,7 @@ class Driving:
     def __repr__(self) -> str:
         return f"<Driving {self._robot} {list(self.publishers.values())}>"
 
-    def came(self, gid: bytes, name: str, *, early: bool) -> bool:
+    def came(self, gid: bytes, name: str, now: float, *, early: bool) -> bool:
         """A publisher's token came; False where there is no place. early: the publisher was there before us."""
         if gid in self.publishers:
             return True
@@ -119,7 +119,8 @@ class Driving:
         back = gid in self._gone
         why = "it was cut off, and is back" if back else "it was there before" if early else ""
         self._gone.pop(gid, None)
-        self.publishers[gid] = Publisher(name, Standing.OWES if why else Standing.FREE, why)
+        self.publishers[gid] = publisher = Publisher(name, Standing.OWES if why else Standing.FREE, why)
+        publisher.heard_at = now  # it may have spoken until now: its silence begins here
         return True
 
     def gone(self, gid: bytes) -> Decision:

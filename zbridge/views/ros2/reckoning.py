@@ -7,7 +7,7 @@ import math
 from zbridge.fleet.messages import Pose
 from zbridge.views.ros2.shapes import Speeds
 
-LONGEST_S = 1.0
+LONGEST_S = 3.0
 """Nothing is added up over a longer pause: nobody knows what happened."""
 SPREAD_PER_M = 4.0
 """The variance of the result grows by so many times that of a pose with each metre or radian."""

@@ -31,6 +31,7 @@ _NO_ESTIMATE = -1.0
 _SECOND_NS = 1_000_000_000
 _CELLS = np.array([-1, 0, 100] + [-1] * 253, np.int8)
 """Occupancy by the fleet's cell: unknown, free, occupied."""
+_LONGEST_SCAN_S = 1.0
 _FIELD_OF_VIEW_RAD, _RANGE_MIN_M, _RANGE_MAX_M = 0.26, 0.0, 10.0
 """Of a distance sensor, which tells neither."""
 
@@ -106,15 +107,14 @@ class Shapes:
             return None
         last = first + step * (len(ranges) - 1)
         if step < 0:
-            first, last, step, ranges = last, first, -step, ranges[::-1]
-        between_s = scanner.time_increment_s if scanner is not None and scan.angle_increment > 0 else 0.0
+            first, last, step, ranges = last, first, -step, np.ascontiguousarray(ranges[::-1])
         return self._make(
             "sensor_msgs/msg/LaserScan",
             header=self.header(stamp_ns, self.frames.laser),
             angle_min=first,
             angle_max=last,
             angle_increment=step,
-            time_increment=between_s if math.isfinite(between_s) else 0.0,
+            time_increment=_between_s(scan, scanner, period_s),
             scan_time=period_s,
             range_min=max(0.0, scan.range_min),
             range_max=scan.range_max,
@@ -259,6 +259,13 @@ class Shapes:
 
     def _vector(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def _between_s(scan: Scan, scanner: Scanner | None, period_s: float) -> float:
+    """Return the seconds between two rays; 0 where they are unknown, or would take longer than a whole scan does."""
+    between_s = scanner.time_increment_s if scanner is not None and scan.angle_increment > 0 else 0.0
+    longest_s = period_s or _LONGEST_SCAN_S
+    return between_s if 0.0 < between_s * (len(scan.ranges) - 1) <= longest_s else 0.0
 
 
 def _is_finite(pose: Pose) -> bool:

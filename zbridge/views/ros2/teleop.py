@@ -102,10 +102,10 @@ class Teleop:
         if endpoint.type_name not in MOST_BYTES or endpoint.type_hash != types.hash(endpoint.type_name):
             self._note_wrong(token, endpoint, alive)
             return
-        gid = endpoint.gid()
+        gid, now = endpoint.gid(), self._loop.time()
         if not alive:
             self._forget(gid)
-        elif self._driving.came(gid, endpoint.node.full_name, early=self._loop.time() < self._settled_at):
+        elif self._driving.came(gid, endpoint.node.full_name, now, early=now < self._settled_at):
             self._limits.setdefault(gid, RateLimit(RATE_HZ))
         else:
             self._counts["publishers_refused"].value += 1

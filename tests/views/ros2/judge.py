@@ -208,9 +208,15 @@ class Publisher:
             twist = types["geometry_msgs/msg/TwistStamped"](header, twist)
         self.put(twist)
 
+    def hide(self) -> None:
+        """Undeclare the token; the publisher stays. Idempotent."""
+        token, self._token = self._token, None
+        if token is not None:
+            token.undeclare()
+
     def close(self) -> None:
         """Undeclare the publisher, its token first."""
-        self._token.undeclare()
+        self.hide()
         self._publisher.undeclare()
 
 

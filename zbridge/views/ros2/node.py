@@ -146,4 +146,4 @@ class RobotNode:
 
     def _on_stop(self) -> None:
         if self.teleop is not None:
-            self.teleop.stopped("the robot was stopped by a call")
+            self.teleop.stopped("the robot was stopped")

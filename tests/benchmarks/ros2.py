@@ -1,8 +1,8 @@
 """What ``zbridge ros2`` costs, against a bare Python relay in the same run: ``python -m tests.benchmarks.ros2``.
 
 The relay subscribes, copies and puts; it knows no lease and changes no byte. Both ways are measured between the fleet's
-bus and ROS's side, where the view or the relay is all that lies between, so the gateway's own share, which is the same for
-both, does not flatter the ratio. Scans and Twists go by turns through the one and the other.
+bus and ROS's side, where the view or the relay is all that lies between: the gateway's own share, the same for both,
+does not flatter the ratio. Scans and Twists go by turns through the one and the other.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from tests.e2e.processes import Part
 from tests.e2e.robots import Robot
 from tests.views.ros2.judge import Ros
 
-SCAN, TWIST = "sensor_msgs/msg/LaserScan", "geometry_msgs/msg/Twist"
+SCAN, TWIST, TF = "sensor_msgs/msg/LaserScan", "geometry_msgs/msg/Twist", "tf2_msgs/msg/TFMessage"
 ROBOTS, RATE_HZ, POINTS = 30, 10.0, 769
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
@@ -64,7 +64,7 @@ class Scene:
     def __init__(self, stack: contextlib.ExitStack, folder: Path) -> None:
         self.fleet_at, self.ros_at = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
         self._part(stack, "router", self.fleet_at, self.ros_at)
-        robot = Robot()
+        self.robot = robot = Robot()
         stack.callback(robot.close)
         file = folder / "r0.toml"
         file.write_text(
@@ -78,15 +78,16 @@ class Scene:
         self.ros = Ros(self.ros_at, "bench")
         stack.callback(self.ros.close)
         names = (self.ros._names("/relay/scan", SCAN)[0], self.ros._names("/relay/cmd_vel", TWIST)[0])
-        self._part(stack, "relay", self.fleet_at, self.ros_at, *names)
+        self.relay = self._part(stack, "relay", self.fleet_at, self.ros_at, *names)
         self.tokens = [
             self.fleet.liveliness().declare_token(f"fleet/r{number}/@alive/gateway") for number in range(1, ROBOTS + 1)
         ]
         wait(lambda: sum(parts[5] == "NN" and parts[8] == "zbridge" for parts in self.ros.graph()) > ROBOTS)
 
-    def _part(self, stack: contextlib.ExitStack, *arguments: str) -> None:
+    def _part(self, stack: contextlib.ExitStack, *arguments: str) -> int:
         part = Part(stack, sys.executable, "-m", "tests.benchmarks.ros2", *arguments)
         assert part.line() == "ready"
+        return part.pid
 
     def _zbridge(self, stack: contextlib.ExitStack, folder: Path, *arguments: str) -> Any:
         log = stack.enter_context((folder / f"{arguments[0]}.log").open("w"))
@@ -94,10 +95,16 @@ class Scene:
         stack.callback(end, process)
         return process
 
-    def cpu_s(self) -> float:
-        """Return the processor time of the view."""
-        fields = Path(f"/proc/{self.view}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+def cpu_s(pid: int) -> float:
+    """Return the processor time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S
+
+
+def memory_mb(pid: int) -> float:
+    """Return the resident memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def scan(number: int) -> bytes:
@@ -203,14 +210,10 @@ def twists(scene: Scene, count: int) -> tuple[Clock, Clock]:
 
 
 @contextlib.contextmanager
-def published(scene: Scene, kinds: dict[str, Callable[[], bytes]]) -> Iterator[list[int]]:
-    """Let all robots publish at RATE_HZ; the list holds how often each has."""
+def published(scene: Scene, robots: list[str], kinds: dict[str, Callable[[], bytes]]) -> Iterator[list[int]]:
+    """Let robots publish at RATE_HZ; the list holds how often each has."""
     ended, rounds = threading.Event(), [0]
-    ways = [
-        (scene.fleet.declare_publisher(f"fleet/r{number}/{kind}"), make)
-        for number in range(1, ROBOTS + 1)
-        for kind, make in kinds.items()
-    ]
+    ways = [(scene.fleet.declare_publisher(f"fleet/{robot}/{kind}"), kinds[kind]) for robot in robots for kind in kinds]
 
     def go_on() -> None:
         while not ended.wait(1 / RATE_HZ):
@@ -229,23 +232,68 @@ def published(scene: Scene, kinds: dict[str, Callable[[], bytes]]) -> Iterator[l
 
 
 def cost(
-    scene: Scene, kinds: dict[str, Callable[[], bytes]], watched: list[tuple[str, str]], seconds: float
+    scene: Scene, pid: int, robots: list[str], kinds: dict[str, Callable[[], bytes]], keys: list[str], seconds: float
 ) -> tuple[float, float]:
-    """Return the view's share of a core, and its processor time for each round of a robot in microseconds."""
-    keys = [
-        scene.ros._names(f"/r{number}/{name}", type_name)[0]
-        for number in range(1, ROBOTS + 1)
-        for name, type_name in watched
-    ]
+    """Return a process's share of a core, and its processor time for each round of a robot in microseconds."""
     kept = [scene.ros.session.declare_subscriber(key, lambda sample: None) for key in keys]
-    with published(scene, kinds) as rounds:
+    with published(scene, robots, kinds) as rounds:
         time.sleep(2.0)
-        before, at, made = scene.cpu_s(), time.monotonic(), rounds[0]
+        before, at, made = cpu_s(pid), time.monotonic(), rounds[0]
         time.sleep(seconds)
-        used, passed, made = scene.cpu_s() - before, time.monotonic() - at, rounds[0] - made
+        used, passed, made = cpu_s(pid) - before, time.monotonic() - at, rounds[0] - made
     for subscriber in kept:
         subscriber.undeclare()
-    return used / passed, used / (made * ROBOTS) * 1e6
+    return used / passed, used / (made * len(robots)) * 1e6
+
+
+def costs(scene: Scene, seconds: float) -> None:
+    """Print what 30 robots cost."""
+    pose = msgpack.packb({"x": 1.0, "y": 2.0, "heading": 0.5})
+    motion = msgpack.packb({"speed": 0.5, "gyro": [0.0, 0.0, 0.1], "acceleration": [0.0, 0.0, 9.8]})
+    scans_alone = {"scan": lambda: scan(1)}
+    everything = {**scans_alone, "pose": lambda: pose, "motion": lambda: motion}
+    robots = [f"r{number}" for number in range(1, ROBOTS + 1)]
+    watched = {SCAN: "scan", "nav_msgs/msg/Odometry": "odom", "sensor_msgs/msg/Imu": "imu", TF: "tf"}
+    keys = {name: [scene.ros._names(f"/{robot}/{name}", kind)[0] for robot in robots] for kind, name in watched.items()}
+    share, each = cost(scene, scene.view, robots, scans_alone, keys["scan"], seconds)
+    print(f"scans of {ROBOTS} robots at {RATE_HZ:g} Hz: {share:.1%} of a core, {each:.0f} us a scan")
+    relayed = scene.ros._names("/relay/scan", SCAN)[0]
+    share, each = cost(scene, scene.relay, ["relay"] * ROBOTS, scans_alone, [relayed], seconds)
+    print(f"as many through the relay: {share:.1%} of a core, {each:.0f} us a scan")
+    all_keys = [key for some in keys.values() for key in some]
+    share, _ = cost(scene, scene.view, robots, everything, all_keys, seconds)
+    print(f"{ROBOTS} robots at {RATE_HZ:g} Hz, scan, odom, imu and tf watched: {share:.1%} of a core")
+    share, _ = cost(scene, scene.view, robots, everything, [], seconds)
+    print(f"{ROBOTS} robots at {RATE_HZ:g} Hz, nobody listens: {share:.2%} of a core")
+
+
+def hostile(scene: Scene, seconds: float) -> None:
+    """Flood cmd_vel from strangers, among a thousand foreign nodes; print what comes of it."""
+    stranger = Ros(scene.ros_at, "stranger")
+    key, zid = stranger._names("/r0/cmd_vel", TWIST)[0], stranger.session.zid()
+    nodes = [stranger._token(f"{zid}/{number}/{number}/NN/%/%/n{number}") for number in range(1000)]
+    liars = [stranger.publisher("/r0/cmd_vel", "std_msgs/msg/String") for _ in range(100)]
+    payload = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
+    declared = stranger.session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+    time.sleep(1.0)
+    before, cpu, at, sent, moved = (
+        memory_mb(scene.view),
+        cpu_s(scene.view),
+        time.monotonic(),
+        0,
+        len(scene.robot.frames),
+    )
+    while time.monotonic() - at < seconds:
+        for number in range(1000):
+            declared.put(payload, attachment=(sent + number).to_bytes(16, "little") + b"\x10" + os.urandom(16))
+        sent += 1000
+    passed, used = time.monotonic() - at, cpu_s(scene.view) - cpu
+    moves = sum(frame.moves for frame in scene.robot.frames[moved:])
+    print(
+        f"strangers: {sent / passed:.0f} samples a second, {len(nodes)} nodes, {len(liars)} of a wrong type: robot "
+        f"moved {moves} times, memory {before:.0f} MB, then {memory_mb(scene.view):.0f} MB, {used / passed:.0%} of a core"
+    )
+    stranger.close()
 
 
 def main() -> None:
@@ -254,15 +302,6 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=1000, help="scans and Twists each way")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each measurement of costs")
     given = parser.parse_args()
-    pose = msgpack.packb({"x": 1.0, "y": 2.0, "heading": 0.5})
-    motion = msgpack.packb({"speed": 0.5, "gyro": [0.0, 0.0, 0.1], "acceleration": [0.0, 0.0, 9.8]})
-    everything = {"scan": lambda: scan(1), "pose": lambda: pose, "motion": lambda: motion}
-    topics = [
-        ("scan", SCAN),
-        ("odom", "nav_msgs/msg/Odometry"),
-        ("imu", "sensor_msgs/msg/Imu"),
-        ("tf", "tf2_msgs/msg/TFMessage"),
-    ]
     with contextlib.ExitStack() as stack:
         scene = Scene(stack, Path(stack.enter_context(tempfile.TemporaryDirectory())))
         for name, measure in (("scan", scans), ("Twist", twists)):
@@ -271,15 +310,9 @@ def main() -> None:
                 print(f"{name}: {len(view.times)} through the view and {len(bare.times)} through the relay came")
                 continue
             mine, other = median(view.times), median(bare.times)
-            print(
-                f"{name}: p50 {mine:.0f} us, relay {other:.0f} us, ratio {mine / other:.2f}; {len(view.times)} of {given.count}"
-            )
-        share, each = cost(scene, {"scan": everything["scan"]}, topics[:1], given.seconds)
-        print(f"scans of {ROBOTS} robots at {RATE_HZ:g} Hz: {share:.1%} of a core, {each:.0f} us a scan")
-        share, each = cost(scene, everything, topics, given.seconds)
-        print(f"{ROBOTS} robots at {RATE_HZ:g} Hz, scan, odom, imu and tf watched: {share:.1%} of a core")
-        share, _ = cost(scene, everything, [], given.seconds)
-        print(f"{ROBOTS} robots at {RATE_HZ:g} Hz, nobody listens: {share:.2%} of a core")
+            print(f"{name}: p50 {mine:.0f} us, relay {other:.0f} us, ratio {mine / other:.2f}")
+        costs(scene, given.seconds)
+        hostile(scene, given.seconds)
 
 
 if __name__ == "__main__":

@@ -34,9 +34,9 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What ROS has to know of a robot, and no robot of ours tells.
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
-    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF
-    vehicle is told 90 degrees then. length_m, width_m, height_m: what RViz shows. map_to_odom: tell ROS that odometry begins at the map's origin; false where a program of ROS's, as
-    slam_toolbox, tells it.
+    None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle is told 90 degrees
+    then. length_m, width_m, height_m: what RViz shows. map_to_odom: tell ROS that odometry begins at the map's origin;
+    false where a program of ROS's, as slam_toolbox, tells it.
     """
 
     speed_full_mps: Above = 1.0

@@ -291,7 +291,7 @@ def hostile(scene: Scene, seconds: float) -> None:
     moves = sum(frame.moves for frame in scene.robot.frames[moved:])
     print(
         f"strangers: {sent / passed:.0f} samples a second, {len(nodes)} nodes, {len(liars)} of a wrong type: robot "
-        f"moved {moves} times, memory {before:.0f} MB, then {memory_mb(scene.view):.0f} MB, {used / passed:.0%} of a core"
+        f"moved {moves} times, memory {before:.0f} MB, then {memory_mb(scene.view):.0f}, {used / passed:.0%} of a core"
     )
     stranger.close()
 

@@ -52,6 +52,8 @@ class Teleop:
         self._stopped: bool | None = None
         self._limits: dict[bytes, RateLimit] = {}
         """By the gids of publishers that have a token."""
+        self._known: dict[bytes, bytes] = {}
+        """By each gid that such a publisher may send with, the one it is known by."""
         self._strangers = RateLimit(STRANGERS_HZ)
         self._wrong: dict[str, str] = {}
         """By the tokens of publishers of another type, what they are."""
@@ -107,6 +109,7 @@ class Teleop:
             self._forget(gid)
         elif self._driving.came(gid, endpoint.node.full_name, now, early=now < self._settled_at):
             self._limits.setdefault(gid, RateLimit(RATE_HZ))
+            self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
             self._counts["publishers_refused"].value += 1
         self._watch_control(bool(self._driving.publishers))
@@ -120,6 +123,8 @@ class Teleop:
                 self._wrong[token] = f"{endpoint.node.full_name} publishes {endpoint.type_name} {endpoint.type_hash}"
 
     def _forget(self, gid: bytes) -> None:
+        for also in [also for also, known in self._known.items() if known == gid]:
+            del self._known[also]
         self._limits.pop(gid, None)
         self._carry_out(self._driving.gone(gid))
 
@@ -152,7 +157,7 @@ class Teleop:
         if attachment is None or len(attachment) != _ATTACHED_BYTES or size > most_bytes + _ATTACHED_BYTES:
             self._counts["malformed"].value += 1
             return None
-        gid = attachment[_GID]
+        gid = self._known.get(attachment[_GID], b"")
         limit = self._limits.get(gid)
         now = self._loop.time()
         if limit is None:
@@ -173,7 +178,8 @@ class Teleop:
         except (ProtocolError, Malformed):
             self._counts["malformed"].value += 1
             return
-        decision = self._driving.heard(attachment.gid, drive.moving, self._loop.time(), wrong)
+        gid = self._known.get(attachment.gid, attachment.gid)
+        decision = self._driving.heard(gid, drive.moving, self._loop.time(), wrong)
         if decision.action is Action.SEND:  # the way of nearly all
             self._holder.send(drive)
         else:

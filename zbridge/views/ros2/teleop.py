@@ -37,15 +37,20 @@ _GID = slice(17, 33)
 
 
 class Teleop:
-    """The cmd_vel of one robot. fleet: the fleet's bus; control_key: where the robot's control is told there."""
+    """The cmd_vel of one robot. fleet: the fleet's bus; control_key: where the robot's control is told there.
 
-    def __init__(self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str) -> None:
+    name: the first part of the name that drivers are given.
+    """
+
+    def __init__(
+        self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str, name: str
+    ) -> None:
         self._side = side
         self._robot = robot
         self._body = body
         self._loop = asyncio.get_running_loop()
         self._driving = Driving(robot.name)
-        self._holder = Holder(robot, self._on_lost)
+        self._holder = Holder(robot, name, self._on_lost)
         self._fleet = fleet
         self._control_key = control_key
         self._control: Handle | None = None

@@ -50,6 +50,7 @@ OFFENCES = {
     "Only the command line imports typer and rich": ("zbridge/app/config.py", "import rich"),
     "Only the certificates import cryptography": ("zbridge/app/roles.py", "import cryptography"),
     "Only the views import what viewers and recordings need": ("zbridge/client/fleet.py", "import foxglove"),
+    "Only the format of ROS 2 imports rosbags and xxhash": ("zbridge/client/fleet.py", "import xxhash"),
 }
 
 

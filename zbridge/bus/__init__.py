@@ -61,13 +61,14 @@ async def open_bus(
     within_s: float = OPEN_S,
     realm: str | None = None,
     robot: str | None = None,
+    timestamps: bool = False,
 ) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
 
     The error says which case it is, where that can be found within three more seconds; it is BusRefused where trying
     again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
     bounds: Zenoh drops what comes in on these keys and is larger; nobody can count it. realm, robot: on a secure bus,
-    those in which the router must know our name.
+    those in which the router must know our name. timestamps: Zenoh stamps what is put here, as kept frames need.
     """
     from zbridge.bus.zenoh import open_zenoh
 
@@ -79,6 +80,7 @@ async def open_bus(
         within_s=within_s,
         realm=realm,
         robot=robot,
+        timestamps=timestamps,
     )
 
 

@@ -78,6 +78,10 @@ class FakeBus:
         """Open another session on the same bus."""
         return FakeBus(zid, self._shared)
 
+    def routers(self) -> list[str]:
+        """Return no router: sessions of a fake bus need none."""
+        return []
+
     def values(self, key_expr: str) -> list[bytes]:
         """Return every payload that was put on matching keys, in order."""
         return [sample.payload for sample in self._shared.history if matches(key_expr, sample.key)]
@@ -134,7 +138,14 @@ class FakeBus:
                     handler(Sample(key, payload))
         return self._keep(_FakeHandle(lambda: self._shared.subscribers.remove(entry)))
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        lane: Lane | Sort = Lane.OTHER,
+        complete: bool = False,
+    ) -> Handle:
         entry = (key, handler, self._zid)
         self._shared.queryables.append(entry)
         return self._keep(_FakeHandle(lambda: self._shared.queryables.remove(entry)))
@@ -180,8 +191,10 @@ class FakeBus:
     async def drain(self, key_expr: str) -> None:
         pass
 
-    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=False))
+    def frames(
+        self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
+    ) -> Publisher:
+        publisher = self._keep(_FakePublisher(key, self._shared, keeps_last=bool(kept)))
         if any(meet(key_expr, key) for key_expr, _ in self._shared.subscribers):
             asyncio.get_running_loop().call_soon(listened, True)
         return publisher
@@ -267,9 +280,11 @@ class FakeQuery:
         self.payload = payload
         self.attachment: bytes | None = None
         self.replies: list[Answer] = []
+        self.attached: list[bytes | None] = []
 
-    def answer(self, payload: bytes) -> None:
+    def answer(self, payload: bytes, attachment: bytes | None = None) -> None:
         self.replies.append(Answer(self.key, payload))
+        self.attached.append(attachment)
 
     def refuse(self, refusal: Refused) -> None:
         self.replies.append(Answer(self.key, b"", refusal))

@@ -92,7 +92,7 @@ class IncomingQuery(Protocol):
     payload: bytes
     attachment: bytes | None
 
-    def answer(self, payload: bytes) -> None:
+    def answer(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Reply with a payload."""
 
     def refuse(self, refusal: Refused) -> None:
@@ -165,6 +165,9 @@ class Bus(Protocol):
     def zid(self) -> str:
         """The id of this session on the bus."""
 
+    def routers(self) -> list[str]:
+        """Return the ids of the routers that this session is connected to."""
+
     def share(self, metrics: Metrics) -> Bus:
         """Return a bus on the same session for one robot, with queues, bounds and declarations of its own.
 
@@ -196,8 +199,18 @@ class Bus(Protocol):
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        lane: Lane | Sort = Lane.OTHER,
+        complete: bool = False,
+    ) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.
+
+        complete: this session answers for the whole key, so that queries to complete answerers alone find it.
+        """
 
     def gather(self, key_expr: str) -> Handle:
         """Declare one queryable, ``key_expr`` (``.../**``), for all keys below it that are answered from now on.
@@ -229,8 +242,14 @@ class Bus(Protocol):
         The query has the lowest priority, so that all else goes before it. Waits for a second at most, raises BusError.
         """
 
-    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
+    def frames(
+        self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
+    ) -> Publisher:
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes.
+
+        best_effort: links may lose frames. kept: last frames that Zenoh's advanced subscribers get when they come late;
+        needs a bus with timestamps.
+        """
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""

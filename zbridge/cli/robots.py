@@ -1,4 +1,4 @@
-"""Declares what is done with robots of the bus: ``zbridge ls, health, echo, drive, stop, restart, foxglove``."""
+"""Declares what is done with robots of the bus: ``zbridge ls, health, echo, drive, stop, restart, foxglove, ros2``."""
 
 from __future__ import annotations
 
@@ -175,3 +175,37 @@ def restart(
         check_name("ROBOT", robot)
     if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
         raise typer.Exit(1)
+
+
+@app.command()
+def ros2(
+    file: Annotated[
+        Path | None, typer.Argument(help="settings (TOML): speeds, sizes, what the options say", show_default=False)
+    ] = None,
+    domain: Annotated[int | None, typer.Option(help="ROS_DOMAIN_ID; 0 by default", show_default=False)] = None,
+    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
+    drive: Annotated[bool, typer.Option("--drive", help="let publishers on cmd_vel drive, and calls switch")] = False,
+    distro: Annotated[
+        str, typer.Option(help="humble, iron, jazzy, kilted or lyrical; jazzy by default", show_default=False)
+    ] = "",
+    ros: Annotated[
+        list[str], typer.Option(help="ROS's router; tcp/localhost:7447 by default", show_default=False)
+    ] = [],
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Annotated[str, typer.Option(help="first chunk of all keys; fleet by default", show_default=False)] = "",
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what is refused")] = False,
+) -> None:
+    """Show robots to ROS 2 over its middleware rmw_zenoh, until SIGTERM or SIGINT; needs zbridge[ros2]."""
+    from zbridge.cli.ros2 import run_ros2
+
+    set_up_log(verbose=verbose)
+    given: dict[str, object] = {
+        "domain": domain,
+        "robots": robot,
+        "drive": drive,
+        "distro": distro or None,
+        "ros": ros,
+        "realm": realm or None,
+    }
+    run_ros2(bus_settings(connect, tls) if connect or tls else None, bus_settings(), file, given)

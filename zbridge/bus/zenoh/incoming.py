@@ -110,9 +110,9 @@ class ZenohQuery:
     def __repr__(self) -> str:
         return f"<ZenohQuery {self.asked}>"
 
-    def answer(self, payload: bytes) -> None:
+    def answer(self, payload: bytes, attachment: bytes | None = None) -> None:
         """Reply with a payload."""
-        self._writer.put(lambda: reply_and_drop(self._query, self.key, payload, None))
+        self._writer.put(lambda: reply_and_drop(self._query, self.key, payload, attachment))
 
     def refuse(self, refusal: Refused) -> None:
         """Reply with an error: its code, and its text."""

@@ -27,7 +27,12 @@ _ORIGIN = re.compile(r"\s+at /.*", re.DOTALL)
 
 
 def zenoh_config(
-    settings: BusSettings, *, wait_for_peers: bool = False, bounds: SizeBounds = (), within_s: float = 1.0
+    settings: BusSettings,
+    *,
+    wait_for_peers: bool = False,
+    bounds: SizeBounds = (),
+    within_s: float = 1.0,
+    timestamps: bool = False,
 ) -> zenoh.Config:
     """Write settings as a Zenoh configuration; raise BusError naming the setting that Zenoh refuses.
 
@@ -43,6 +48,8 @@ def zenoh_config(
         # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
     }
+    if timestamps:
+        values["timestamping/enabled"] = True
     if settings.listen:
         values["listen/endpoints"] = settings.listen
     if bounds:

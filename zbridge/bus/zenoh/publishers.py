@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import zenoh
+import zenoh.ext
 
 from zbridge.bus.interface import Batch, Publisher
 from zbridge.bus.writer import Writer
@@ -81,6 +82,48 @@ class PlainPublisher(Declared):
             return self._writer.put(lambda: self._put(payload, attachment=attachment))
         self._put(payload, attachment=attachment)
         return True
+
+
+class FramePublisher(Declared):
+    """Writes frames of any format on a key, and tells when the first listener comes and the last one goes.
+
+    kept: last frames that advanced subscribers get when they come late, and which they may ask for if one was lost.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        writer: Writer,
+        listened: Callable[[bool], None],
+        *,
+        best_effort: bool,
+        kept: int,
+    ) -> None:
+        self.key = key
+        self.last: bytes | None = None
+        self._writer = writer
+        reliability = zenoh.Reliability.BEST_EFFORT if best_effort else zenoh.Reliability.RELIABLE
+        plain: Any = session.declare_publisher(key, express=True, reliability=reliability, congestion_control=_DROP)
+        matching = plain.declare_matching_listener(threadless(lambda status: listened(status.matching)))
+        self._put: Callable[..., object] = plain.put
+        publishers = [plain]
+        if kept:
+            advanced = zenoh.ext.declare_advanced_publisher(
+                session,
+                key,
+                congestion_control=_DROP,
+                cache=zenoh.ext.CacheConfig(kept),
+                publisher_detection=True,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            )
+            self._put = advanced.put
+            publishers.append(advanced)
+        super().__init__(matching, *publishers)
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        """Publish one frame."""
+        return self._writer.put_at_once(partial(self._put, payload, attachment=attachment), 1)
 
 
 class _StreamPublisher(Declared):
@@ -205,10 +248,10 @@ class _StatePublisher(Declared):
         super().close()
 
 
-def reply_and_drop(query: zenoh.Query, key: str, payload: bytes, encoding: zenoh.Encoding | None) -> None:
+def reply_and_drop(query: zenoh.Query, key: str, payload: bytes, attachment: bytes | None) -> None:
     """Answer a query, and end it; on a writer thread."""
     try:
-        query.reply(key, payload, encoding=encoding, express=True)
+        query.reply(key, payload, attachment=attachment, express=True)
     finally:
         query.drop()  # type: ignore[no-untyped-call]
 
@@ -238,6 +281,7 @@ _PRIORITIES = {
     Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
     Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
 }
+_DROP = zenoh.CongestionControl.DROP
 _CONGESTIONS = {
     Congestion.DROP: zenoh.CongestionControl.DROP,
     Congestion.BLOCK: zenoh.CongestionControl.BLOCK,

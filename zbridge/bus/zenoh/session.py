@@ -31,7 +31,7 @@ from zbridge.bus.zenoh.incoming import (
     sorted_callback,
 )
 from zbridge.bus.zenoh.opening import in_short, open_or_say_why, zenoh_config
-from zbridge.bus.zenoh.publishers import PlainPublisher, Publishers
+from zbridge.bus.zenoh.publishers import FramePublisher, Publishers
 from zbridge.errors import BusError
 from zbridge.fleet.topics import SizeBounds, Topic
 from zbridge.metrics import Metrics
@@ -55,9 +55,12 @@ async def open_zenoh(
     within_s: float = 1.0,
     realm: str | None = None,
     robot: str | None = None,
+    timestamps: bool = False,
 ) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
-    config = zenoh_config(settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s)
+    config = zenoh_config(
+        settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
+    )
     session = await open_or_say_why(config, settings)
     bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
     certificate = own_certificate(settings.tls)
@@ -112,6 +115,10 @@ class ZenohBus:
         """The id of the Zenoh session."""
         return str(self._session.zid())
 
+    def routers(self) -> list[str]:
+        """Return the ids of the routers that this session is connected to."""
+        return [str(zid) for zid in self._session.info.routers_zid()]
+
     def share(self, metrics: Metrics) -> ZenohBus:
         """Return a bus on the same session for one robot, with queues, bounds, threads and declarations of its own.
 
@@ -149,13 +156,25 @@ class ZenohBus:
             store = sorted_callback(lane, source)
         return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
 
-    def answer(self, key: str, handler: Callable[[IncomingQuery], None], *, lane: Lane | Sort = Lane.OTHER) -> Handle:
-        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one."""
+    def answer(
+        self,
+        key: str,
+        handler: Callable[[IncomingQuery], None],
+        *,
+        lane: Lane | Sort = Lane.OTHER,
+        complete: bool = False,
+    ) -> Handle:
+        """Answer queries that ask for ``key``, with or without wildcards; the last chunk of ``key`` may be one.
+
+        complete: this session answers for the whole key, so that queries to complete answerers alone find it.
+        """
         writer = self._writer
         source = self._inbox.source(handler, lambda raw: ZenohQuery(raw, key, writer))
         store = query_callback(
             rate_limited(lane, self._loop.time) if isinstance(lane, Lane) else lane, source, self._unanswered
         )
+        if complete:
+            return self._keep(Declared(self._session.declare_queryable(key, store, complete=True)))
         return self._keep(self._answers.add(key, store))
 
     def gather(self, key_expr: str) -> Handle:
@@ -233,16 +252,21 @@ class ZenohBus:
         except TimeoutError:
             raise BusError(f"the bus took nothing for {FLUSH_S:g} s") from None
 
-    def frames(self, key: str, listened: Callable[[bool], None]) -> Publisher:
-        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes."""
-        loop = self._loop
-        plain = self._session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+    def frames(
+        self, key: str, listened: Callable[[bool], None], *, best_effort: bool = False, kept: int = 0
+    ) -> Publisher:
+        """Declare a key for raw frames; call ``listened`` when the first listener comes and the last one goes.
 
-        def changed(status: zenoh.MatchingStatus) -> None:
-            loop.call_soon_threadsafe(listened, status.matching)
+        best_effort: links may lose frames. kept: last frames that Zenoh's advanced subscribers get when they come late;
+        needs a bus with timestamps.
+        """
 
-        watch = plain.declare_matching_listener(threadless(changed))
-        return self._keep(PlainPublisher(key, plain, None, watch))
+        def changed(matching: bool) -> None:
+            self._loop.call_soon_threadsafe(listened, matching)
+
+        return self._keep(
+            FramePublisher(self._session, key, self._streams, changed, best_effort=best_effort, kept=kept)
+        )
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first listener of ``key`` appears (True) and when the last one leaves (False)."""

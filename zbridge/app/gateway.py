@@ -119,7 +119,7 @@ class Gateway:
                     shown.close()
                 shown = self._show_sessions(bus, "gateway")
                 try:
-                    await self._serve(ownership, self._device(bus, audit, plan))
+                    await self._serve(bus, ownership, self._device(bus, audit, plan))
                 finally:
                     shown.close()
         finally:
@@ -133,9 +133,19 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, ownership: Ownership, device: Device) -> None:
+    async def _work(self, bus: Bus, device: Device) -> None:
+        """Run the robot, and its camera where it has one."""
+        if self._plan.camera is None:
+            await device.run()
+        else:
+            from zbridge.camera.camera import Camera
+
+            camera = Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions)
+            await together(device.run(), camera.run())
+
+    async def _serve(self, bus: Bus, ownership: Ownership, device: Device) -> None:
         """Serve the robot until another gateway has to take it."""
-        serving = asyncio.ensure_future(device.run())
+        serving = asyncio.ensure_future(self._work(bus, device))
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)

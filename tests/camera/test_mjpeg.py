@@ -106,7 +106,7 @@ LIES: dict[str, tuple[bytes, str]] = {
     "an endless header": (HEAD + b"--FRAME\r\nX: " + LONG, "the header of a part of more than 16384 bytes"),
     "endless line breaks": (HEAD + part(ONE) + b"\r\n" * 5, "line breaks after a picture"),
     "a length that is none": (HEAD + b"--FRAME\r\nContent-Length: -5\r\n\r\n", "no number of bytes"),
-    "a length of many digits": (HEAD + b"--FRAME\r\nContent-Length: " + b"9" * 5000 + b"\r\n\r\n", "no number of bytes"),
+    "a length of many digits": (HEAD + b"--FRAME\r\nContent-Length: " + b"9" * 5000 + b"\r\n\r\n", "no number of"),
     "a picture too large": (
         HEAD + b"--FRAME\r\nContent-Length: 4194305\r\n\r\n", "a picture of 4194305 bytes exceeds 4194304"
     ),
@@ -120,11 +120,10 @@ LIES: dict[str, tuple[bytes, str]] = {
 def test_what_contradicts_the_form_or_a_bound_is_an_error_and_gives_no_picture(lie: str) -> None:
     assert len(ONE) == 113, "the lengths above are of this picture"
     data, text = LIES[lie]
-    reader, given = MjpegReader(), list[bytes]()
     with pytest.raises(ProtocolError, match=text):
-        for begin in range(0, len(data), 1000):
-            given += [each.jpeg for each in reader.receive(data[begin : begin + 1000])]
-    assert given == []
+        pictures(data)
+    with pytest.raises(ProtocolError, match=text):
+        assert pictures(data, *range(1000, len(data), 1000)) == [], "bytes that come later contradict"
 
 
 def test_a_picture_of_the_largest_size_is_taken_with_and_without_a_length() -> None:
@@ -137,10 +136,17 @@ def test_a_picture_of_the_largest_size_is_taken_with_and_without_a_length() -> N
 def test_what_is_kept_of_a_stream_that_never_ends_a_picture_is_bounded() -> None:
     reader = MjpegReader()
     reader.receive(HEAD + b"--FRAME\r\n\r\n\xff\xd8\xff")
-    with pytest.raises(ProtocolError):
+    most = 0
+
+    def flood() -> None:
+        nonlocal most
         for _ in range(100):
             reader.receive(bytes(64 * 1024))
-            assert len(reader._buffer) <= PICTURE_BYTES + 64 * 1024 + 100
+            most = max(most, len(reader._buffer))
+
+    with pytest.raises(ProtocolError):
+        flood()
+    assert 0 < most <= PICTURE_BYTES + 100
 
 
 @pytest.mark.parametrize("seed", range(4))

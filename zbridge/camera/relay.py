@@ -18,6 +18,7 @@ from collections.abc import Callable
 from zbridge.camera.demand import Demand
 from zbridge.camera.latest import Latest
 from zbridge.camera.settings import CameraPlan
+from zbridge.camera.upstream import explain
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.session_table import Backoff
@@ -75,7 +76,7 @@ class Relay:
             try:
                 sockets = await _listen(self._address)
             except OSError as error:
-                self._tell(f"camera relay {self._address.host}:{self._address.port}: {error.strerror or error}")
+                self._tell(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
                 await asyncio.sleep(backoff.delay_s())
                 continue
             self._tell(None)

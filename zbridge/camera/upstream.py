@@ -8,6 +8,8 @@ HTTP library would add a dependency and hide them.
 from __future__ import annotations
 
 import asyncio
+import os
+import socket
 from collections.abc import Callable
 
 from zbridge.camera.mjpeg import MjpegReader, Part
@@ -34,9 +36,15 @@ async def fetch(source: Source, stall_s: float, took: Took) -> None:
         writer.write(_request(source))
         await _read(reader, stall_s, took)
     except OSError as error:
-        raise LinkError(error.strerror or str(error)) from error
+        raise LinkError(explain(error)) from error
     finally:
         writer.transport.abort()
+
+
+def explain(error: OSError) -> str:
+    """Say why in the operating system's words, on every event loop: ``Connection refused``."""
+    known = error.errno is not None and error.errno > 0 and not isinstance(error, socket.gaierror)
+    return os.strerror(error.errno) if known and error.errno is not None else error.strerror or str(error)
 
 
 async def _connect(source: Source) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -45,8 +53,8 @@ async def _connect(source: Source) -> tuple[asyncio.StreamReader, asyncio.Stream
             return await asyncio.open_connection(source.host, source.port)
     except TimeoutError:
         raise LinkError(f"no connection within {CONNECT_S:g} s") from None
-    except (OSError, UnicodeError) as error:
-        raise LinkError(getattr(error, "strerror", None) or str(error)) from error
+    except OSError as error:
+        raise LinkError(explain(error)) from error
 
 
 def _request(source: Source) -> bytes:

@@ -80,7 +80,7 @@ class Relay:
                 await asyncio.sleep(backoff.delay_s())
                 continue
             self._tell(None)
-            log.info("camera: HQ programs find %s at %s", PATH.decode(), sockets[0].getsockname()[:2])
+            log.info("camera: HQ programs find %s at %s", PATH.decode(), self._address)
             try:
                 async with asyncio.TaskGroup() as tasks:
                     for listening in sockets:

@@ -77,7 +77,7 @@ async def _read(reader: asyncio.StreamReader, stall_s: float, took: Took) -> Non
         rest_s = budget.rest_s(len(data), len(parts) + mjpeg.rejected, loop.time())
         took(mjpeg, parts)
         mjpeg.rejected = 0
-        await asyncio.sleep(rest_s)
+        await asyncio.sleep(min(rest_s, stall_s))
         if parts:
             deadline = loop.time() + stall_s
     raise LinkError("the stream ended")

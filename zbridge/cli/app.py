@@ -75,6 +75,9 @@ def check(file: File, tls: FileTls = None) -> None:
         raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:
         parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
+    if plan.camera is not None:
+        relayed = f", relayed at {plan.camera.relay}" if plan.camera.relay is not None else ""
+        parts.append(f"camera at {plan.camera.source}{relayed}")
     parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
     parts.append(f"bus as {plan.config.bus.effective_mode}")
     if certificate is not None:

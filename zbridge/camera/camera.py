@@ -34,6 +34,8 @@ log = logging.getLogger("zbridge.camera")
 
 STEADY_S = 10.0
 """A stream that lasted so long was a good one: the next attempt comes soon."""
+RETRY_S = 5.0
+"""Longest time between two attempts, but for jitter: less than the relay's clients wait for a picture."""
 _CONDITION, _RELAY = "camera", "camera relay"
 
 
@@ -89,7 +91,7 @@ class Camera:
 
     async def _follow(self) -> None:
         """Fetch the stream whenever somebody watches."""
-        backoff = Backoff()
+        backoff = Backoff(most_s=RETRY_S)
         while True:
             if not self._demand.wanted:
                 self._conditions.set(_CONDITION, None)

@@ -31,6 +31,7 @@ class Scene(NamedTuple):
     latest: Latest
     metrics: Metrics
     told: list[str | None]
+    writers: list[asyncio.StreamWriter]
 
     async def ask(self, request: bytes) -> asyncio.StreamReader:
         reader, writer = await asyncio.open_connection(HOST, self.port)
@@ -38,17 +39,10 @@ class Scene(NamedTuple):
         writer.write(request)
         return reader
 
-    @property
-    def writers(self) -> list[asyncio.StreamWriter]:
-        return _writers
-
     def show(self, *pictures: bytes, head: bytes = HEAD) -> None:
         stream = MjpegReader()
         for each in stream.receive(head + b"".join(map(part, pictures))):
             self.latest.show(stream, each)
-
-
-_writers: list[asyncio.StreamWriter] = []
 
 
 @contextlib.asynccontextmanager
@@ -56,7 +50,7 @@ async def serving(port: int = 0, *allow: str, clients: int = 16) -> AsyncIterato
     """Run a relay until the end of the context."""
     settings = CameraSettings(url="http://robot/", clients=clients)
     networks = tuple(map(ipaddress.ip_network, allow))
-    scene = Scene(port or free_port(), Demand(), Latest(), Metrics(), [])
+    scene = Scene(port or free_port(), Demand(), Latest(), Metrics(), [], [])
     plan = CameraPlan(Source("robot", 80, "/"), settings, None, networks)
     relay = Relay(plan, Address(HOST, scene.port), scene.demand, scene.latest, scene.metrics, scene.told.append)
     running = asyncio.create_task(relay.run())
@@ -67,9 +61,8 @@ async def serving(port: int = 0, *allow: str, clients: int = 16) -> AsyncIterato
     finally:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        for writer in _writers:
+        for writer in scene.writers:
             writer.transport.abort()
-        _writers.clear()
 
 
 async def until(condition: Callable[[], object]) -> None:

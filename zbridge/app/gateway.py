@@ -236,7 +236,7 @@ class Gateway:
         handles = (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
         self.restarts.device = device
         try:
-            await self._serve(ownership, device, begin)
+            await self._serve(bus, ownership, device, begin)
         finally:
             self.restarts.device = None
             for handle in handles:
@@ -250,10 +250,20 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _serve(self, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None) -> None:
+    async def _film(self, bus: Bus) -> None:
+        """Serve the robot's camera where it has one."""
+        if self._plan.camera is None:
+            return
+        from zbridge.camera.camera import Camera
+
+        await Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run()
+
+    async def _serve(
+        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None
+    ) -> None:
         """Serve the robot until another gateway has to take it."""
         self._device_served = device
-        serving = asyncio.ensure_future(device.run(begin))
+        serving = asyncio.ensure_future(together(device.run(begin), self._film(bus)))
         watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
         try:
             await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)

@@ -23,6 +23,8 @@ errors          :class:`ProtocolError` for bytes that are no message, :class:`En
                 can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
                 :class:`NotReady` or :class:`Malformed`, each with a :class:`Code`.
 address         :class:`Address`: where simulators listen.
+samples         :class:`KeyedSample`: the frames of a protocol whose robots speak Zenoh (``Protocol.keyed``), with
+                :func:`write_sample`, :func:`read_sample` and :func:`sample_end`.
 metrics         :class:`Metrics`, :class:`Count`: counters.
 =============== ===================================================================================================
 """
@@ -62,6 +64,7 @@ from zbridge.protocol.plugin import (
     Translate,
 )
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, sample_end, write_sample
 from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
 from zbridge.protocol.session_table import ClientIds
 
@@ -85,6 +88,7 @@ __all__ = [
     "Handshake",
     "HqSide",
     "HqSimulation",
+    "KeyedSample",
     "Limits",
     "Malformed",
     "Metrics",
@@ -100,6 +104,7 @@ __all__ = [
     "Robot",
     "RobotUser",
     "Role",
+    "SampleKind",
     "Sectors",
     "Send",
     "Session",
@@ -112,4 +117,7 @@ __all__ = [
     "agree",
     "newest",
     "parse_versions",
+    "read_sample",
+    "sample_end",
+    "write_sample",
 ]

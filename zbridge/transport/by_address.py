@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zbridge.protocol.address import DeviceAddress, SerialAddress
+from zbridge.protocol.address import DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.transport import serial, tcp
 from zbridge.transport.link import Link, Receiver
 
@@ -11,4 +11,8 @@ async def connect(address: DeviceAddress, receiver: Receiver) -> Link:
     """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason where that is not possible."""
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
+    if isinstance(address, ZenohAddress):
+        from zbridge.transport import samples  # loads what only such links need
+
+        return await samples.connect(address, receiver)
     return await tcp.connect(address, receiver)

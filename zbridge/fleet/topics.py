@@ -16,10 +16,12 @@ import msgspec
 from zbridge.fleet.messages import (
     Acquire,
     Authorization,
+    Battery,
     Control,
     Devices,
     Drive,
     FleetMessage,
+    Image,
     Map,
     Mode,
     Motion,
@@ -167,6 +169,8 @@ SCAN = Topic("scan", Scan, Delivery.STREAM)
 MOTION = Topic("motion", Motion, Delivery.STREAM)
 POSE = Topic("pose", Pose, Delivery.STREAM)
 TEXT = Topic("text", Text, Delivery.STREAM)
+IMAGE = Topic("image", Image, Delivery.STREAM)
+BATTERY = Topic("battery", Battery, Delivery.STREAM)
 SENSOR = _family("sensor", Reading, Delivery.STREAM)
 RAW = _family("raw", Raw, Delivery.STREAM)
 
@@ -202,7 +206,8 @@ RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_
 _TOPICS = {
     topic.path: topic
     for topic in (
-        *(SCAN, MOTION, POSE, TEXT, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
+        *(SCAN, MOTION, POSE, TEXT, IMAGE, BATTERY),
+        *(STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
         *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE),
     )

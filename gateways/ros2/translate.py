@@ -24,7 +24,7 @@ from gateways.ros2.messages import (
 from gateways.ros2.session import REST, RosRole, Velocity
 from gateways.ros2.settings import Options
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Map, Motion, Pose, Reading, Scan, Scanner
+from zbridge.fleet.messages import Battery, Drive, FleetMessage, Image, Map, Motion, Pose, Scan, Scanner
 from zbridge.fleet.topics import Topic
 from zbridge.protocol import (
     Metrics,
@@ -39,14 +39,13 @@ from zbridge.protocol import (
 from zbridge.ros2 import types_of
 
 NAME = "ros2"
-BATTERY = "battery"
-"""The name of the sensor that a robot's battery is."""
 OLDEST_NS = 1_000_000_000
 """A stamp is believed if it is at most this much before its arrival."""
 AHEAD_NS = 100_000_000
 """A stamp that is this much after its arrival is from a clock that is wrong, and is counted."""
 MOST_POINTS = 100_000
 MOST_CELLS = 16_000_000
+MOST_IMAGE_BYTES = 4 * 2**20
 FREE_BELOW, OCCUPIED_FROM = 25, 65
 """Percents of occupancy, as ROS's map_saver has them; between them a cell is unknown."""
 _UNKNOWN, _FREE, _OCCUPIED = 0, 1, 2
@@ -157,15 +156,25 @@ class RosRobot(Robot):
         )
 
     def _battery(self, message: BatteryState, stamp_ns: int) -> tuple[Telemetry, ...]:
-        level = float(message.body.percentage)
-        _require(math.isfinite(level), "a battery that does not know its charge")
-        fault = not 0.0 <= level <= 1.0
+        """A value that is not known is NaN; the states of charging are those of the message's constants."""
+        body = message.body
+        level, charging = _known(body.percentage), _CHARGING.get(int(body.power_supply_status))
+        _require(level is None or 0.0 <= level <= 1.0, f"a battery that is {level} full")
         stamp, device_ms = self._stamps(message, stamp_ns)
-        reading = Reading(level, BATTERY, fault=fault, stamp_ns=stamp, device_ms=device_ms)
-        return ((topics.SENSOR(BATTERY), reading),)
+        voltage, current = _known(body.voltage), _known(body.current)
+        battery = Battery(level, voltage, current, charging, stamp_ns=stamp, device_ms=device_ms)
+        return ((topics.BATTERY, battery),)
 
     def _image(self, message: CompressedImage, stamp_ns: int) -> tuple[Telemetry, ...]:
-        return ()
+        """The format of a message may say more: ``rgb8; jpeg compressed bgr8``."""
+        words = str(message.body.format).lower()
+        found = next((name for word, name in _FORMATS if word in words), None)
+        if found is None:
+            raise ProtocolError(f"an image as {words[:40]!r}")
+        _require(len(message.body.data) <= MOST_IMAGE_BYTES, f"an image of {len(message.body.data)} bytes")
+        stamp, device_ms = self._stamps(message, stamp_ns)
+        image = Image(found, message.body.data.tobytes(), stamp_ns=stamp, device_ms=device_ms)
+        return ((topics.IMAGE, image),)
 
     def _keep(self, shown: list[Telemetry]) -> tuple[Telemetry, ...]:
         """Remember the answers to queries."""
@@ -247,6 +256,13 @@ def _vector(vector: Any, covariance: Any) -> tuple[float, float, float] | None:
     return x, y, z
 
 
+def _known(value: float) -> float | None:
+    return float(value) if _finite(value) else None
+
+
+_CHARGING = {1: True, 2: False, 3: False, 4: False}
+"""power_supply_status: charging, discharging, not charging, full; 0 is unknown."""
+_FORMATS = (("jpeg", "jpeg"), ("jpg", "jpeg"), ("png", "png"))
 _TELEMETRY: dict[type[Heard], Callable[[RosRobot, Any, int], tuple[Telemetry, ...]]] = {
     LaserScan: RosRobot._scan,
     Odometry: RosRobot._odometry,

@@ -10,7 +10,18 @@ from __future__ import annotations
 from typing import Any
 
 from gateways.ros2.settings import Options
-from zbridge.protocol import Metrics, Protocol, Robot, Simulation
+from zbridge.protocol import (
+    Codec,
+    KeyedSample,
+    Metrics,
+    Protocol,
+    Robot,
+    SampleKind,
+    Simulation,
+    read_sample,
+    sample_end,
+    write_sample,
+)
 
 TEMPLATE = """\
 [device]
@@ -61,5 +72,7 @@ PROTOCOL = Protocol(
     simulate=_simulate,
     simulated=SIMULATED,
     template=TEMPLATE,
+    codecs=(Codec("samples", write_sample, read_sample, sample_end, tuple(map(KeyedSample, SampleKind))),),
     keyed=True,
+    requires=("rosbags", "xxhash"),
 )

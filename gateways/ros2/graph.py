@@ -80,8 +80,9 @@ class Graph:
         return endpoint
 
     def gone(self, token: str) -> bool:
-        """Forget an endpoint; False if it was none of those that count."""
-        self.wrong.pop(token, None)
+        """Forget an endpoint; False if it was not known."""
+        if self.wrong.pop(token, None) is not None:
+            return True
         for table in (self.publishers, self.takers, self.drivers):
             endpoint = table.pop(token, None)
             if endpoint is not None:

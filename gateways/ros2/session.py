@@ -21,6 +21,7 @@ from gateways.ros2.graph import Graph
 from gateways.ros2.messages import LIVE, TWIST_STAMPED, Command, Event, Ignored
 from gateways.ros2.settings import Options
 from zbridge.protocol import (
+    SAMPLE_BYTES,
     Count,
     KeyedSample,
     Limits,
@@ -34,9 +35,9 @@ from zbridge.protocol import (
     State,
     read_sample,
     sample_end,
+    subscription,
     write_sample,
 )
-from zbridge.protocol.samples import FRAME_BYTES, subscribe
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
 
 REST_S = 1.0
@@ -71,7 +72,7 @@ class RosRole(Session[Any]):
     handled = frozenset({Event, Command, Ignored})
 
     def __init__(self, options: Options, types: Types, overruled: Count) -> None:
-        super().__init__(Limits(frame_bytes=FRAME_BYTES, handshake_s=math.inf))
+        super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=math.inf))
         self.transport = "zenoh"
         self.outbox = _Dated(self)
         self.graph = Graph(options, types)
@@ -174,7 +175,7 @@ class RosRole(Session[Any]):
             self._show(endpoint, Kind.PUBLISHER)
         if wanted.heard is not Command or not self._options.shared:
             self._show(endpoint, Kind.SUBSCRIBER, kept=wanted.kept)
-            self.send_first(subscribe(endpoint.key, kept=wanted.kept))
+            self.send_first(subscription(endpoint.key, kept=wanted.kept))
 
     def _show(self, endpoint: Endpoint, kind: Kind, *, kept: bool = False) -> None:
         if (endpoint.key, kind) in self._own or self._node is None:

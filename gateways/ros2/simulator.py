@@ -10,6 +10,7 @@ import asyncio
 import logging
 import math
 import random
+import socket
 import time
 from typing import Any
 
@@ -17,6 +18,8 @@ import numpy as np
 
 from gateways.ros2.messages import TWIST, TWIST_STAMPED, Event
 from zbridge.protocol import (
+    SAMPLE_BYTES,
+    Address,
     ConfigError,
     KeyedSample,
     Limits,
@@ -28,9 +31,9 @@ from zbridge.protocol import (
     State,
     read_sample,
     sample_end,
+    subscription,
     write_sample,
 )
-from zbridge.protocol.samples import FRAME_BYTES, subscribe
 from zbridge.ros2 import (
     DISTROS,
     KEEP_LAST_10,
@@ -79,7 +82,7 @@ class NodeRole(Session[Any]):
     handled = frozenset({Event})
 
     def __init__(self, types: Types, command_type: str, *, domain: int = 0, namespace: str = "/") -> None:
-        super().__init__(Limits(frame_bytes=FRAME_BYTES, handshake_s=5.0))
+        super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=5.0))
         self._types, self._domain, self._namespace = types, domain, namespace
         self._command_type = command_type
         self._publishers: dict[str, Endpoint] = {}
@@ -112,7 +115,7 @@ class NodeRole(Session[Any]):
             self._publishers[name] = Endpoint(
                 node, number, Kind.PUBLISHER, f"{prefix}/{name}", type_name, types.hash(type_name), qos
             )
-        self.send_first(subscribe(taker.key))
+        self.send_first(subscription(taker.key))
         for token in (node.token(), taker.token(), *(publisher.token() for publisher in self._publishers.values())):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
@@ -250,8 +253,9 @@ async def simulate(simulation: Simulation) -> None:
     distro, dialect = simulation.version or "jazzy", simulation.dialect or "twist"
     if distro not in DISTROS or dialect not in _DIALECTS:
         raise ConfigError(f"{distro}, {dialect}: expected one of {', '.join(DISTROS)}, and of {', '.join(_DIALECTS)}")
-    if len(simulation.addresses) != 1 or not simulation.addresses[0].port:
-        raise ConfigError("a ROS 2 robot has one router, with a port: tcp://127.0.0.1:7447")
+    if len(simulation.addresses) != 1:
+        raise ConfigError("a ROS 2 robot has one router")
+    address = _with_port(simulation.addresses[0])
     types = types_of(distro)
     machine, session = Machine(simulation.seed, types), NodeRole(types, _DIALECTS[dialect])
 
@@ -260,12 +264,20 @@ async def simulate(simulation: Simulation) -> None:
             machine.take(twist)
 
     conversation = Conversation(session, asyncio.get_running_loop(), deliver=deliver)
-    async with serve(simulation.addresses[0], conversation):
-        simulation.ready(simulation.addresses)
+    async with serve(address, conversation):
+        simulation.ready((address,))
         try:
             await _live(machine, session, conversation, types)
         finally:
             conversation.close("simulator ended")
+
+
+def _with_port(address: Address) -> Address:
+    """Find a free port where none is told: Zenoh does not say which one it takes."""
+    if address.port:
+        return address
+    with socket.create_server((address.host, 0)) as free:
+        return Address(address.host, int(free.getsockname()[1]))
 
 
 async def _live(machine: Machine, session: NodeRole, conversation: Conversation, types: Types) -> None:

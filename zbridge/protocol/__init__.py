@@ -23,8 +23,9 @@ errors          :class:`ProtocolError` for bytes that are no message, :class:`En
                 can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
                 :class:`NotReady` or :class:`Malformed`, each with a :class:`Code`.
 address         :class:`Address`: where simulators listen.
-samples         :class:`KeyedSample`: the frames of a protocol whose robots speak Zenoh (``Protocol.keyed``), with
-                :func:`write_sample`, :func:`read_sample` and :func:`sample_end`.
+samples         :class:`KeyedSample` of a :class:`SampleKind`: the frames of a protocol whose robots speak Zenoh
+                (``Protocol.keyed``), of :data:`SAMPLE_BYTES` at most, with :func:`write_sample`, :func:`read_sample`,
+                :func:`sample_end` and :func:`subscription`.
 metrics         :class:`Metrics`, :class:`Count`: counters.
 =============== ===================================================================================================
 """
@@ -64,13 +65,22 @@ from zbridge.protocol.plugin import (
     Translate,
 )
 from zbridge.protocol.rate_limit import RateLimit
-from zbridge.protocol.samples import KeyedSample, SampleKind, read_sample, sample_end, write_sample
+from zbridge.protocol.samples import (
+    SAMPLE_BYTES,
+    KeyedSample,
+    SampleKind,
+    read_sample,
+    sample_end,
+    subscription,
+    write_sample,
+)
 from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
 from zbridge.protocol.session_table import ClientIds
 
 __all__ = [
     "ATTEND_S",
     "LIMIT",
+    "SAMPLE_BYTES",
     "Address",
     "BearingScan",
     "ClientIds",
@@ -119,5 +129,6 @@ __all__ = [
     "parse_versions",
     "read_sample",
     "sample_end",
+    "subscription",
     "write_sample",
 ]

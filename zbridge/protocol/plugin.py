@@ -264,6 +264,8 @@ class Protocol(msgspec.Struct, frozen=True):
     keyed: bool = False
     """Whether its robots speak Zenoh: a link is a Zenoh session of its own, and its frames are those of
     :mod:`zbridge.protocol.samples`."""
+    requires: tuple[str, ...] = ()
+    """Modules that its robots need beyond what zbridge itself does; an extra installs them."""
 
     def device_address(self, text: str) -> DeviceAddress:
         """Read the address of a robot of this protocol; raise LinkError that names what was expected."""

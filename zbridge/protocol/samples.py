@@ -27,7 +27,7 @@ _HEADER = struct.Struct("<IBHHq")
 _NONE = 0xFFFF
 """Stands for no attachment."""
 _COUNT = struct.Struct("<I")
-FRAME_BYTES = 16 * 2**20
+SAMPLE_BYTES = 16 * 2**20
 """Most bytes of a frame: a map of 4000 x 4000 cells."""
 
 
@@ -62,7 +62,7 @@ class KeyedSample(msgspec.Struct, frozen=True):
         return int(_COUNT.unpack(self.payload)[0])
 
 
-def subscribe(key: str, *, kept: bool = False) -> KeyedSample:
+def subscription(key: str, *, kept: bool = False) -> KeyedSample:
     """Make SUBSCRIBE. kept: the last samples that publishers have kept come first."""
     return KeyedSample(SampleKind.SUBSCRIBE, key, b"kept" if kept else b"")
 
@@ -77,7 +77,7 @@ def write_sample(sample: KeyedSample) -> bytes:
     key, attachment = sample.key.encode(), sample.attachment
     shown = attachment or b""
     size = _HEADER.size + len(key) + len(shown) + len(sample.payload)
-    if len(key) >= _NONE or len(shown) >= _NONE or size > FRAME_BYTES:
+    if len(key) >= _NONE or len(shown) >= _NONE or size > SAMPLE_BYTES:
         raise EncodeError(f"{sample.key[:80]}: sample of {size} bytes, attachment of {len(shown)}")
     told = _NONE if attachment is None else len(shown)
     return b"".join((_HEADER.pack(size, sample.kind, len(key), told, sample.stamp_ns), key, shown, sample.payload))

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 from zbridge.bus import Bus, BusSettings, Handle, Lane, Look, Publisher, Sample, Sort, open_bus
 from zbridge.errors import BusError, LinkError
@@ -204,14 +204,11 @@ async def connect(address: ZenohAddress, receiver: Receiver) -> ZenohLink:
 
 
 @contextlib.asynccontextmanager
-async def serve(
-    address: Address, receiver: Receiver, bound: Callable[[Address], object] = lambda address: None
-) -> AsyncIterator[ZenohLink]:
+async def serve(address: Address, receiver: Receiver) -> AsyncIterator[ZenohLink]:
     """Open a router at ``address``, which is itself the session of ``receiver``; raise LinkError where it cannot be."""
     settings = BusSettings(mode="router", listen=(f"tcp/{address.host}:{address.port}",), multicast=False)
     link = await _opened(str(address), settings, receiver)
     link.begin(ends=False)
-    bound(address)
     try:
         yield link
     finally:

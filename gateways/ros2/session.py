@@ -2,8 +2,8 @@
 
 The link is a Zenoh session (:mod:`zbridge.protocol.samples`). The handshake: the link is open; a publisher of one of
 the robot's topics has a token; something came from it. The session ends when all tokens are gone or nothing came for
-``silent_s``; before it ends, the robot is told to stand still. ROS has no handshake of its own, so this one has no time
-limit: ``busy`` says what is missing.
+``silent_s``; before it ends, the robot is told to stand still. ROS has no handshake of its own: ``busy`` says what is
+missing, and after :data:`HANDSHAKE_S` the link is opened anew.
 
 What others write to the topic of commands is answered by what we said last, unless the robot is ``shared``: another
 node's motion must not outlive a stop.
@@ -40,11 +40,15 @@ from zbridge.protocol import (
 )
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
 
+HANDSHAKE_S = 60.0
+"""Seconds after which the link is opened anew where nothing of the robot was heard."""
 REST_S = 1.0
 """Seconds for which zeros are repeated after neutral."""
 ANSWERS_HZ = 100.0
 """Times a second that other nodes' commands are answered."""
 _DRIVE = "drive"
+_KIND_AT = 4
+"""Offset of the kind in a frame."""
 _STAMP = struct.Struct("<iI")
 _STAMP_AT = 4
 """Offset of the stamp in a TwistStamped as CDR: behind the encapsulation header."""
@@ -72,7 +76,7 @@ class RosRole(Session[Any]):
     handled = frozenset({Event, Command, Ignored})
 
     def __init__(self, options: Options, types: Types, overruled: Count) -> None:
-        super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=math.inf))
+        super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=HANDSHAKE_S))
         self.transport = "zenoh"
         self.outbox = _Dated(self)
         self.graph = Graph(options, types)
@@ -271,17 +275,30 @@ class RosRole(Session[Any]):
 
     def dated(self, frame: bytes, now: float) -> bytes:
         """Complete a command that leaves now: its number, our gid, the time, and the stamp on the robot's clock."""
-        sample = read_sample(frame)
-        gid = self._gids.get(sample.key)
-        if sample.kind is not SampleKind.PUT or gid is None:
+        if frame[_KIND_AT] != SampleKind.PUT:
             return frame
+        sample = read_sample(frame)
+        gid = self._gids[sample.key]
         number = self._numbers[sample.key] = self._numbers.get(sample.key, 0) + 1
         sent_ns = self._time[0] + round((now - self._time[1]) * _NS_PER_S)
-        payload = sample.payload
-        if self.graph.keys[sample.key][1] == TWIST_STAMPED:
-            payload = payload[:_STAMP_AT] + self._robot_stamp(now) + payload[_STAMP_AT + _STAMP.size :]
+        payload = self._stamped(sample, self._robot_stamp(now))
         attachment = Attachment(number, max(0, sent_ns), gid).encode()
         return write_sample(KeyedSample(SampleKind.PUT, sample.key, payload, attachment))
+
+    def undated(self, frame: bytes) -> bytes:
+        if frame[_KIND_AT] != SampleKind.PUT:
+            return frame
+        sample = read_sample(frame)
+        return write_sample(KeyedSample(SampleKind.PUT, sample.key, self._stamped(sample, bytes(_STAMP.size))))
+
+    def _stamped(self, sample: KeyedSample, stamp: bytes) -> bytes:
+        """Write a stamp into a command, if its type has one."""
+        if self.graph.keys[sample.key][1] != TWIST_STAMPED:
+            return sample.payload
+        return sample.payload[:_STAMP_AT] + stamp + sample.payload[_STAMP_AT + _STAMP.size :]
+
+    def overdue(self) -> str:
+        return self.graph.waiting_for
 
     def _robot_stamp(self, now: float) -> bytes:
         """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""

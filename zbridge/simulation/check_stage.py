@@ -192,7 +192,7 @@ class Rehearsal:
             session.expire(self.now)
             frame = session.outgoing(self.now)
             if frame is not None:
-                written.append(frame)
+                written.append(session.undated(frame))
                 session.outbox.written(self.now)
                 if answers and session.state is State.ESTABLISHED:
                     for answer in self._recording.answers.get(frame, ()):

@@ -32,6 +32,8 @@ CDR = bytes((0, 1, 0, 0))
 SIDE, CELL_M = 40, 0.1
 """Cells along a side of the map."""
 POINTS = 360
+GRACE_S = 1.0
+"""Seconds by which the news of a token may be later than a command, or a command later than the end of its token."""
 LATE_S = 5.0
 """Seconds by which the time of an attachment may be wrong."""
 
@@ -88,7 +90,8 @@ class StrictRobot:
         self.tokens: dict[str, Any] = {}
         """What it has declared; a test takes tokens back."""
         self._hangs = False
-        self._alive: set[bytes] = set()
+        self._alive: dict[bytes, float] = {}
+        """The gids of tokens, and until when they count: news of tokens and commands come on different threads."""
         self._declare()
         self._thread = threading.Thread(target=self._live, daemon=True)
         self._thread.start()
@@ -130,8 +133,9 @@ class StrictRobot:
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         gid = gid_of(str(sample.key_expr))
+        here = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
-            (self._alive.add if sample.kind == zenoh.SampleKind.PUT else self._alive.discard)(gid)
+            self._alive[gid] = math.inf if here else time.monotonic() + GRACE_S
 
     def _on_command(self, sample: zenoh.Sample) -> None:
         at = time.monotonic()
@@ -153,9 +157,11 @@ class StrictRobot:
             raise ValueError(f"attachment of {len(attachment)} bytes")
         number, sent_ns = struct.unpack_from("<qq", attachment)
         gid = attachment[17:]
-        with self._lock:
-            if gid not in self._alive:
+        given_up_at = time.monotonic() + GRACE_S
+        while not self._is_alive(gid):
+            if time.monotonic() > given_up_at:
                 raise ValueError("a gid whose token is not alive")
+            time.sleep(0.01)
         before, before_ns = self._last.get(gid, (number - 1, 0))
         self._last[gid] = number, sent_ns
         if number != before + 1 or number < 1:
@@ -163,6 +169,10 @@ class StrictRobot:
         if sent_ns < before_ns or abs(sent_ns - time.time_ns()) > LATE_S * 1e9:
             self.violations.append(f"sent at {sent_ns}, after {before_ns}, now {time.time_ns()}")
         return gid
+
+    def _is_alive(self, gid: bytes) -> bool:
+        with self._lock:
+            return self._alive.get(gid, 0.0) > time.monotonic()
 
     def _twist(self, payload: bytes) -> tuple[float, ...]:
         at = 4

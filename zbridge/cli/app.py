@@ -222,6 +222,40 @@ def router(
 
 
 @app.command()
+def ros2(
+    file: Annotated[
+        Path | None, typer.Argument(help="settings (TOML): speeds, sizes, what the options say", show_default=False)
+    ] = None,
+    domain: Annotated[int | None, typer.Option(help="ROS_DOMAIN_ID; 0 by default", show_default=False)] = None,
+    robot: Annotated[list[str], typer.Option(help="show this robot only; once for each; all by default")] = [],
+    drive: Annotated[bool, typer.Option("--drive", help="let publishers on cmd_vel drive, and calls switch")] = False,
+    distro: Annotated[
+        str, typer.Option(help="humble, iron, jazzy, kilted or lyrical; jazzy by default", show_default=False)
+    ] = "",
+    ros: Annotated[
+        list[str], typer.Option(help="ROS's router; tcp/localhost:7447 by default", show_default=False)
+    ] = [],
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Annotated[str, typer.Option(help="first chunk of all keys; fleet by default", show_default=False)] = "",
+    verbose: Verbose = False,
+) -> None:
+    """Show robots to ROS 2 over its middleware rmw_zenoh, until SIGTERM or SIGINT; needs zbridge[ros2]."""
+    from zbridge.cli.ros2 import run_ros2
+
+    set_up_log(verbose=verbose)
+    given: dict[str, object] = {
+        "domain": domain,
+        "robots": robot,
+        "drive": drive,
+        "distro": distro or None,
+        "ros": ros,
+        "realm": realm or None,
+    }
+    run_ros2(bus_settings(connect, tls) if connect or tls else None, bus_settings(), file, given)
+
+
+@app.command()
 def ls(
     connect: Connect = [],
     tls: TlsFolder = None,

@@ -30,6 +30,7 @@ class Types:
         self.distro = distro
         self._store = store
         self._hashes: dict[str, str] = {}
+        self._made: dict[str, tuple[Any, dict[str, Any], dict[str, str]]] = {}
         for service in _SERVICES:
             _add_service(store, service)
 
@@ -52,7 +53,8 @@ class Types:
     def message(self, type_name: str, **fields: Any) -> Any:
         """Make a message; a field that is left out is zero, empty or a message of such.
 
-        A field that this distribution does not have is left out: later ones have more. Arrays are numpy arrays.
+        A field that this distribution does not have is left out: later ones have more. Arrays are numpy arrays. What
+        was left out is shared by all messages: it must not be changed.
         """
         return self._make(type_name, fields)
 
@@ -71,11 +73,22 @@ class Types:
             raise ProtocolError(f"{type_name} of {len(payload)} bytes: {error}") from error
 
     def _make(self, type_name: str, fields: Mapping[str, Any]) -> Any:
-        made = {
-            _attribute(name): fields[name] if name in fields else self._zero(kind)
-            for name, kind in self._store.fielddefs[type_name][1]
-        }
-        return self._store.types[type_name](**made)
+        made = self._made.get(type_name)
+        if made is None:
+            made = self._made[type_name] = self._plan(type_name)
+        build, zeros, attributes = made
+        given = dict(zeros)
+        for name, value in fields.items():
+            attribute = attributes.get(name)
+            if attribute is not None:
+                given[attribute] = value
+        return build(**given)
+
+    def _plan(self, type_name: str) -> tuple[Any, dict[str, Any], dict[str, str]]:
+        """Return a type's class, its zeros by attribute, and its attributes by field."""
+        fields = self._store.fielddefs[type_name][1]
+        attributes = {name: _attribute(name) for name, _ in fields}
+        return self._store.types[type_name], {attributes[name]: self._zero(kind) for name, kind in fields}, attributes
 
     def _zero(self, kind: Any) -> Any:
         import numpy as np

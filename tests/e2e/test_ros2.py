@@ -1,0 +1,266 @@
+"""``zbridge ros2`` between a real gateway and a participant of ROS 2 that shares no code with it; two real routers."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgpack
+import pytest
+import zenoh
+
+from tests.e2e.conftest import Gateway, configuration, end, free_port, start, until
+from tests.e2e.robots import STOP, Robot
+from tests.views.ros2.judge import Heard, Publisher, Ros
+
+SCAN, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+DIAGNOSED = "diagnostic_msgs/msg/DiagnosticArray"
+
+
+class Scene:
+    """A scripted robot behind a real gateway, the view, ROS's router, and a session on the fleet's bus."""
+
+    def __init__(self, stack: contextlib.ExitStack, folder: Path) -> None:
+        self.robot = Robot()
+        stack.callback(self.robot.close)
+        self.fleet_at, self.ros_at = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+        self.fleet = zenoh.open(configuration("router", self.fleet_at))
+        stack.callback(self.fleet.close)
+        self.ros_router = zenoh.open(configuration("router", self.ros_at))
+        stack.callback(self.ros_router.close)
+        device = f'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{self.robot.port}"]\n'
+        Gateway(stack, folder / "r1.toml", self.fleet_at, device)
+        file = folder / "ros2.toml"
+        file.write_text(f'drive = true\nros = ["{self.ros_at}"]\n[robot.r1]\nspeed_full_mps = 0.5\n')
+        log = stack.enter_context((folder / "ros2.log").open("w"))
+        self.view = start("ros2", str(file), "--connect", self.fleet_at, stdout=log)
+        stack.callback(lambda: end(self.view))
+        self.ros = Ros(self.ros_at, "teleop")
+        stack.callback(self.ros.close)
+        self.diagnosed = self.ros.subscribe("/r1/diagnostics", DIAGNOSED)
+        self.told("r1: state", "established")
+
+    def told(self, name: str, text: str) -> str:
+        """Wait until a diagnostic of this name holds a text, in its message or values."""
+
+        def shown(heard: list[Heard]) -> str | None:
+            entries = [entry for entry in heard[-1].message.status if entry.name == name] if heard else []
+            texts = [" ".join([each.message, *(f"{v.key}={v.value}" for v in each.values)]) for each in entries]
+            return next((each for each in texts if text in each), None)
+
+        return shown(self.diagnosed.until(shown)) or ""
+
+    def moves(self, since: float = 0.0) -> list[float]:
+        """Give the speeds of the frames that moved the robot after a moment, in the order they came."""
+        frames = [frame for frame in tuple(self.robot.frames) if frame.moves and frame.at > since]
+        return [frame.number / 1e6 for frame in frames]
+
+    def rests(self) -> bool:
+        """Whether the newest frame that moves or stops the robot is a stop."""
+        newest = [frame for frame in tuple(self.robot.frames) if frame.moves or frame.packet_id == STOP]
+        return not newest or newest[-1].packet_id == STOP
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    with contextlib.ExitStack() as stack:
+        yield Scene(stack, tmp_path_factory.mktemp("ros2"))
+
+
+@contextlib.contextmanager
+def repeated(act: Callable[[], None], every_s: float = 0.05) -> Iterator[None]:
+    """Do something again and again, as a stick does that is pushed."""
+    ended = threading.Event()
+
+    def go_on() -> None:
+        while not ended.wait(every_s):
+            act()
+
+    thread = threading.Thread(target=go_on, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def publishing(scene: Scene, type_name: str = TWIST) -> Iterator[Publisher]:
+    """Have a publisher on cmd_vel that the view knows and that may drive."""
+    publisher = scene.ros.publisher("/r1/cmd_vel", type_name)
+    try:
+        with repeated(publisher.twist):
+            scene.told("r1: cmd_vel", "/teleop=may drive")
+        yield publisher
+    finally:
+        publisher.close()
+        until(scene.rests, what="rest")
+        scene.told("r1: control", "free" if "stopped" not in scene.told("r1: control", "") else "stopped")
+
+
+def test_the_graph_shows_a_node_for_the_robot_and_what_it_offers(scene: Scene) -> None:
+    def offered() -> set[tuple[str, str]]:
+        tokens = [parts[5:] for parts in scene.ros.graph() if parts[7:9] == ["%r1", "zbridge"]]
+        return {(token[0], token[4].replace("%", "/") if len(token) > 4 else "") for token in tokens}
+
+    expected = {("MP", f"/r1/{name}") for name in ("scan", "odom", "pose", "map", "imu", "tf", "robot_description")}
+    expected |= {("MP", "/tf"), ("MP", "/tf_static"), ("MS", "/r1/cmd_vel"), ("NN", "")}
+    expected |= {("SS", f"/r1/{name}") for name in ("stop", "set_light", "set_lidar", "set_camera")}
+    until(lambda: expected <= offered(), what="graph")
+
+
+def test_a_scan_comes_while_somebody_listens_and_a_late_joiner_gets_the_map(scene: Scene) -> None:
+    fleet, now_ns = scene.fleet, time.time_ns()
+    token = fleet.liveliness().declare_token("fleet/r2/@alive/gateway")
+    until(lambda: any(parts[7] == "%r2" for parts in scene.ros.graph()), what="r2")
+    ranges = struct.pack("<3f", 1.0, 2.0, 3.0)
+    scan = {"angle_min": -1.0, "angle_increment": 1.0, "range_min": 0.1, "range_max": 9.0, "ranges": ranges}
+    grid = {"rows": 1, "columns": 3, "cell": 0.5, "origin": [0.0, 0.0], "cells": bytes([0, 1, 2])}
+
+    def put(name: str, fields: dict[str, object]) -> Callable[[], None]:
+        return lambda: fleet.put(f"fleet/r2/{name}", msgpack.packb({**fields, "stamp_ns": now_ns}))
+
+    scans = scene.ros.subscribe("/r2/scan", SCAN)
+    first = scene.ros.subscribe("/r2/map", GRID, latched=True)
+    with repeated(put("scan", scan)), repeated(put("map", grid)):
+        heard = scans.until(lambda heard: len(heard) > 2)
+        first.until(bool)
+    laser = heard[-1].message
+    assert laser.ranges.tolist() == [1.0, 2.0, 3.0]
+    assert (laser.header.frame_id, laser.angle_max) == ("r2/laser", 1.0)
+    assert laser.header.stamp.sec * 10**9 + laser.header.stamp.nanosec == now_ns
+    numbers = [each.number for each in heard]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    late = scene.ros.subscribe("/r2/map", GRID, latched=True)
+    assert late.until(bool)[0].message.data.tolist() == [-1, 0, 100]
+    fixed = scene.ros.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", latched=True)
+    robots = {"r1/laser", "r2/laser"}
+    fixed.until(lambda heard: robots <= {at.child_frame_id for each in heard for at in each.message.transforms})
+    token.undeclare()
+    until(lambda: not any(parts[7] == "%r2" for parts in scene.ros.graph()), what="no r2")
+
+
+@pytest.mark.parametrize("type_name", [TWIST, STAMPED])
+def test_a_twist_drives_and_silence_stops(scene: Scene, type_name: str) -> None:
+    with publishing(scene, type_name) as publisher:
+        begun = time.monotonic()
+        with repeated(lambda: publisher.twist(0.125)):
+            until(lambda: scene.moves(begun), what="motion")
+            scene.told("r1: cmd_vel", "driven by /teleop")
+            scene.told("r1: control", "held by ros2.teleop")
+        assert scene.moves(begun)[-1] == pytest.approx(0.25), "0.125 m/s of 0.5 m/s"
+        until(scene.rests, what="rest")
+        scene.told("r1: cmd_vel", "nobody drives")
+
+
+def test_of_two_publishers_the_second_is_refused_and_told_by_whom(scene: Scene) -> None:
+    other = Ros(scene.ros_at, "nav", namespace="/planner")
+    with contextlib.closing(other), publishing(scene) as publisher:
+        begun = time.monotonic()
+        with repeated(lambda: publisher.twist(0.125)):
+            until(lambda: scene.moves(begun), what="motion")
+            second = other.publisher("/r1/cmd_vel", TWIST)
+            with repeated(lambda: second.twist(-0.5)):
+                scene.told("r1: cmd_vel", "/planner/nav=r1 is driven by /teleop")
+        assert all(speed > 0 for speed in scene.moves(begun))
+
+
+def test_a_publisher_that_is_gone_stops_the_robot_although_it_was_just_heard(scene: Scene) -> None:
+    begun = time.monotonic()
+    with publishing(scene) as publisher, repeated(lambda: publisher.twist(0.25), 0.2):
+        until(lambda: scene.moves(begun), what="motion")
+        publisher.hide()
+        until(scene.rests, what="rest")
+        scene.told("r1: cmd_vel", "nobody drives")
+
+
+def test_a_called_stop_stops_and_a_pushed_stick_does_not_move_the_robot_anew(scene: Scene) -> None:
+    with publishing(scene) as publisher:
+        begun = time.monotonic()
+        with repeated(lambda: publisher.twist(0.25)):
+            until(lambda: scene.moves(begun), what="motion")
+            response, _ = scene.ros.call("/r1/stop", TRIGGER, scene.ros.request(TRIGGER, none=0))
+            assert (response.success, response.message) == (True, "")
+            stopped = time.monotonic()
+            scene.told("r1: cmd_vel", "the robot was stopped: send a zero")
+            assert scene.rests()
+            assert not [frame for frame in scene.robot.frames if frame.moves and frame.at > stopped + 0.2]
+        with repeated(publisher.twist):
+            scene.told("r1: cmd_vel", "/teleop=may drive")
+        with repeated(lambda: publisher.twist(0.25)):
+            until(lambda: scene.moves(stopped), what="motion anew")
+
+
+def test_a_call_switches_and_a_malformed_one_has_an_error(scene: Scene) -> None:
+    response, _ = scene.ros.call("/r1/set_light", SET_BOOL, scene.ros.request(SET_BOOL, data=True))
+    assert response.success, response.message
+    key, _ = scene.ros._names("/r1/set_light", SET_BOOL)
+    for payload, attachment in ((b"\x00\x01\x00\x00\x01", None), (b"\xff" * 300, bytes(33)), (b"", b"\x10" * 33)):
+        replies = scene.ros.session.get(key, payload=payload, attachment=attachment, timeout=10.0)
+        errors = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
+        assert errors, payload
+        assert b"malformed" in errors[0]
+
+
+def test_garbage_wrong_types_and_strangers_are_counted_and_move_nothing(scene: Scene) -> None:
+    begun = time.monotonic()
+    stranger = Ros(scene.ros_at, "stranger")
+    with contextlib.closing(stranger), publishing(scene) as publisher:
+        wrong = stranger.publisher("/r1/cmd_vel", "std_msgs/msg/String")
+        twist = struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
+        good = b"\x00\x01\x00\x00" + twist
+        key = publisher.key
+        attachments = [
+            None,
+            b"",
+            bytes(32),
+            bytes(33),
+            bytes(64),
+            b"\xff" * 33,
+            b"\x01" + bytes(15) + b"\x10" + b"x" * 16,
+        ]
+        for attachment in attachments:
+            stranger.session.put(key, good, attachment=attachment)
+        for payload in (b"", b"\x00", good[:-1], b"\x09" + good, b"\xff" * 60, b"\xff" * 5000):
+            publisher.put_payload(payload)
+        nan = b"\x00\x01\x00\x00" + struct.pack("<6d", float("nan"), 0, 0, 0, 0, 0)
+        publisher.put_payload(nan)
+        wrong.put_payload(good)
+        told = scene.told("r1: cmd_vel", "/stranger publishes std_msgs/msg/String")
+        told = scene.told("r1: cmd_vel", "malformed=")
+        told = scene.told("r1: cmd_vel", "strangers=")
+        assert told
+        for number in range(3000):
+            stranger.session.put(key, good, attachment=number.to_bytes(16, "little") + b"\x10" + bytes(16))
+        for parts in (
+            "0/0/NN/%/%/x",
+            "0/7/MP/%/%/x/%r1%cmd_vel/y/z/::",
+            "0/8/MP/%/%/x/%r1%cmd_vel/a::msg::dds_::B_/c/::,9:,:,:,,",
+        ):
+            stranger._kept.append(stranger._token(f"{stranger.session.zid()}/{parts}"))
+        with repeated(lambda: publisher.twist(0.125)):
+            until(lambda: scene.moves(begun), what="motion after the flood")
+        assert all(speed == pytest.approx(0.25) for speed in scene.moves(begun))
+
+
+def test_both_routers_at_one_address_is_an_error_that_says_so(scene: Scene, tmp_path: Path) -> None:
+    process = start("ros2", "--ros", scene.fleet_at, "--connect", scene.fleet_at)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "the same router as the fleet's" in output
+    assert json.dumps(output).count("Traceback") == 0
+
+
+def test_no_router_of_ros_is_an_error_that_says_how_to_start_one(scene: Scene) -> None:
+    process = start("ros2", "--ros", f"tcp/127.0.0.1:{free_port()}", "--connect", scene.fleet_at)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "rmw_zenohd" in output

@@ -1,0 +1,60 @@
+"""Twists as fractions of what a robot can do. Sans-IO."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from zbridge.errors import Malformed, Unsupported
+from zbridge.fleet.messages import Drive
+from zbridge.ros2 import Types
+from zbridge.views.ros2.settings import Body
+
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+MOST_BYTES: Mapping[str, int] = {TWIST: 64, STAMPED: 512}
+"""Bounds of the payloads; a stamped one has the name of a frame."""
+_STILL = 1e-6
+"""m/s and rad/s below this are zero."""
+
+
+def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Drive:
+    """Read a Twist or TwistStamped; its stamp says nothing here: clocks of machines are never compared.
+
+    Raises ProtocolError for what is none, Malformed for numbers that are not finite, Unsupported for a turn on the
+    spot of a robot that steers.
+    """
+    message = types.decode(type_name, payload)
+    twist = message.twist if type_name == STAMPED else message
+    forward, left, turn = twist.linear.x, twist.linear.y, twist.angular.z
+    if not (math.isfinite(forward) and math.isfinite(left) and math.isfinite(turn)):
+        raise Malformed("cmd_vel: expected finite numbers")
+    return drive_of(forward, left, turn, body)
+
+
+def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: Body) -> Drive:
+    """Scale speeds to a Drive. Above full scale all parts are scaled down alike: the curve stays. Or Unsupported."""
+    forward_mps, left_mps, turn_radps = (
+        0.0 if abs(value) < _STILL else value for value in (forward_mps, left_mps, turn_radps)
+    )
+    forward, left = forward_mps / body.speed_full_mps, left_mps / body.speed_full_mps
+    if body.wheelbase_m is not None:
+        return _steered(forward, forward_mps, left_mps, turn_radps, body.wheelbase_m, body.steer_full_rad)
+    turn = turn_radps / body.turn_full_radps
+    most = max(1.0, abs(forward), abs(left), abs(turn))
+    return Drive(forward=_held(forward / most), left=_held(left / most), turn=_held(turn / most))
+
+
+def _steered(
+    forward: float, forward_mps: float, left_mps: float, turn_radps: float, wheelbase_m: float, full_rad: float
+) -> Drive:
+    """Turn the wheels so that the robot runs the circle of radius v / omega: by atan(wheelbase x omega / v)."""
+    if left_mps:
+        raise Unsupported("cmd_vel: linear.y: a robot that steers does not move sideways")
+    if turn_radps and not forward_mps:
+        raise Unsupported("cmd_vel: angular.z without linear.x: a robot that steers does not turn on the spot")
+    angle = math.atan(wheelbase_m * turn_radps / abs(forward_mps)) if forward_mps else 0.0
+    return Drive(forward=_held(forward), turn=_held(angle / full_rad))
+
+
+def _held(value: float) -> float:
+    return max(-1.0, min(1.0, value))

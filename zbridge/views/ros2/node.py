@@ -1,0 +1,149 @@
+"""One robot as a node of ROS: its topics, worked for only while somebody listens; its services, and its cmd_vel."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+from zbridge.bus import Bus, Handle, Sample
+from zbridge.client import Fleet
+from zbridge.errors import PayloadError
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Devices
+from zbridge.fleet.topics import KeySpace
+from zbridge.ros2 import Kind
+from zbridge.views.ros2.outlets import Outlet, RosSide
+from zbridge.views.ros2.pictures import TOPICS, RobotPictures, RosTopic
+from zbridge.views.ros2.services import Services
+from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.teleop import Teleop
+
+NODE = "zbridge"
+"""The name of each robot's node, in the robot's namespace."""
+DIAGNOSED_S = 1.0
+"""Seconds between two diagnostics."""
+
+
+class RobotNode:
+    """Declares a robot on ROS's side. bus: the fleet's; drive: whether cmd_vel is heard."""
+
+    def __init__(self, side: RosSide, bus: Bus, keys: KeySpace, body: Body, *, drive: bool) -> None:
+        self.robot = keys.robot
+        self._side = side
+        self._bus = bus
+        self._keys = keys
+        self._pictures = RobotPictures(keys.robot, side.types, body, side.metrics)
+        self._malformed = side.metrics.count("ros2_malformed")
+        self.node = side.node(f"/{self._pictures.frames.prefix}", NODE)
+        self._outlets: dict[str, list[Outlet]] = {}
+        self._listened: dict[str, set[Outlet]] = {}
+        """The outlets of each topic that somebody listens to; topics without one are left out."""
+        self._subscribed: dict[str, Handle] = {}
+        self._paths: dict[str, tuple[str, ...]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._handles: list[Handle] = [side.bus.announce(self.node.token())]
+        robot = Fleet(bus, keys.realm)[keys.robot]
+        control_key = keys.key(topics.CONTROL.path)
+        self.teleop = Teleop(side, self.node, robot, body, bus, control_key) if drive else None
+        self._services = Services(side, self.node, robot, drive=drive, on_stop=self._on_stop)
+        self._declare(TOPICS)
+        for name, message in self._pictures.fixed(time.time_ns()):
+            self._publish(name, message, self._outlets[name])
+        self._handles.append(bus.subscribe(keys.key(topics.DEVICES.path), self._on_devices, history=True))
+
+    def __repr__(self) -> str:
+        return f"<RobotNode {self.node.full_name}, {sorted(self._listened)}>"
+
+    async def close(self) -> None:
+        """Give the robot back, and take everything back that was declared; idempotent."""
+        if self._timer is not None:
+            self._timer.cancel()
+        outlets = [outlet for of_topic in self._outlets.values() for outlet in of_topic]
+        for handle in (*self._handles, *self._subscribed.values(), *outlets):
+            handle.close()
+        self._services.close()
+        if self.teleop is not None:
+            await self.teleop.close()
+
+    def _declare(self, ros_topics: Iterable[RosTopic]) -> None:
+        for topic in ros_topics:
+            if topic.name in self._outlets:
+                continue
+            names = [f"{self.node.namespace}/{topic.name}"] + ([f"/{topic.name}"] if topic.everywhere else [])
+            self._paths[topic.name] = topic.paths
+            self._outlets[topic.name] = [self._outlet(topic, name) for name in names]
+
+    def _outlet(self, topic: RosTopic, name: str) -> Outlet:
+        endpoint = self._side.endpoint(self.node, Kind.PUBLISHER, name, topic.type_name, topic.qos)
+        made: list[Outlet] = []
+
+        def listened(anybody: bool) -> None:
+            self._on_listened(topic.name, made[0], anybody)
+
+        made.append(Outlet(self._side, endpoint, listened, kept=topic.qos.depth if topic.kept else 0))
+        return made[0]
+
+    # On demand
+
+    def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
+        listened = self._listened.setdefault(name, set())
+        (listened.add if anybody else listened.discard)(outlet)
+        if not listened:
+            del self._listened[name]
+        self._subscribe()
+        if name == "diagnostics" and anybody and self._timer is None:
+            self._diagnose()
+
+    def _subscribe(self) -> None:
+        """Subscribe on the fleet's bus to what the topics that are listened to need, and to nothing else."""
+        needed = {path for name in self._listened for path in self._paths[name]}
+        for path in self._subscribed.keys() - needed:
+            self._subscribed.pop(path).close()
+        for path in needed - self._subscribed.keys():
+            topic = topics.find(path)
+            handler = partial(self._take, path)
+            history = topic is not None and topic.qos.keeps_last
+            self._subscribed[path] = self._bus.subscribe(self._keys.key(path), handler, history=history)
+
+    def _take(self, path: str, sample: Sample) -> None:
+        if path.endswith("*"):
+            path = self._keys.path(sample.key)
+        topic = topics.find(path)
+        if topic is None:
+            return
+        try:
+            message = payloads.decode(topic.message, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        for name, made in self._pictures.make(path, message, time.time_ns(), self._listened):
+            self._publish(name, made, self._listened.get(name, ()))
+
+    def _publish(self, name: str, message: Any, outlets: Iterable[Outlet]) -> None:
+        for outlet in outlets:
+            outlet.put(message)
+
+    def _on_devices(self, sample: Sample) -> None:
+        try:
+            devices = payloads.decode(Devices, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        self._declare(self._pictures.sensors(devices.devices))
+
+    def _diagnose(self) -> None:
+        """Tell once a second, while somebody listens."""
+        self._timer = None
+        outlets = self._listened.get("diagnostics")
+        if outlets:
+            more = [self.teleop.diagnostics()] if self.teleop is not None else []
+            self._publish("diagnostics", self._pictures.diagnostics(more, time.time_ns()), outlets)
+            self._timer = asyncio.get_running_loop().call_later(DIAGNOSED_S, self._diagnose)
+
+    def _on_stop(self) -> None:
+        if self.teleop is not None:
+            self.teleop.stopped("the robot was stopped")

@@ -1,0 +1,72 @@
+"""What one session on ROS's side declares: nodes, and their publishers, each with its token, numbers and gid."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from zbridge.bus import Bus, Handle
+from zbridge.errors import EncodeError
+from zbridge.metrics import Metrics
+from zbridge.ros2 import Attachment, Endpoint, Kind, Node, QoS, Reliability, Types
+
+
+class RosSide:
+    """The session on ROS's side, and what all nodes share there. domain: of ROS."""
+
+    def __init__(self, bus: Bus, domain: int, types: Types, metrics: Metrics) -> None:
+        self.bus = bus
+        self.domain = domain
+        self.types = types
+        self.metrics = metrics
+        self._numbers = itertools.count()
+        self.sent = metrics.count("ros2_sent")
+        self.not_encoded = metrics.count("ros2_not_encoded")
+
+    def __repr__(self) -> str:
+        return f"<RosSide domain {self.domain}, {self.types.distro}>"
+
+    def node(self, namespace: str, name: str) -> Node:
+        """Name a node of this session."""
+        return Node(self.domain, self.bus.zid, next(self._numbers), namespace, name)
+
+    def endpoint(self, node: Node, kind: Kind, name: str, type_name: str, qos: QoS) -> Endpoint:
+        """Name an endpoint of a node. name: ``/r1/scan``."""
+        return Endpoint(node, next(self._numbers), kind, name, type_name, self.types.hash(type_name), qos)
+
+
+class Outlet:
+    """One publisher. listened: called when the first subscriber comes and the last one goes."""
+
+    def __init__(self, side: RosSide, endpoint: Endpoint, listened: Callable[[bool], None], *, kept: int) -> None:
+        self._side = side
+        self._gid = endpoint.gid()
+        self._numbers: Iterator[int] = itertools.count(1)
+        best_effort = endpoint.qos.reliability is Reliability.BEST_EFFORT
+        self._publisher = side.bus.frames(endpoint.key, listened, best_effort=best_effort, kept=kept)
+        self._handles: tuple[Handle, ...] = (side.bus.announce(endpoint.token()), self._publisher)
+
+    def __repr__(self) -> str:
+        return f"<Outlet {self._publisher.key}>"
+
+    def put(self, message: Any) -> None:
+        """Publish a message; one that ROS's types cannot hold is counted and left out."""
+        try:
+            payload = self._side.types.encode(message)
+        except EncodeError:
+            self._side.not_encoded.value += 1
+            return
+        self.put_payload(payload)
+
+    def put_payload(self, payload: bytes) -> None:
+        """Publish a message that is CDR already."""
+        attachment = Attachment(next(self._numbers), time.time_ns(), self._gid).encode()
+        self._publisher.put(payload, attachment)
+        self._side.sent.value += 1
+
+    def close(self) -> None:
+        """Take the publisher back; idempotent."""
+        for handle in self._handles:
+            handle.close()

@@ -1,0 +1,217 @@
+"""What a robot's fleet messages are on ROS's side: which topics there are, and what is put on them. Sans-IO."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterator
+from typing import Any
+
+import msgspec
+
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control, Device, FleetMessage, Map, Motion, Pose, Reading, Scan, Scanner, Status
+from zbridge.metrics import Metrics
+from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
+from zbridge.views.ros2.description import urdf
+from zbridge.views.ros2.diagnostics import Entry, entries_of
+from zbridge.views.ros2.reckoning import Reckoning
+from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.shapes import Frames, Shapes, speeds_of
+from zbridge.views.ros2.stamps import Stamps
+
+SENSORS = "sensor/*"
+"""The readings of all sensors, as a path below a robot."""
+MOST_SENSORS = 64
+"""Sensors of one robot that have a topic."""
+_LONGEST_PERIOD_S = 10.0
+_KINDS = {"distance": "range", "rotational": "joint", "linear": "joint"}
+
+
+class RosTopic(msgspec.Struct, frozen=True):
+    """A topic that a robot's node publishes. name: below the robot; paths: below the robot, on the fleet's bus.
+
+    everywhere: it is also published without the robot's name, where ROS's programs look for it.
+    """
+
+    name: str
+    type_name: str
+    qos: QoS = KEEP_LAST_10
+    paths: tuple[str, ...] = ()
+    everywhere: bool = False
+
+    @property
+    def kept(self) -> bool:
+        """Whether who comes late gets the last message."""
+        return self.qos == LATCHED
+
+
+TOPICS = (
+    RosTopic("scan", "sensor_msgs/msg/LaserScan", SENSOR_DATA, (topics.SCAN.path, topics.SCANNER.path)),
+    RosTopic("odom", "nav_msgs/msg/Odometry", KEEP_LAST_10, (topics.POSE.path, topics.MOTION.path)),
+    RosTopic("pose", "geometry_msgs/msg/PoseStamped", KEEP_LAST_10, (topics.POSE.path,)),
+    RosTopic("imu", "sensor_msgs/msg/Imu", SENSOR_DATA, (topics.MOTION.path,)),
+    RosTopic("map", "nav_msgs/msg/OccupancyGrid", LATCHED, (topics.MAP.path,)),
+    RosTopic("tf", "tf2_msgs/msg/TFMessage", QoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
+    RosTopic("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (), True),
+    RosTopic(
+        "diagnostics",
+        "diagnostic_msgs/msg/DiagnosticArray",
+        KEEP_LAST_10,
+        (topics.STATUS.path, topics.CONTROL.path),
+        True,
+    ),
+    RosTopic("robot_description", "std_msgs/msg/String", LATCHED),
+)
+"""The topics of every robot; those of its sensors are found in its table of devices."""
+JOINTS = RosTopic("joint_states", "sensor_msgs/msg/JointState", KEEP_LAST_10, (SENSORS,))
+
+Made = Iterator[tuple[str, Any]]
+"""Names of topics and the ROS messages for them."""
+
+
+class RobotPictures:
+    """Makes the ROS messages of one robot: all of a topic that somebody listens to."""
+
+    def __init__(self, robot: str, types: Types, body: Body, metrics: Metrics) -> None:
+        self.robot = robot
+        self.frames = Frames(ros_name(robot))
+        self._types = types
+        self._body = body
+        self._shapes = Shapes(types, self.frames)
+        self._stamps = Stamps(metrics)
+        self._unusable = metrics.count("ros2_unusable")
+        self._motion: Motion | None = None
+        self._has_pose = False
+        self._reckoning = Reckoning()
+        self._scanner: Scanner | None = None
+        self._scan_at_ns: int | None = None
+        self._status: Status | None = None
+        self._control: Control | None = None
+        self._positions: dict[str, float] = {}
+        self._names: dict[str, str] = {}
+
+    def __repr__(self) -> str:
+        return f"<RobotPictures {self.robot}>"
+
+    def sensors(self, devices: tuple[Device, ...]) -> list[RosTopic]:
+        """Return the topics of a robot's sensors; names that are one in ROS have one topic."""
+        found: dict[str, RosTopic] = {}
+        self._names = {}
+        for device in devices:
+            kind = _KINDS.get(device.kind)
+            if kind is None or len(self._names) >= MOST_SENSORS:
+                continue
+            self._names[device.name] = name = ros_name(device.name)
+            if kind == "range":
+                found[name] = RosTopic(f"range/{name}", "sensor_msgs/msg/Range", SENSOR_DATA, (SENSORS,))
+            else:
+                found[JOINTS.name] = JOINTS
+        return list(found.values())
+
+    def fixed(self, now_ns: int) -> Made:
+        """Make what never changes."""
+        laser = self._body.laser
+        pairs = {(self.frames.base, self.frames.laser): (Pose(laser.x, laser.y, laser.yaw), laser.z)}
+        if self._body.map_to_odom:
+            pairs[self.frames.map, self.frames.odom] = (Pose(0.0, 0.0, 0.0), 0.0)
+        yield "tf_static", self._shapes.transforms(pairs, now_ns)
+        yield "robot_description", self._shapes.text(urdf(self.robot, self.frames, self._body))
+
+    def make(self, path: str, message: FleetMessage, now_ns: int, wanted: Container[str]) -> Made:
+        """Make the messages of the topics ``wanted`` of a fleet message that came on a path."""
+        maker = _MAKERS.get(type(message))
+        if maker is None:
+            return
+        stamp_ns = self._stamps.read(message.stamp_ns, now_ns)
+        for name, made in maker(self, path, message, stamp_ns, wanted):
+            if made is not None:
+                yield name, made
+            else:
+                self._unusable.value += 1
+
+    def diagnostics(self, more: list[Entry], now_ns: int) -> Any:
+        """Make a DiagnosticArray of what is known, and of ``more``."""
+        make = self._types.message
+        entries = [*entries_of(self.robot, self._status, self._control), *more]
+        return make(
+            "diagnostic_msgs/msg/DiagnosticArray",
+            header=self._shapes.header(now_ns, ""),
+            status=[
+                make(
+                    "diagnostic_msgs/msg/DiagnosticStatus",
+                    level=entry.level,
+                    name=entry.name,
+                    message=entry.message,
+                    hardware_id=self.robot,
+                    values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in entry.values],
+                )
+                for entry in entries
+            ],
+        )
+
+    def _on_scan(self, path: str, scan: Scan, stamp_ns: int, wanted: Container[str]) -> Made:
+        before, self._scan_at_ns = self._scan_at_ns, stamp_ns
+        period_s = (stamp_ns - before) / 1e9 if before is not None else 0.0
+        period_s = period_s if 0.0 < period_s < _LONGEST_PERIOD_S else 0.0
+        if "scan" in wanted:
+            yield "scan", self._shapes.laser_scan(scan, self._scanner, stamp_ns, period_s)
+
+    def _on_scanner(self, path: str, scanner: Scanner, stamp_ns: int, wanted: Container[str]) -> Made:
+        self._scanner = scanner
+        yield from ()
+
+    def _on_pose(self, path: str, pose: Pose, stamp_ns: int, wanted: Container[str]) -> Made:
+        self._has_pose = True
+        if "pose" in wanted:
+            yield "pose", self._shapes.pose_stamped(pose, stamp_ns)
+        yield from self._moved(pose, 1.0, stamp_ns, wanted)
+
+    def _on_motion(self, path: str, motion: Motion, stamp_ns: int, wanted: Container[str]) -> Made:
+        self._motion = motion
+        if "imu" in wanted and (motion.gyro is not None or motion.acceleration is not None):
+            yield "imu", self._shapes.imu(motion, stamp_ns)
+        if not self._has_pose:
+            pose = self._reckoning.add(speeds_of(motion, self._body.speed_full_mps), stamp_ns)
+            yield from self._moved(pose, self._reckoning.spread, stamp_ns, wanted)
+
+    def _moved(self, pose: Pose | None, spread: float, stamp_ns: int, wanted: Container[str]) -> Made:
+        if "odom" in wanted:
+            speeds = speeds_of(self._motion, self._body.speed_full_mps)
+            yield "odom", self._shapes.odometry(pose, speeds, stamp_ns, spread)
+        if "tf" in wanted and pose is not None:
+            yield "tf", self._shapes.moved(pose, stamp_ns)
+
+    def _on_map(self, path: str, fleet_map: Map, stamp_ns: int, wanted: Container[str]) -> Made:
+        if "map" in wanted:
+            yield "map", self._shapes.occupancy_grid(fleet_map, stamp_ns)
+
+    def _on_reading(self, path: str, reading: Reading, stamp_ns: int, wanted: Container[str]) -> Made:
+        name = self._names.get(topics.unescape(path.rpartition("/")[2]))
+        kind = _KINDS.get(reading.kind or "")
+        if name is None or kind is None:
+            return
+        if kind == "range":
+            if f"range/{name}" in wanted:
+                yield f"range/{name}", self._shapes.range_of(name, reading, stamp_ns)
+        elif JOINTS.name in wanted:
+            self._positions[name] = reading.value
+            yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
+
+    def _on_status(self, path: str, status: Status, stamp_ns: int, wanted: Container[str]) -> Made:
+        self._status = status
+        yield from ()
+
+    def _on_control(self, path: str, control: Control, stamp_ns: int, wanted: Container[str]) -> Made:
+        self._control = control
+        yield from ()
+
+
+_MAKERS: dict[type[FleetMessage], Callable[[RobotPictures, str, Any, int, Container[str]], Made]] = {
+    Scan: RobotPictures._on_scan,
+    Scanner: RobotPictures._on_scanner,
+    Pose: RobotPictures._on_pose,
+    Motion: RobotPictures._on_motion,
+    Map: RobotPictures._on_map,
+    Reading: RobotPictures._on_reading,
+    Status: RobotPictures._on_status,
+    Control: RobotPictures._on_control,
+}

@@ -1,0 +1,130 @@
+"""Opens both buses, and makes a node of each robot whose gateway lives, until cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+
+from zbridge.bus import Bus, BusSettings, open_bus
+from zbridge.errors import BusError, ConfigError
+from zbridge.fleet.topics import KeySpace, is_name, split_key
+from zbridge.metrics import Metrics
+from zbridge.ros2 import ros_name, types_of
+from zbridge.views.ros2.node import RobotNode
+from zbridge.views.ros2.outlets import RosSide
+from zbridge.views.ros2.settings import Plan
+
+log = logging.getLogger("zbridge.ros2")
+
+ROBOTS = 256
+"""Most robots that are shown at a time."""
+HIDDEN_AFTER_S = 2.0
+"""A robot whose gateway is away for less keeps its node."""
+
+
+async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
+    """Show robots until cancelled; raise BusError or ConfigError. on_ready: called when robots are looked for."""
+    types = types_of(plan.distro)
+    fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm)
+    try:
+        try:
+            ros = await open_bus(plan.ros, metrics, timestamps=True)
+        except BusError as error:
+            where = ", ".join(plan.ros.connect)
+            raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
+        try:
+            _apart(fleet, ros, plan)
+            view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics))
+            try:
+                view.start()
+                on_ready(view)
+                await asyncio.Event().wait()
+            finally:
+                await view.close()
+        finally:
+            await ros.close()
+    finally:
+        await fleet.close()
+
+
+def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
+    """Raise ConfigError where both sessions are at one router: a fleet's rules do not know ROS's keys."""
+    if set(fleet.routers()) & set(ros.routers()) or fleet.zid in ros.routers():
+        where = ", ".join(plan.ros.connect)
+        raise ConfigError(
+            f"ros = {where}: the same router as the fleet's. Both like port 7447: give one of them another port, "
+            "and say where with --ros or --connect"
+        )
+
+
+class View:
+    """The robots of a realm as nodes."""
+
+    def __init__(self, plan: Plan, fleet: Bus, side: RosSide) -> None:
+        self._plan = plan
+        self._fleet = fleet
+        self._side = side
+        self.nodes: dict[str, RobotNode] = {}
+        self._leaving: dict[str, asyncio.TimerHandle] = {}
+        self._closing: set[asyncio.Task[None]] = set()
+        self._left_out = side.metrics.count("ros2_robots_left_out")
+
+    def __repr__(self) -> str:
+        return f"<View of {sorted(self.nodes)}>"
+
+    def start(self) -> None:
+        """Begin to look for robots."""
+        self._fleet.watch_alive(f"{self._plan.realm}/*/@alive/gateway", self._on_gateway)
+        self._side.bus.watch_connected(self._on_connected)
+
+    async def close(self) -> None:
+        """Give all robots back."""
+        for timer in self._leaving.values():
+            timer.cancel()
+        nodes, self.nodes = list(self.nodes.values()), {}
+        await asyncio.gather(*(node.close() for node in nodes), *self._closing, return_exceptions=True)
+
+    def _on_connected(self, up: bool) -> None:
+        if not up:
+            log.warning("ROS's router is gone: whoever drove is stopped")
+        for node in self.nodes.values():
+            if node.teleop is not None:
+                node.teleop.connected(up)
+
+    def _on_gateway(self, key: str, alive: bool) -> None:
+        split = split_key(key)
+        if split is None or not is_name(robot := split[1]) or (self._plan.robots and robot not in self._plan.robots):
+            return
+        timer = self._leaving.pop(robot, None)
+        if timer is not None:
+            timer.cancel()
+        if alive and robot not in self.nodes:
+            self._show(robot)
+        elif not alive and robot in self.nodes:
+            self._leaving[robot] = asyncio.get_running_loop().call_later(HIDDEN_AFTER_S, self._hide, robot)
+
+    def _show(self, robot: str) -> None:
+        taken = next((node.robot for node in self.nodes.values() if ros_name(node.robot) == ros_name(robot)), None)
+        if taken is not None or len(self.nodes) >= ROBOTS:
+            self._left_out.value += 1
+            why = f"its name in ROS is {taken}'s" if taken is not None else f"more than {ROBOTS} robots"
+            log.warning("%s is not shown: %s", robot, why)
+            return
+        keys, plan = KeySpace(self._plan.realm, robot), self._plan
+        self.nodes[robot] = RobotNode(self._side, self._fleet, keys, plan.body(robot), drive=plan.drive)
+        log.info("%s is %s", robot, self.nodes[robot].node.full_name)
+
+    def _hide(self, robot: str) -> None:
+        self._leaving.pop(robot, None)
+        node = self.nodes.pop(robot, None)
+        if node is not None:
+            task = asyncio.get_running_loop().create_task(self._close(node))
+            self._closing.add(task)
+            task.add_done_callback(self._closing.discard)
+
+    async def _close(self, node: RobotNode) -> None:
+        with contextlib.suppress(BusError):
+            await node.close()
+        log.info("%s is gone", node.robot)

@@ -1,0 +1,228 @@
+"""Lets publishers on a robot's cmd_vel drive it, one at a time, through the lease.
+
+Theory of operation. A liveliness watch knows the publishers by their tokens, and :mod:`driving` what each may do.
+:meth:`Teleop._sort` runs on Zenoh's threads: it drops what no known publisher sent, and what comes faster than
+:data:`RATE_HZ`, before the event loop hears of it. The rest is read (``cmd_vel``), and carried out by ``holder``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+
+from zbridge.bus import Bus, Handle, Lane, Look, Sample
+from zbridge.client import Robot
+from zbridge.errors import Malformed, PayloadError, ProtocolError, Unsupported
+from zbridge.fleet import payload as payloads
+from zbridge.fleet.messages import Control, Drive
+from zbridge.protocol.rate_limit import RateLimit
+from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
+from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
+from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Entry, cut
+from zbridge.views.ros2.driving import Action, Decision, Driving, Standing
+from zbridge.views.ros2.holder import Holder
+from zbridge.views.ros2.outlets import RosSide
+from zbridge.views.ros2.settings import Body
+
+RATE_HZ = 200.0
+"""Commands a second of one publisher that are heard."""
+STRANGERS_HZ = 5.0
+"""Commands a second of publishers without a token that are counted as refused one by one."""
+SETTLE_S = 1.0
+"""Tokens that come within this time of a connection were there before."""
+WRONG_TYPES = 16
+"""Publishers of a type that is no Twist, or of another version of it, that are shown."""
+_ATTACHED_BYTES = 33
+_GID = slice(17, 33)
+
+
+class Teleop:
+    """The cmd_vel of one robot. fleet: the fleet's bus; control_key: where the robot's control is told there."""
+
+    def __init__(self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str) -> None:
+        self._side = side
+        self._robot = robot
+        self._body = body
+        self._loop = asyncio.get_running_loop()
+        self._driving = Driving(robot.name)
+        self._holder = Holder(robot, self._on_lost)
+        self._fleet = fleet
+        self._control_key = control_key
+        self._control: Handle | None = None
+        self._stopped: bool | None = None
+        self._limits: dict[bytes, RateLimit] = {}
+        """By the gids of publishers that have a token."""
+        self._strangers = RateLimit(STRANGERS_HZ)
+        self._wrong: dict[str, str] = {}
+        """By the tokens of publishers of another type, what they are."""
+        self._timer: asyncio.TimerHandle | None = None
+        self._counts = {name: side.metrics.count(f"ros2_cmd_vel_{name}") for name in _COUNTS}
+        self._settled_at = self._loop.time() + SETTLE_S
+        self.topic = f"{node.namespace}/cmd_vel"
+        self._handles = self._declare(node)
+
+    def __repr__(self) -> str:
+        return f"<Teleop {self.topic}, {self._driving!r}>"
+
+    def _declare(self, node: Node) -> list[Handle]:
+        bus, handles = self._side.bus, list[Handle]()
+        for type_name in MOST_BYTES:
+            endpoint = self._side.endpoint(node, Kind.SUBSCRIBER, self.topic, type_name, KEEP_LAST_10)
+            sort = partial(self._sort, MOST_BYTES[type_name])
+            handles.append(bus.subscribe(endpoint.key, partial(self._take, type_name), lane=sort))
+            handles.append(bus.announce(endpoint.token()))
+        handles.append(bus.watch_alive(endpoints_of(self._side.domain, Kind.PUBLISHER, self.topic), self._on_token))
+        return handles
+
+    async def close(self) -> None:
+        """Give the robot back, and take everything back that was declared; idempotent."""
+        handles, self._handles = self._handles, []
+        for handle in handles:
+            handle.close()
+        self._watch_control(False)
+        if self._timer is not None:
+            self._timer.cancel()
+        await self._holder.close()
+
+    # Who is there
+
+    def connected(self, up: bool) -> None:
+        """ROS's router was found again, or lost: then nobody is there."""
+        self._settled_at = self._loop.time() + SETTLE_S
+        if not up:
+            for gid in list(self._driving.publishers):
+                self._forget(gid)
+
+    def _on_token(self, token: str, alive: bool) -> None:
+        endpoint = read_token(token)
+        if not isinstance(endpoint, Endpoint) or endpoint.kind is not Kind.PUBLISHER:
+            self._counts["tokens_unreadable"].value += 1
+            return
+        types = self._side.types
+        if endpoint.type_name not in MOST_BYTES or endpoint.type_hash != types.hash(endpoint.type_name):
+            self._note_wrong(token, endpoint, alive)
+            return
+        gid, now = endpoint.gid(), self._loop.time()
+        if not alive:
+            self._forget(gid)
+        elif self._driving.came(gid, endpoint.node.full_name, now, early=now < self._settled_at):
+            self._limits.setdefault(gid, RateLimit(RATE_HZ))
+        else:
+            self._counts["publishers_refused"].value += 1
+        self._watch_control(bool(self._driving.publishers))
+
+    def _note_wrong(self, token: str, endpoint: Endpoint, alive: bool) -> None:
+        if not alive:
+            self._wrong.pop(token, None)
+        else:
+            self._counts["wrong_type"].value += 1
+            if len(self._wrong) < WRONG_TYPES:
+                self._wrong[token] = f"{endpoint.node.full_name} publishes {endpoint.type_name} {endpoint.type_hash}"
+
+    def _forget(self, gid: bytes) -> None:
+        self._limits.pop(gid, None)
+        self._carry_out(self._driving.gone(gid))
+
+    def _watch_control(self, wanted: bool) -> None:
+        """Look who stops the robot, while there is a publisher."""
+        if wanted and self._control is None:
+            self._stopped = None
+            self._control = self._fleet.subscribe(self._control_key, self._on_control)
+        elif not wanted and self._control is not None:
+            self._control.close()
+            self._control = None
+
+    def _on_control(self, sample: Sample) -> None:
+        try:
+            stopped = payloads.decode(Control, sample.payload).state == "stopped"
+        except PayloadError:
+            return
+        if stopped and self._stopped is False:
+            self.stopped("the robot was stopped")
+        self._stopped = stopped
+
+    def stopped(self, why: str) -> None:
+        """The robot was stopped: whoever drives owes a zero or silence."""
+        self._carry_out(self._driving.stopped(why))
+
+    # What they command
+
+    def _sort(self, most_bytes: int, key: str, attachment: bytes | None, size: int, look: Look) -> Lane | None:
+        """Choose the lane; on Zenoh's threads."""
+        if attachment is None or len(attachment) != _ATTACHED_BYTES or size > most_bytes + _ATTACHED_BYTES:
+            self._counts["malformed"].value += 1
+            return None
+        gid = attachment[_GID]
+        limit = self._limits.get(gid)
+        now = self._loop.time()
+        if limit is None:
+            self._counts["strangers"].value += 1
+            return Lane.OTHER if self._strangers.take(now) else None
+        if not limit.take(now):
+            self._counts["too_fast"].value += 1
+            return None
+        return Lane.COMMAND if gid == self._driving.holder else Lane.OTHER
+
+    def _take(self, type_name: str, sample: Sample) -> None:
+        drive, wrong = Drive(), ""
+        try:
+            attachment = read_attachment(sample.attachment)
+            drive = read_twist(self._side.types, type_name, sample.payload, self._body)
+        except Unsupported as error:
+            wrong = str(error)
+        except (ProtocolError, Malformed):
+            self._counts["malformed"].value += 1
+            return
+        decision = self._driving.heard(attachment.gid, drive.moving, self._loop.time(), wrong)
+        if decision.action is Action.SEND:  # the way of nearly all
+            self._holder.send(drive)
+        else:
+            self._carry_out(decision, drive)
+        self._arm()
+
+    def _carry_out(self, decision: Decision, drive: Drive | None = None) -> None:
+        if decision.action is Action.ACQUIRE and drive is not None:
+            self._holder.acquire(decision.publisher, drive)
+        elif decision.action is Action.RELEASE:
+            self._holder.release()
+        elif decision.action is Action.REFUSE:
+            self._counts["refused"].value += 1
+
+    def _on_lost(self, why: str) -> None:
+        self._driving.lost(why)
+
+    def _arm(self) -> None:
+        """Wake at the deadline or before it: commands mostly put it off."""
+        deadline = self._driving.deadline()
+        if deadline is not None and self._timer is None:
+            self._timer = self._loop.call_at(deadline, self._expire)
+
+    def _expire(self) -> None:
+        self._timer = None
+        self._carry_out(self._driving.expire(self._loop.time()))
+        self._arm()
+
+    # What is told
+
+    def diagnostics(self) -> Entry:
+        """Return who drives, and why others may not."""
+        publishers = list(self._driving.publishers.values())[:MOST_VALUES]
+        values = [(cut(publisher.name), _standing(publisher.standing, publisher.why)) for publisher in publishers]
+        values += [("refused", cut(wrong)) for wrong in self._wrong.values()]
+        values += [(name, str(count.value)) for name, count in self._counts.items() if count.value]
+        driver = self._driving.driver
+        owing = [publisher for publisher in publishers if publisher.standing is Standing.OWES]
+        text = f"driven by {driver}" if driver else "nobody drives"
+        if owing:
+            text += f"; {owing[0].name} is refused: {_standing(Standing.OWES, owing[0].why)}"
+        level = WARN if owing or self._wrong else OK
+        return Entry(level, f"{self._robot.name}: cmd_vel", cut(text), values[:MOST_VALUES])
+
+
+def _standing(standing: Standing, why: str) -> str:
+    if standing is not Standing.OWES:
+        return "drives" if standing is Standing.DRIVES else "may drive"
+    return cut(f"{why}: send a zero, or nothing for a second, then drive")
+
+
+_COUNTS = ("refused", "malformed", "strangers", "too_fast", "wrong_type", "tokens_unreadable", "publishers_refused")

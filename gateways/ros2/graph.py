@@ -79,6 +79,10 @@ class Graph:
         self.keys[endpoint.key] = (wanted, endpoint.type_name)
         return endpoint
 
+    def knows(self, token: str) -> bool:
+        """Tell whether a token is one of those that were looked at."""
+        return any(token in table for table in (self.publishers, self.takers, self.drivers, self.wrong))
+
     def gone(self, token: str) -> bool:
         """Forget an endpoint; False if it was not known."""
         if self.wrong.pop(token, None) is not None:

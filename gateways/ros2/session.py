@@ -44,6 +44,8 @@ HANDSHAKE_S = 60.0
 """Seconds after which the link is opened anew where nothing of the robot was heard."""
 REST_S = 1.0
 """Seconds for which zeros are repeated after neutral."""
+WATCH_S = 2.0
+"""Seconds between two questions for tokens, while something of the robot is missing."""
 ANSWERS_HZ = 100.0
 """Times a second that other nodes' commands are answered."""
 _DRIVE = "drive"
@@ -96,6 +98,7 @@ class RosRole(Session[Any]):
         """Unix time of the last frame, and when it came on the session's own time line."""
         self._robot_time: tuple[int, float] | None = None
         """The same of the robot's clock, by its last stamp."""
+        self._watch_at = -math.inf
         self._answers = RateLimit(ANSWERS_HZ)
 
     # Messages
@@ -152,7 +155,9 @@ class RosRole(Session[Any]):
             self.traffic.dropped += sample.count
         elif sample.kind is SampleKind.OPENED and self._node is None:
             self._begin(sample.payload.decode("ascii", "replace"))
-        elif sample.kind is SampleKind.APPEARED and not self._is_own(sample.key):
+        elif sample.kind is SampleKind.OPENED:
+            self._watch_again()
+        elif sample.kind is SampleKind.APPEARED and not self._is_own(sample.key) and not self.graph.knows(sample.key):
             try:
                 self._appeared(self.graph.appeared(sample.key))
             finally:
@@ -168,6 +173,13 @@ class RosRole(Session[Any]):
         for expression in self.graph.watched():
             self.send_first(KeyedSample(SampleKind.WATCH, expression))
         self._look()
+
+    def _watch_again(self) -> None:
+        """Ask for tokens again while something is missing: Zenoh may lose the news of some."""
+        if self.busy is not None and self._now >= self._watch_at:
+            self._watch_at = self._now + WATCH_S
+            for expression in self.graph.watched():
+                self.send_first(KeyedSample(SampleKind.WATCH, expression))
 
     def _is_own(self, token: str) -> bool:
         return self._node is not None and token.split("/", 3)[2:3] == [self._node.zid]

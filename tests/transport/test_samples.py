@@ -67,6 +67,17 @@ async def test_what_is_written_is_declared_and_put_and_what_comes_of_it_is_read(
     assert await scene.other.alive("mine/*") == []
 
 
+async def test_to_watch_again_asks_for_the_tokens_that_are_there() -> None:
+    scene = Scene()
+    scene.write(KeyedSample(SampleKind.WATCH, "t/*"))
+    scene.other.announce("t/1")
+    scene.recorder.data.clear()
+    scene.write(*[KeyedSample(SampleKind.WATCH, "t/*")] * 3)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert [(one.kind, one.key) for one in scene.read] == [(SampleKind.APPEARED, "t/1")]
+
+
 async def test_what_comes_while_nothing_is_read_is_dropped_and_told() -> None:
     scene = Scene()
     scene.write(subscription("k"))

@@ -7,7 +7,8 @@ outbox, limits, states, taps.
 =========== ==================================================== ==============================================
 written     SUBSCRIBE, WATCH and ANNOUNCE declare until the      ``key``: an expression; ANNOUNCE: a liveliness
             link ends; WITHDRAW takes back what was declared     token; ``kept``: SUBSCRIBE wants the last samples
-            on a key; KEEP and PUT put                           from before, KEEP keeps its last one
+            on a key; KEEP and PUT put; WATCH again asks         from before, KEEP keeps its last one
+            for the tokens that are there
 read        OPENED first, and when the link was idle; SAMPLE;    ``stamp_ns``: when it came, Unix time
             APPEARED and GONE of watched tokens; DROPPED         ``payload``: OPENED the id of the Zenoh session,
                                                                  DROPPED how many samples, u32

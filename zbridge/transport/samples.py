@@ -46,6 +46,7 @@ class ZenohLink:
         self._above = 0
         """Samples that came too fast."""
         self._told = 0
+        self._looking: dict[str, asyncio.Task[None]] = {}
         self._closing: asyncio.Task[bool] | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -79,6 +80,8 @@ class ZenohLink:
                 handle = self._declared.pop((kind, sample.key), None)
                 if handle is not None:
                     handle.close()
+        elif sample.kind is SampleKind.WATCH and (sample.kind, sample.key) in self._declared:
+            self._look_again(sample.key)
         elif (sample.kind, sample.key) not in self._declared:
             self._bounded(len(self._declared))
             self._declared[sample.kind, sample.key] = self._declare(sample)
@@ -150,6 +153,17 @@ class ZenohLink:
         kind = SampleKind.APPEARED if here else SampleKind.GONE
         self._feed(KeyedSample(kind, token, stamp_ns=time.time_ns()))
 
+    def _look_again(self, key: str) -> None:
+        """Ask for the tokens that are there: news of some may be lost while many come and go at once."""
+        if key not in self._looking:
+            self._looking[key] = self._loop.create_task(self._ask(key))
+            self._looking[key].add_done_callback(lambda _: self._looking.pop(key, None))
+
+    async def _ask(self, key: str) -> None:
+        with contextlib.suppress(BusError):
+            for token in await self._bus.alive(key):
+                self._on_token(token, here=True)
+
     def _feed(self, sample: KeyedSample) -> None:
         if not self._open:
             return
@@ -181,6 +195,8 @@ class ZenohLink:
         self._open = False
         if self._timer is not None:
             self._timer.cancel()
+        for looking in self._looking.values():
+            looking.cancel()
         self._closing = self._loop.create_task(self._bus.close())
         _closing.add(self._closing)
         self._closing.add_done_callback(_closing.discard)

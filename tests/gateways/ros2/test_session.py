@@ -35,6 +35,25 @@ def test_a_session_shows_its_node_and_watches_the_robots_topics_only() -> None:
     assert {watch.key for watch in watches} == expected | {WATCHED.format(kind, "cmd_vel") for kind in ("MP", "MS")}
 
 
+def test_what_is_missing_is_asked_for_again_every_two_seconds_and_known_tokens_change_nothing() -> None:
+    scene = RosScene()
+    by, known = scene.appears("odom"), len(scene.session.graph.watched())
+    for seconds, asked in ((0.5, known), (0.5, 0), (1.6, known)):
+        scene.now += seconds
+        scene.written.clear()
+        scene.feed(KeyedSample(SampleKind.OPENED, payload=b"cafe", stamp_ns=scene.time_ns))
+        assert [one.kind for one in scene.written] == [SampleKind.WATCH] * asked
+    scene.written.clear()
+    scene.appears("odom")
+    assert scene.written == []
+    scene.hears("odom", by)
+    scene.appears("cmd_vel", TWIST, "MS", number=2)
+    scene.now += 5.0
+    scene.written.clear()
+    scene.feed(KeyedSample(SampleKind.OPENED, payload=b"cafe", stamp_ns=scene.time_ns))
+    assert scene.written == []
+
+
 def test_a_publisher_is_subscribed_to_with_a_token_of_our_own_and_the_last_map_is_wanted() -> None:
     scene = RosScene()
     scene.written.clear()

@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from gateways.ros2.session import Velocity
-from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, RosScene, header, key, token
+from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, TYPES, RosScene, header, key, token
 from zbridge.errors import NotReady
 from zbridge.protocol import KeyedSample, SampleKind
 from zbridge.ros2 import gid_of
@@ -184,10 +184,12 @@ def test_garbage_lying_attachments_and_strangers_are_counted_and_change_nothing(
     scene = RosScene()
     by = scene.establish()
     good, rng = struct.pack("<qqB", 1, 1, 16) + gid_of(by), random.Random(1)
+    whole = TYPES.encode(TYPES.message(KINDS["odom"]))
     lies = [None, b"", good[:-1], good + b"\0", bytes(33), struct.pack("<qqB", -1, 1, 16) + gid_of(by)]
     lies.append(struct.pack("<qqB", 1, 1, 16) + gid_of("nobody"))
     for attachment in lies:
-        assert scene.feed(KeyedSample(SampleKind.SAMPLE, key("odom", KINDS["odom"]), b"", attachment, 1)) == []
+        sample = KeyedSample(SampleKind.SAMPLE, key("odom", KINDS["odom"]), whole, attachment, 1)
+        assert scene.feed(sample) == []
     for size in range(0, 300, 7):
         assert scene.says("odom", by, rng.randbytes(size)) == []
     assert scene.feed(KeyedSample(SampleKind.SAMPLE, "0/other/x/y", b"", good, 1)) == []

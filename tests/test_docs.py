@@ -28,7 +28,7 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 FILE = re.compile(r"(?<![\w/.-])(?:zbridge|gateways|tests|docs|deploy|\.ci)/[\w./<>*@-]*")
 BARE_FILE = re.compile(r"(?<![\w/.*-])\w+\.(?:py|toml|md|hex)\b(?!\()")
 MODULE = re.compile(r"(?<![\w./:@\"-])(?:zbridge|gateways|tests)(?:\.[A-Za-z_]\w*)+")
-COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z]+[0-9]?)(.*)", re.MULTILINE)
+COMMAND = re.compile(r"(?:^|&& )zbridge ([a-z0-9]+)(.*)", re.MULTILINE)
 SPAN = re.compile(r"`([^`\n]+)`")
 BLOCK = re.compile(r"^```\w*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 

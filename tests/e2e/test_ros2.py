@@ -264,3 +264,21 @@ def test_no_router_of_ros_is_an_error_that_says_how_to_start_one(scene: Scene) -
     output, _ = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "rmw_zenohd" in output
+
+
+def test_a_restart_of_ros_s_router_stops_the_robot_and_whoever_pushes_on_owes(scene: Scene) -> None:
+    with publishing(scene) as publisher:
+        begun = time.monotonic()
+        with repeated(lambda: publisher.twist(0.125)):
+            until(lambda: scene.moves(begun), what="motion")
+            scene.ros_router.close()
+            until(scene.rests, what="rest")
+            stopped = time.monotonic()
+            scene.ros_router = zenoh.open(configuration("router", scene.ros_at))
+            scene.told("r1: cmd_vel", "/teleop=it was cut off, and is back: send a zero")
+            assert scene.moves(stopped + 0.2) == []
+        with repeated(publisher.twist):
+            scene.told("r1: cmd_vel", "/teleop=may drive")
+        with repeated(lambda: publisher.twist(0.125)):
+            until(lambda: scene.moves(stopped), what="motion anew")
+    scene.ros_router.close()

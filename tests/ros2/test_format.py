@@ -71,7 +71,6 @@ NO_TOKENS = [
     "@ros2_lv/2/aa/0/0/NN/%/%",
     "@ros2_lv/2/aa/0/0/NN/%/%/listener/more",
     "@ros2_lv/x/aa/0/0/NN/%/%/listener",
-    "@ros2_lv/2/aa/0/٣/NN/%/%/listener",
     "@ros2_lv/2/aa/0/0/XX/%/%/listener",
     "@ros2_lv/2//0/0/NN/%/%/listener",
     LISTENER,
@@ -116,6 +115,18 @@ def test_slashes_within_a_part_are_percent_signs() -> None:
     assert node.token() == "@ros2_lv/0/aa/3/3/NN/%e%f/%a%b/n"
     assert node.full_name == "/a/b/n"
     assert read_token(node.token()) == node
+
+
+def test_tokens_and_gids_of_dora_rs_are_read() -> None:
+    token = (  # captured: dora-rs 1.1.0, a publisher of node /x/d; its samples had the gid below
+        "@ros2_lv/0/163c68d81ed5621b39d8d88a707e10e4/d/2/MP/%/%x/d/%r1%cmd_vel/geometry_msgs::msg::dds_::Twist_/"
+        "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a/::,10:,:,:,,"
+    )
+    read = read_token(token)
+    assert isinstance(read, Endpoint)
+    assert (read.node.full_name, read.node.number, read.number) == ("/x/d", "d", 2)
+    assert bytes.fromhex("e4107e708ad8d8390200000000000000") in read.gids()
+    assert read.gid() in read.gids()
 
 
 def test_a_gid_is_the_xxh3_128_of_the_token_low_half_first() -> None:

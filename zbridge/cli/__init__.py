@@ -1,9 +1,9 @@
-"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ls, echo, drive, stop, certs``.
+"""The command line: ``zbridge run, check, init, simulate, probe, demo, router, ros2, ls, echo, drive, stop, certs``.
 
 Knows no protocol. Only this package imports typer and rich, and this module does not: ``zbridge run`` loads neither.
 ``app`` declares the commands, ``certs`` those of ``zbridge certs``; ``bus``, ``demo`` (with ``secure_demo`` and
-``processes``), ``drive``, ``probe`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives. Exit codes:
-0 done, 1 failed, 2 wrong arguments or configuration.
+``processes``), ``drive``, ``probe``, ``ros2`` and ``router`` carry theirs out, ``keyboard`` turns keys into drives.
+Exit codes: 0 done, 1 failed, 2 wrong arguments or configuration.
 """
 
 from __future__ import annotations

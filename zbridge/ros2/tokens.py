@@ -29,11 +29,14 @@ class Kind(Enum):
 
 
 class Node(msgspec.Struct, frozen=True):
-    """A node. number: of the node within its session. namespace: ``/r1``, or ``/``; zid: of its Zenoh session."""
+    """A node. number: of the node within its session; of others' nodes it may be any text. zid: of its Zenoh session.
+
+    namespace: ``/r1``, or ``/``.
+    """
 
     domain: int
     zid: str
-    number: int
+    number: int | str
     namespace: str
     name: str
     enclave: str = "/"
@@ -47,7 +50,7 @@ class Node(msgspec.Struct, frozen=True):
         """Write the node's own token."""
         return self._token(self.number, Kind.NODE)
 
-    def _token(self, number: int, kind: Kind) -> str:
+    def _token(self, number: int | str, kind: Kind) -> str:
         names = "/".join(map(_mangle, (self.enclave.rstrip("/"), self.namespace.rstrip("/"), self.name)))
         return f"@ros2_lv/{self.domain}/{self.zid}/{self.number}/{number}/{kind.value}/{names}"
 
@@ -60,7 +63,7 @@ class Endpoint(msgspec.Struct, frozen=True):
     """
 
     node: Node
-    number: int
+    number: int | str
     kind: Kind
     name: str
     type_name: str
@@ -83,6 +86,15 @@ class Endpoint(msgspec.Struct, frozen=True):
     def gid(self) -> bytes:
         """Return its gid, 16 bytes: the hash of its token. It stands in the attachments of what it sends."""
         return gid_of(self.token())
+
+    def gids(self) -> tuple[bytes, ...]:
+        """Return the gids that it may send with: rmw_zenoh's, and that of dora-rs (half the zid, then the number)."""
+        try:
+            zid, number = int(self.node.zid, 16), int(self.number)
+        except ValueError:
+            return (self.gid(),)
+        half = 2**64 - 1
+        return (self.gid(), (zid & half).to_bytes(8, "little") + (number & half).to_bytes(8, "little"))
 
 
 def gid_of(token: str) -> bytes:
@@ -109,14 +121,10 @@ def read_token(token: str) -> Node | Endpoint | None:
     parts = token.split("/") if len(token) <= LONGEST else []
     if len(parts) < _NODE_PARTS or parts[0] != "@ros2_lv" or "" in parts:
         return None
-    kind = _KINDS.get(parts[5])
-    numbers = [_number(part) for part in (parts[1], parts[3], parts[4])]
-    if kind is None or None in numbers:
+    kind, domain = _KINDS.get(parts[5]), _number(parts[1])
+    if kind is None or not isinstance(domain, int):
         return None
-    domain, node_number, number = numbers
-    assert domain is not None
-    assert node_number is not None
-    assert number is not None
+    node_number, number = _number(parts[3]), _number(parts[4])
     enclave, namespace, name = map(_demangle, parts[6:9])
     node = Node(domain, parts[2], node_number, namespace or "/", name, enclave or "/")
     if kind is Kind.NODE:
@@ -124,7 +132,7 @@ def read_token(token: str) -> Node | Endpoint | None:
     return _read_endpoint(node, number, kind, parts, token)
 
 
-def _read_endpoint(node: Node, number: int, kind: Kind, parts: list[str], token: str) -> Endpoint | None:
+def _read_endpoint(node: Node, number: int | str, kind: Kind, parts: list[str], token: str) -> Endpoint | None:
     if len(parts) < _ENDPOINT_PARTS:  # later versions may say more after the QoS
         return None
     type_name, qos = ros_type(_demangle(parts[10])), read_qos(parts[12])
@@ -133,8 +141,8 @@ def _read_endpoint(node: Node, number: int, kind: Kind, parts: list[str], token:
     return Endpoint(node, number, kind, _demangle(parts[9]), type_name, _demangle(parts[11]), qos, token)
 
 
-def _number(text: str) -> int | None:
-    return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
+def _number(text: str) -> int | str:
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 19 and str(int(text)) == text else text
 
 
 def _mangle(name: str) -> str:

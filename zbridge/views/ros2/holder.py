@@ -16,14 +16,15 @@ STALE_S = 0.4
 WAIT_S = 2.0
 """Longest wait for the robot's gateway."""
 NAME = "ros2"
-"""The first part of the holder's name; the publisher's node follows."""
+"""The first part of the holder's name where no certificate says another; the publisher's node follows."""
 
 
 class Holder:
-    """One lease after the other. on_lost: called with the reason when the lease was refused or lost."""
+    """One lease after the other. name: the first part of the holder's; on_lost: called with the reason of a loss."""
 
-    def __init__(self, robot: Robot, on_lost: Callable[[str], None]) -> None:
+    def __init__(self, robot: Robot, name: str, on_lost: Callable[[str], None]) -> None:
         self._robot = robot
+        self._name = name
         self._on_lost = on_lost
         self._clock = asyncio.get_running_loop().time
         self._came = asyncio.Event()
@@ -39,7 +40,7 @@ class Holder:
     def acquire(self, node: str, drive: Drive) -> None:
         """Ask for the robot in the name of a node, and carry the command out when it is granted."""
         self.release()
-        self._task = asyncio.get_running_loop().create_task(self._hold(f"{NAME}.{node.strip('/')}"))
+        self._task = asyncio.get_running_loop().create_task(self._hold(f"{self._name}.{node.strip('/')}"))
         self.send(drive)
 
     def send(self, drive: Drive) -> None:
@@ -67,7 +68,7 @@ class Holder:
         try:
             if self._earlier:
                 await asyncio.wait(tuple(self._earlier))
-            async with self._robot.control(who, name=NAME, deadman_s=DEADMAN_S, wait_s=WAIT_S) as driver:
+            async with self._robot.control(who, name=self._name, deadman_s=DEADMAN_S, wait_s=WAIT_S) as driver:
                 await self._drive_on(driver)
         except ZbridgeError as error:
             why = str(error)

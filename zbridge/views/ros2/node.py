@@ -16,6 +16,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices
 from zbridge.fleet.topics import KeySpace
 from zbridge.ros2 import Kind
+from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
 from zbridge.views.ros2.pictures import TOPICS, RobotPictures, RosTopic
 from zbridge.views.ros2.services import Services
@@ -29,9 +30,14 @@ DIAGNOSED_S = 1.0
 
 
 class RobotNode:
-    """Declares a robot on ROS's side. bus: the fleet's; drive: whether cmd_vel is heard."""
+    """Declares a robot on ROS's side. bus: the fleet's; own: our name there, if a certificate says one.
 
-    def __init__(self, side: RosSide, bus: Bus, keys: KeySpace, body: Body, *, drive: bool) -> None:
+    drive: whether cmd_vel is heard.
+    """
+
+    def __init__(
+        self, side: RosSide, bus: Bus, keys: KeySpace, body: Body, *, drive: bool, own: str | None = None
+    ) -> None:
         self.robot = keys.robot
         self._side = side
         self._bus = bus
@@ -46,9 +52,9 @@ class RobotNode:
         self._paths: dict[str, tuple[str, ...]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._handles: list[Handle] = [side.bus.announce(self.node.token())]
-        robot = Fleet(bus, keys.realm)[keys.robot]
+        robot = Fleet(bus, keys.realm, own)[keys.robot]
         control_key = keys.key(topics.CONTROL.path)
-        self.teleop = Teleop(side, self.node, robot, body, bus, control_key) if drive else None
+        self.teleop = Teleop(side, self.node, robot, body, bus, control_key, own or NAME) if drive else None
         self._services = Services(side, self.node, robot, drive=drive, on_stop=self._on_stop)
         self._declare(TOPICS)
         for name, message in self._pictures.fixed(time.time_ns()):

@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable
 
 from zbridge.bus import Bus, BusSettings, open_bus
+from zbridge.bus.tls.member import own_name
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace, is_name, split_key
 from zbridge.metrics import Metrics
@@ -36,7 +37,7 @@ async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callab
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
         try:
             _apart(fleet, ros, plan)
-            view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics))
+            view = View(plan, fleet, RosSide(ros, plan.domain, types, metrics), own_name(bus.tls))
             try:
                 view.start()
                 on_ready(view)
@@ -60,9 +61,10 @@ def _apart(fleet: Bus, ros: Bus, plan: Plan) -> None:
 
 
 class View:
-    """The robots of a realm as nodes."""
+    """The robots of a realm as nodes. own: our name on the fleet's bus, if a certificate says one."""
 
-    def __init__(self, plan: Plan, fleet: Bus, side: RosSide) -> None:
+    def __init__(self, plan: Plan, fleet: Bus, side: RosSide, own: str | None) -> None:
+        self._own = own
         self._plan = plan
         self._fleet = fleet
         self._side = side
@@ -113,7 +115,7 @@ class View:
             log.warning("%s is not shown: %s", robot, why)
             return
         keys, plan = KeySpace(self._plan.realm, robot), self._plan
-        self.nodes[robot] = RobotNode(self._side, self._fleet, keys, plan.body(robot), drive=plan.drive)
+        self.nodes[robot] = RobotNode(self._side, self._fleet, keys, plan.body(robot), drive=plan.drive, own=self._own)
         log.info("%s is %s", robot, self.nodes[robot].node.full_name)
 
     def _hide(self, robot: str) -> None:

@@ -37,21 +37,28 @@ _GID = slice(17, 33)
 
 
 class Teleop:
-    """The cmd_vel of one robot. fleet: the fleet's bus; control_key: where the robot's control is told there."""
+    """The cmd_vel of one robot. fleet: the fleet's bus; control_key: where the robot's control is told there.
 
-    def __init__(self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str) -> None:
+    name: the first part of the name that drivers are given.
+    """
+
+    def __init__(
+        self, side: RosSide, node: Node, robot: Robot, body: Body, fleet: Bus, control_key: str, name: str
+    ) -> None:
         self._side = side
         self._robot = robot
         self._body = body
         self._loop = asyncio.get_running_loop()
         self._driving = Driving(robot.name)
-        self._holder = Holder(robot, self._on_lost)
+        self._holder = Holder(robot, name, self._on_lost)
         self._fleet = fleet
         self._control_key = control_key
         self._control: Handle | None = None
         self._stopped: bool | None = None
         self._limits: dict[bytes, RateLimit] = {}
         """By the gids of publishers that have a token."""
+        self._known: dict[bytes, bytes] = {}
+        """By each gid that such a publisher may send with, the one it is known by."""
         self._strangers = RateLimit(STRANGERS_HZ)
         self._wrong: dict[str, str] = {}
         """By the tokens of publishers of another type, what they are."""
@@ -107,6 +114,7 @@ class Teleop:
             self._forget(gid)
         elif self._driving.came(gid, endpoint.node.full_name, now, early=now < self._settled_at):
             self._limits.setdefault(gid, RateLimit(RATE_HZ))
+            self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
             self._counts["publishers_refused"].value += 1
         self._watch_control(bool(self._driving.publishers))
@@ -120,6 +128,8 @@ class Teleop:
                 self._wrong[token] = f"{endpoint.node.full_name} publishes {endpoint.type_name} {endpoint.type_hash}"
 
     def _forget(self, gid: bytes) -> None:
+        for also in [also for also, known in self._known.items() if known == gid]:
+            del self._known[also]
         self._limits.pop(gid, None)
         self._carry_out(self._driving.gone(gid))
 
@@ -152,7 +162,7 @@ class Teleop:
         if attachment is None or len(attachment) != _ATTACHED_BYTES or size > most_bytes + _ATTACHED_BYTES:
             self._counts["malformed"].value += 1
             return None
-        gid = attachment[_GID]
+        gid = self._known.get(attachment[_GID], b"")
         limit = self._limits.get(gid)
         now = self._loop.time()
         if limit is None:
@@ -173,7 +183,8 @@ class Teleop:
         except (ProtocolError, Malformed):
             self._counts["malformed"].value += 1
             return
-        decision = self._driving.heard(attachment.gid, drive.moving, self._loop.time(), wrong)
+        gid = self._known.get(attachment.gid, attachment.gid)
+        decision = self._driving.heard(gid, drive.moving, self._loop.time(), wrong)
         if decision.action is Action.SEND:  # the way of nearly all
             self._holder.send(drive)
         else:

@@ -75,7 +75,7 @@ class Graph:
             raise ProtocolError(f"{endpoint.name}: more than {ENDPOINTS} endpoints")
         table[token] = endpoint
         if endpoint.kind is Kind.PUBLISHER:
-            self.gids[endpoint.gid()] = endpoint
+            self.gids |= dict.fromkeys(endpoint.gids(), endpoint)
         self.keys[endpoint.key] = (wanted, endpoint.type_name)
         return endpoint
 
@@ -90,7 +90,8 @@ class Graph:
         for table in (self.publishers, self.takers, self.drivers):
             endpoint = table.pop(token, None)
             if endpoint is not None:
-                self.gids.pop(endpoint.gid(), None)
+                for gid in endpoint.gids():
+                    self.gids.pop(gid, None)
                 return True
         return False
 

@@ -111,7 +111,7 @@ async def test_a_link_ends_once_with_its_last_connection() -> None:
     scene = Scene()
     scene.own.connection(up=False)
     scene.link.close()
-    await scene.link.closed()
+    await scene.link.ended()
     await asyncio.sleep(0)
     assert (scene.recorder.calls.count("lost"), scene.recorder.reason) == (1, "connection lost: the router is gone")
     scene.write(KeyedSample(SampleKind.PUT, "out", b"1"))

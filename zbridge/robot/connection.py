@@ -18,7 +18,7 @@ from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.session import Session, State, Tap
 from zbridge.protocol.session_table import Backoff, SessionTable
-from zbridge.transport import Conversation
+from zbridge.transport import Conversation, Link
 
 log = logging.getLogger("zbridge.link")
 
@@ -105,6 +105,7 @@ class Connection:
         self.conversation: Conversation | None = None
         self._hooks = hooks
         self._ending = False
+        self._link: Link | None = None
         self._watchers: dict[str, Callable[[bytes], object]] = {}
 
     def __repr__(self) -> str:
@@ -129,6 +130,8 @@ class Connection:
         if conversation is not None:
             conversation.close(reason)
             await asyncio.wait([conversation.ended], timeout=timeout_s)
+        if self._link is not None:
+            await self._link.ended()
         self.state, self.reason = "offline", reason
 
     def status(self) -> LinkStatus:
@@ -174,7 +177,7 @@ class Connection:
         self.conversation = conversation
         hooks.manager.add(session)
         try:
-            await hooks.connect(self.address, conversation)
+            self._link = await hooks.connect(self.address, conversation)
             await conversation.ended
         except LinkError as error:
             session.lost(str(error))

@@ -44,3 +44,6 @@ class FakeLink:
     def abort(self) -> None:
         """Note the call."""
         self.closed = True
+
+    async def ended(self) -> None:
+        """Return at once."""

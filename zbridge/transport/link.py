@@ -83,3 +83,6 @@ class Link(Protocol):
 
     def abort(self) -> None:
         """Close the connection now; what was written may be lost. Idempotent."""
+
+    async def ended(self) -> None:
+        """Wait, after :meth:`close` or a loss, until no thread of the link runs; the process may end then."""

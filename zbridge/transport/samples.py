@@ -108,8 +108,8 @@ class ZenohLink:
         """Close the session; idempotent."""
         self._end("closed")
 
-    async def closed(self) -> None:
-        """Wait until the session is closed."""
+    async def ended(self) -> None:
+        """Wait until the session is closed: a process that ends before would be cut off in the middle of Zenoh."""
         if self._closing is not None:
             await asyncio.shield(self._closing)
 
@@ -229,7 +229,7 @@ async def serve(address: Address, receiver: Receiver) -> AsyncIterator[ZenohLink
         yield link
     finally:
         link.close()
-        await link.closed()
+        await link.ended()
 
 
 async def _opened(peer: str, settings: BusSettings, receiver: Receiver) -> ZenohLink:

@@ -120,6 +120,9 @@ class SerialLink:
         """Close the line now, whatever was written; idempotent."""
         self._end("closed")
 
+    async def ended(self) -> None:
+        """Return at once: such a link has no threads."""
+
     def _read(self) -> None:
         try:
             data = os.read(self._fd, READ_BYTES)

@@ -15,11 +15,10 @@ import math
 import struct
 from typing import Any
 
-import msgspec
-
 from gateways.ros2.graph import Graph
 from gateways.ros2.messages import LIVE, TWIST_STAMPED, Command, Event, Ignored
 from gateways.ros2.settings import Options
+from gateways.ros2.twists import REST, Velocity, write_twist
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Count,
@@ -42,6 +41,8 @@ from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoin
 
 HANDSHAKE_S = 60.0
 """Seconds after which the link is opened anew where nothing of the robot was heard."""
+LAST_S = 0.5
+"""Seconds for which zeros are repeated before a session ends."""
 REST_S = 1.0
 """Seconds for which zeros are repeated after neutral."""
 WATCH_S = 2.0
@@ -57,17 +58,6 @@ _STAMP_AT = 4
 _NS_PER_S = 1_000_000_000
 _SHOWN = 64
 """Longest name of another node that is shown."""
-
-
-class Velocity(msgspec.Struct, frozen=True):
-    """What a Twist says: m/s forward and to the left, rad/s counter-clockwise."""
-
-    forward: float = 0.0
-    left: float = 0.0
-    turn: float = 0.0
-
-
-REST = Velocity()
 
 
 class RosRole(Session[Any]):
@@ -92,6 +82,8 @@ class RosRole(Session[Any]):
         self._gids: dict[str, bytes] = {}
         """Our gids, by the keys that we write."""
         self._numbers: dict[str, int] = {}
+        self._lost, self._lost_at = "", -math.inf
+        """Why the session will end, and since when that is known."""
         self._velocity = REST
         self._now = self._heard_at = -math.inf
         self._time: tuple[int, float] = (0, 0.0)
@@ -127,6 +119,9 @@ class RosRole(Session[Any]):
         message = wanted.heard(self._types.decode(type_name, sample.payload))
         if wanted.heard is not Command:
             self._heard_at = self._now
+            if self._lost and self.graph.publishers:
+                self._lost = ""
+                self._look()
             if isinstance(message, LIVE):
                 self._robot_time = message.stamp_ns, self._now
         return message
@@ -165,7 +160,7 @@ class RosRole(Session[Any]):
         elif sample.kind is SampleKind.GONE and self.graph.gone(sample.key):
             self._look()
             if self.state is State.ESTABLISHED and not self.graph.publishers:
-                self.close("its publishers are gone", self._now)
+                self._lose("its publishers are gone", self._now)
 
     def _begin(self, zid: str) -> None:
         self._node = Node(self._options.domain, zid, 0, self._options.full_namespace, "zbridge")
@@ -212,7 +207,7 @@ class RosRole(Session[Any]):
         if self.over:
             return
         if self.state is State.ESTABLISHED:
-            self.busy, self.features = self.graph.idle_drive, self._features()
+            self.busy, self.features = self._lost or self.graph.idle_drive, self._features()
             nodes = sorted({driver.node.full_name[:_SHOWN] for driver in self.graph.drivers.values()})
             others = f"{', '.join(nodes[:3])} {'publish' if len(nodes) > 1 else 'publishes'} {self.graph.command_topic}"
             self.doubts = (f"{others} too, and is overruled",) if nodes and not self._options.shared else ()
@@ -222,10 +217,22 @@ class RosRole(Session[Any]):
     # Time
 
     def timers(self) -> float:
-        return self._heard_at + self._options.silent_s if self.state is State.ESTABLISHED else math.inf
+        if self.state is not State.ESTABLISHED:
+            return math.inf
+        return self._lost_at + LAST_S if self._lost else self._heard_at + self._options.silent_s
 
     def on_timer(self, now: float) -> None:
-        self.close(f"nothing came for {self._options.silent_s:g} s", now)
+        if self._lost:
+            self.close(self._lost, now)
+        else:
+            self._lose(f"nothing came for {self._options.silent_s:g} s", now)
+
+    def _lose(self, reason: str, now: float) -> None:
+        """Take no drives and repeat zeros; end after :data:`LAST_S`: one frame alone may be lost on the way."""
+        self._lost, self._lost_at = reason, now
+        if self.graph.takers and not (self._options.shared and not self.moving):
+            self.drive(REST, now, urgent=True)
+        self._look()
 
     def close(self, reason: str, now: float) -> None:
         """Tell the robot to stand still, and end."""
@@ -260,19 +267,9 @@ class RosRole(Session[Any]):
         """Write a velocity for each type that is taken; :class:`_Dated` completes the frames when they leave."""
         keys = {taker.key: taker.type_name for taker in self.graph.takers.values()}
         return tuple(
-            write_sample(KeyedSample(SampleKind.PUT, key, self._twist(type_name, velocity)))
+            write_sample(KeyedSample(SampleKind.PUT, key, write_twist(self._types, type_name, velocity)))
             for key, type_name in keys.items()
         )
-
-    def _twist(self, type_name: str, velocity: Velocity) -> bytes:
-        make = self._types.message
-        linear = make("geometry_msgs/msg/Vector3", x=velocity.forward, y=velocity.left)
-        angular = make("geometry_msgs/msg/Vector3", z=velocity.turn)
-        twist = make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
-        if type_name == TWIST_STAMPED:
-            header = make("std_msgs/msg/Header", frame_id="base_link")
-            twist = make(TWIST_STAMPED, header=header, twist=twist)
-        return self._types.encode(twist)
 
     def _answer(self, now: float) -> None:
         """Say again what we said last: another node has said something else."""

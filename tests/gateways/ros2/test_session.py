@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from gateways.ros2.session import Velocity
+from gateways.ros2.twists import Velocity
 from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, TYPES, RosScene, header, key, token
 from zbridge.errors import NotReady
 from zbridge.protocol import KeyedSample, SampleKind
@@ -84,6 +84,9 @@ def test_a_robot_that_says_nothing_for_two_seconds_is_told_to_stand_still_and_is
     scene.after(1.9)
     assert scene.session.state.value == "established"
     assert puts(scene.after(0.11))[-1] == ZEROS
+    assert (scene.session.state.value, scene.session.busy) == ("established", "nothing came for 2 s")
+    assert [puts(scene.after(0.1)) for _ in range(4)] == [[ZEROS]] * 4
+    scene.after(0.11)
     assert (scene.session.state.value, scene.session.reason) == ("closed", "nothing came for 2 s")
 
 
@@ -95,7 +98,19 @@ def test_a_robot_whose_last_publisher_is_gone_is_told_to_stand_still_and_is_lost
     scene.written.clear()
     scene.gone(by)
     assert puts(scene.written) == [ZEROS]
+    assert (scene.session.state.value, scene.session.busy) == ("established", "its publishers are gone")
+    scene.after(0.51)
     assert (scene.session.state.value, scene.session.reason) == ("closed", "its publishers are gone")
+
+
+def test_a_robot_that_speaks_again_at_once_is_kept() -> None:
+    scene = RosScene()
+    by = scene.establish()
+    scene.after(2.01)
+    scene.now += 0.3
+    scene.hears("odom", by, header=header(scene.time_ns))
+    scene.after(1.9)
+    assert (scene.session.state.value, scene.session.busy) == ("established", None)
 
 
 def test_a_drive_is_repeated_ten_times_a_second_with_rising_numbers_and_times() -> None:

@@ -44,6 +44,8 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     ),
     (m.Scanner(**SCANNER), SCANNER),
     (m.Reading(1.5), {"value": 1.5, "fault": False} | none("kind device")),
+    (m.Image("jpeg", b"\xff\xd8"), {"format": "jpeg", "data": b"\xff\xd8"} | none("width height")),
+    (m.Battery(level=0.5, voltage=12.0), {"level": 0.5, "voltage": 12.0} | none("current charging")),
     (m.Devices((m.Device("left", 1, "motor"),)), {"devices": [{"name": "left", "number": 1, "kind": "motor"}]}),
     (m.Switch(on=True), {"on": True}),
     (m.Switch(on=True, stamp_ns=0, seq=0, device_ms=0), {"on": True, "stamp_ns": 0, "seq": 0, "device_ms": 0}),

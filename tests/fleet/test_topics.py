@@ -9,7 +9,8 @@ from zbridge.fleet import topics
 from zbridge.fleet.topics import Congestion, Delivery, KeySpace, Priority, Topic, escape, find, unescape
 
 TABLE: dict[Delivery, dict[str, type[m.FleetMessage]]] = {
-    Delivery.STREAM: {"scan": m.Scan, "motion": m.Motion, "pose": m.Pose, "text": m.Text, "image": m.Image}
+    Delivery.STREAM: {"scan": m.Scan, "motion": m.Motion, "pose": m.Pose, "text": m.Text}
+    | {"image": m.Image, "battery": m.Battery}
     | {"sensor/front": m.Reading, "raw/tcpudp": m.Raw},
     Delivery.STATE: {"status": m.Status, "control": m.Control, "scanner": m.Scanner, "map": m.Map}
     | {"lidar": m.Switch, "camera": m.Switch, "devices": m.Devices},

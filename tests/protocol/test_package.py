@@ -16,6 +16,8 @@ GATEWAYS = sorted(
     if path.name != "__main__.py" and "conformance" not in path.parts
 )
 AUTHORS = {"zbridge.protocol", "zbridge.wire", "zbridge.fleet"}
+FORMATS = {"zbridge.ros2"}
+"""What other programs put on Zenoh; sans-IO, like the author's packages."""
 SIMULATORS = {"zbridge.simulation", "zbridge.transport"}
 
 
@@ -38,5 +40,5 @@ def test_a_gateway_is_written_with_the_authors_packages_alone(path: Path) -> Non
     nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)]
     imported = [str(node.module) for node in nodes if str(node.module).startswith("zbridge")]
     rooms = {".".join(name.split(".")[:2]) for name in imported}
-    assert rooms <= AUTHORS | (SIMULATORS if "simulator" in path.stem else set())
+    assert rooms <= AUTHORS | FORMATS | (SIMULATORS if "simulator" in path.stem else set())
     assert not {name for name in imported if name.startswith("zbridge.protocol.")}

@@ -27,7 +27,7 @@ from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
 from zbridge.hq import HqSettings, ListenerPlan
 from zbridge.hq.settings import Network
-from zbridge.protocol.address import Address, DeviceAddress, parse_device_address
+from zbridge.protocol.address import Address, DeviceAddress
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 from zbridge.transport import server_context
@@ -136,7 +136,7 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
 def _device(settings: DeviceSettings) -> DevicePlan:
     protocol = _protocol("device.", settings.protocol)
     options = convert(settings.options, protocol.options, "device.options.")
-    addresses = tuple(_device_address("device.connect", text) for text in settings.connect)
+    addresses = tuple(_device_address("device.connect", protocol, text) for text in settings.connect)
     if len(addresses) > protocol.links:
         raise ConfigError(
             f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
@@ -197,9 +197,9 @@ def _listener_address(key: str, text: str) -> Address:
         raise ConfigError(f"{key} = {error}") from error
 
 
-def _device_address(key: str, text: str) -> DeviceAddress:
+def _device_address(key: str, protocol: Protocol, text: str) -> DeviceAddress:
     try:
-        return parse_device_address(text)
+        return protocol.device_address(text)
     except LinkError as error:
         raise ConfigError(f"{key} = {error}") from error
 

@@ -129,10 +129,11 @@ class FakeBus:
         *,
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
+        kept: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
         self._shared.subscribers.append(entry)
-        if history:
+        if history or kept:
             for key, payload in tuple(self._shared.last.items()):
                 if matches(key_expr, key):
                     handler(Sample(key, payload))

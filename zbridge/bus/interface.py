@@ -193,8 +193,11 @@ class Bus(Protocol):
         *,
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
+        kept: bool = False,
     ) -> Handle:
         """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
+
+        kept: the frames that publishers have kept come too, those of publishers that appear later as well.
 
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """

@@ -17,7 +17,7 @@ from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
-from zbridge.protocol.address import Address, parse_device_address
+from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
 app = typer.Typer(
@@ -193,7 +193,8 @@ def probe(
     from zbridge.cli.probe import probe as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
-    found, at = find_protocol(protocol), parse_device_address(address)
+    found = find_protocol(protocol)
+    at = found.device_address(address)
     code = run_loop(ask(bus_settings(connect, tls), found, at, realm=realm, sure=yes))
     if code:
         raise typer.Exit(code)

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import AsyncIterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
 
@@ -99,7 +100,7 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
 
     secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
     """
-    robots = {f"{protocol}1": protocol for protocol in protocol_names()}
+    robots = {f"{name}1": name for name in protocol_names() if _is_whole(find_protocol(name))}
     watch = Watch(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
@@ -127,6 +128,11 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
             for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
                 print(shown(line), file=sys.stderr)  # noqa: T201
             raise ZbridgeError(f"no data from {', '.join(silent)}; the end of the processes' log is above")
+
+
+def _is_whole(protocol: Protocol) -> bool:
+    """Tell whether what the protocol's robots need is installed."""
+    return all(find_spec(module) is not None for module in protocol.requires)
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:

@@ -19,7 +19,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.transport import Conversation, connect
+from zbridge.transport import Conversation, Link, connect
 
 PROBE_S = 15.0
 """Longest time a handshake may take."""
@@ -75,10 +75,11 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
         if session.state is State.ESTABLISHED:
             settled.set()
 
+    link: Link | None = None
     conversation = Conversation(session, loop, deliver=lambda messages: None, changed=changed)
     conversation.ended.add_done_callback(lambda _: settled.set())
     try:
-        await connect(address, conversation)
+        link = await connect(address, conversation)
         async with asyncio.timeout(PROBE_S):
             await settled.wait()
     except (LinkError, TimeoutError) as error:
@@ -91,6 +92,8 @@ async def _talk(protocol: Protocol, address: DeviceAddress) -> int:
             async with asyncio.timeout(1.0):
                 await asyncio.shield(conversation.ended)
         conversation.abandon()
+        if link is not None:
+            await link.ended()
     _show(
         {
             "protocol": protocol.name,

@@ -95,6 +95,24 @@ class Map(FleetMessage, frozen=True, eq=False):
     cells: Cells
 
 
+class Image(FleetMessage, frozen=True):
+    """One compressed picture of the robot's camera. format: ``jpeg`` or ``png``; pixels, None = unknown."""
+
+    format: str
+    data: bytes
+    width: int | None = None
+    height: int | None = None
+
+
+class Battery(FleetMessage, frozen=True):
+    """The robot's battery. level: 0 (empty) to 1; V, A (negative: it is being emptied). None = unknown."""
+
+    level: float | None = None
+    voltage: float | None = None
+    current: float | None = None
+    charging: bool | None = None
+
+
 class Reading(FleetMessage, frozen=True):
     """One value of a named sensor, in the sensor's unit. fault: the value is not plausible."""
 
@@ -122,15 +140,6 @@ class Switch(FleetMessage, frozen=True):
     """A switch that is on or off."""
 
     on: bool
-
-
-class Image(FleetMessage, frozen=True):
-    """One picture of a camera. format: ``jpeg``; data: its bytes; width, height: pixels, None where not known."""
-
-    format: str
-    data: bytes
-    width: int | None = None
-    height: int | None = None
 
 
 class Text(FleetMessage, frozen=True):

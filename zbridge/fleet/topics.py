@@ -16,6 +16,7 @@ import msgspec
 from zbridge.fleet.messages import (
     Acquire,
     Authorization,
+    Battery,
     Control,
     Devices,
     Drive,
@@ -179,6 +180,7 @@ MOTION = Topic("motion", Motion, Delivery.STREAM)
 POSE = Topic("pose", Pose, Delivery.STREAM)
 TEXT = Topic("text", Text, Delivery.STREAM)
 IMAGE = Topic("image", Image, Delivery.STREAM)
+BATTERY = Topic("battery", Battery, Delivery.STREAM)
 SENSOR = _family("sensor", Reading, Delivery.STREAM)
 RAW = _family("raw", Raw, Delivery.STREAM)
 
@@ -215,7 +217,8 @@ RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_
 _TOPICS = {
     topic.path: topic
     for topic in (
-        *(SCAN, MOTION, POSE, TEXT, IMAGE, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
+        *(SCAN, MOTION, POSE, TEXT, IMAGE, BATTERY),
+        *(STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
         *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE),
     )

@@ -25,6 +25,9 @@ errors          :class:`ProtocolError` for bytes that are no message, :class:`En
                 can carry, :class:`ConfigError` for options; :class:`Refused` for commands: :class:`Unsupported`,
                 :class:`NotReady` or :class:`Malformed`, each with a :class:`Code`.
 address         :class:`Address`: where simulators listen.
+samples         :class:`KeyedSample` of a :class:`SampleKind`: the frames of a protocol whose robots speak Zenoh
+                (``Protocol.keyed``), of :data:`SAMPLE_BYTES` at most, with :func:`write_sample`, :func:`read_sample`,
+                :func:`sample_end` and :func:`subscription`.
 metrics         :class:`Metrics`, :class:`Count`: counters.
 =============== ===================================================================================================
 """
@@ -65,6 +68,15 @@ from zbridge.protocol.plugin import (
     Translate,
 )
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.protocol.samples import (
+    SAMPLE_BYTES,
+    KeyedSample,
+    SampleKind,
+    read_sample,
+    sample_end,
+    subscription,
+    write_sample,
+)
 from zbridge.protocol.session import Datagram, Limits, Role, Session, State, Traffic
 from zbridge.protocol.session_table import ClientIds
 
@@ -73,6 +85,7 @@ __all__ = [
     "FRAME",
     "FRAMES",
     "LIMIT",
+    "SAMPLE_BYTES",
     "Address",
     "BearingScan",
     "ClientIds",
@@ -94,6 +107,7 @@ __all__ = [
     "HqSide",
     "HqSimulation",
     "Kept",
+    "KeyedSample",
     "Limits",
     "Malformed",
     "Metrics",
@@ -109,6 +123,7 @@ __all__ = [
     "Robot",
     "RobotUser",
     "Role",
+    "SampleKind",
     "Sectors",
     "Send",
     "Session",
@@ -121,4 +136,8 @@ __all__ = [
     "agree",
     "newest",
     "parse_versions",
+    "read_sample",
+    "sample_end",
+    "subscription",
+    "write_sample",
 ]

@@ -1,6 +1,7 @@
 """Where a peer of a legacy protocol is, as configurations and logs write it. Opens nothing.
 
-A robot is at a :data:`DeviceAddress`: a TCP port or a serial line. Listeners and simulators are at TCP ports only.
+A robot is at a :data:`DeviceAddress`: a TCP port, a serial line, or a Zenoh router of its own. Listeners and simulators
+are at TCP ports only.
 """
 
 from __future__ import annotations
@@ -58,7 +59,22 @@ class SerialAddress(msgspec.Struct, frozen=True):
         return f"serial://{quote(self.path)}?baud={self.baud}"
 
 
-DeviceAddress = Address | SerialAddress
+class ZenohAddress(msgspec.Struct, frozen=True):
+    """A Zenoh router to which robots are connected: ``tcp://host:port``. It is not the fleet's bus."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return str(Address(self.host, self.port))
+
+    @property
+    def endpoint(self) -> str:
+        """The address as Zenoh writes it: ``tcp/host:port``."""
+        return str(self).replace("://", "/")
+
+
+DeviceAddress = Address | SerialAddress | ZenohAddress
 """Where a robot is."""
 
 

@@ -22,7 +22,7 @@ from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol.address import Address
+from zbridge.protocol.address import Address, DeviceAddress, ZenohAddress, parse_device_address
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
@@ -273,6 +273,18 @@ class Protocol(msgspec.Struct, frozen=True):
     """The messages, for the conformance kit."""
     hq_template: str = ""
     """The lines of a commented ``[[hq]]`` table: ``protocol``, ``listen`` and ``[hq.options]``."""
+    keyed: bool = False
+    """Whether its robots speak Zenoh: a link is a Zenoh session of its own, and its frames are those of
+    :mod:`zbridge.protocol.samples`."""
+    requires: tuple[str, ...] = ()
+    """Modules that its robots need beyond what zbridge itself does; an extra installs them."""
+
+    def device_address(self, text: str) -> DeviceAddress:
+        """Read the address of a robot of this protocol; raise LinkError that names what was expected."""
+        if not self.keyed:
+            return parse_device_address(text)
+        router = Address.parse(text)
+        return ZenohAddress(router.host, router.port)
 
 
 def protocol_names() -> tuple[str, ...]:

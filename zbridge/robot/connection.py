@@ -115,6 +115,7 @@ class Connection:
         self.conversation: Conversation | None = None
         self._hooks = hooks
         self._ending = False
+        self._link: Link | None = None
         self._free = asyncio.Event()
         """Cleared while another process may get the link: nothing is connected then."""
         self._free.set()
@@ -144,6 +145,8 @@ class Connection:
         if conversation is not None:
             conversation.close(reason)
             await asyncio.wait([conversation.ended], timeout=timeout_s)
+        if self._link is not None:
+            await self._link.ended()
         self.state, self.reason = "offline", reason
 
     # A restart
@@ -217,7 +220,7 @@ class Connection:
         hooks.manager.add(session)
         try:
             if not taken_over:
-                await hooks.connect(self.address, conversation)
+                self._link = await hooks.connect(self.address, conversation)
             await conversation.ended
         except LinkError as error:
             session.lost(str(error))

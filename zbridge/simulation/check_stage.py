@@ -21,8 +21,7 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import Protocol, Robot, Simulation
 from zbridge.protocol.session import Session, State
-from zbridge.transport import Conversation
-from zbridge.transport.tcp import connect
+from zbridge.transport import Conversation, connect
 
 SHOWN_S = 1.0
 """Seconds that a recording goes on after the session was established."""
@@ -55,6 +54,7 @@ class Live:
     """A robot object with a conversation on each link of the simulated robot."""
 
     def __init__(self, protocol: Protocol) -> None:
+        self._protocol = protocol
         self.robot = robot_of(protocol)
         self.sessions: list[Session[Any]] = []
         self.frames: list[tuple[str, bytes]] = []
@@ -73,7 +73,7 @@ class Live:
                 session.tap = lambda direction, frame: self.frames.append((direction, frame))
             self.sessions.append(session)
             self._conversations.append(Conversation(session, loop, deliver=self._deliver))
-            await connect(address, self._conversations[-1])
+            await connect(self._protocol.device_address(str(address)), self._conversations[-1])
 
     def _deliver(self, messages: list[Any]) -> None:
         self.messages += messages
@@ -192,7 +192,7 @@ class Rehearsal:
             session.expire(self.now)
             frame = session.outgoing(self.now)
             if frame is not None:
-                written.append(frame)
+                written.append(session.undated(frame))
                 session.outbox.written(self.now)
                 if answers and session.state is State.ESTABLISHED:
                     for answer in self._recording.answers.get(frame, ()):

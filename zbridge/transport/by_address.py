@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from zbridge.protocol.address import DeviceAddress, SerialAddress
+from zbridge.errors import ProtocolError
+from zbridge.protocol.address import DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport import serial, tcp
 from zbridge.transport.link import Link, Receiver
@@ -16,6 +17,10 @@ async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray 
     """
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
+    if isinstance(address, ZenohAddress):
+        from zbridge.transport import samples  # loads what only such links need
+
+        return await samples.connect(address, receiver)
     return await tcp.connect(address, receiver, buffer)
 
 
@@ -26,4 +31,6 @@ async def take_over(address: DeviceAddress, given: Exported, parcel: Parcel, rec
     """
     if isinstance(address, SerialAddress):
         return serial.take_over(address, parcel.take(given.get("serial")), receiver)
+    if isinstance(address, ZenohAddress):
+        raise ProtocolError("a Zenoh session stays in its process")
     return await tcp.take_over(given, parcel, receiver)

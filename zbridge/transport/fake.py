@@ -70,3 +70,6 @@ class FakeLink:
     def abort(self) -> None:
         """Note the call."""
         self.closed = True
+
+    async def ended(self) -> None:
+        """Return at once."""

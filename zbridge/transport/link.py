@@ -110,6 +110,9 @@ class Link(Protocol):
     def abort(self) -> None:
         """Close the connection now; what was written may be lost. Idempotent."""
 
+    async def ended(self) -> None:
+        """Wait, after :meth:`close` or a loss, until no thread of the link runs; the process may end then."""
+
 
 class _Nobody:
     """Takes nothing: the receiver of a link that was given up."""

@@ -156,6 +156,9 @@ class SerialLink:
         """Close the line now, whatever was written; idempotent."""
         self._end("closed")
 
+    async def ended(self) -> None:
+        """Return at once: such a link has no threads."""
+
     def _read(self) -> None:
         self.reads()
         try:

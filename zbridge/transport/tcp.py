@@ -200,6 +200,9 @@ class TcpLink(asyncio.BufferedProtocol):
 
     # What asyncio calls
 
+    async def ended(self) -> None:
+        """Return at once: such a link has no threads."""
+
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)  # uvloop's transport does not inherit from it
         self._transport.set_write_buffer_limits(high=0)  # makes uvloop write at once, not at the end of its iteration

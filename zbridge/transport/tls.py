@@ -148,6 +148,9 @@ class TlsLink(Receiver):
 
     # What the TCP link calls
 
+    async def ended(self) -> None:
+        """Return at once: such a link has no threads."""
+
     def attached(self, link: Link) -> None:
         """Begin: the connection is up, the handshake is not done."""
         self._link = link

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
+import zenoh.ext
 
 from zbridge.bus.inbox import Source
 from zbridge.bus.interface import Answer, Lane, Look, Sample, Sort
@@ -56,6 +57,12 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
             source.put(Sample(key, payload.to_bytes(), shown), lane, size)
 
     return store
+
+
+def subscribe_with_kept(session: zenoh.Session, key_expr: str, store: Callable[[zenoh.Sample], None]) -> Any:
+    """Subscribe to a key and to what advanced publishers have kept of it, now and whenever one appears."""
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+    return zenoh.ext.declare_advanced_subscriber(session, key_expr, store, history=history)
 
 
 def query_callback(sort: Sort, source: Source, unanswered: Count) -> Callable[[zenoh.Query], None]:

@@ -29,6 +29,7 @@ from zbridge.bus.zenoh.incoming import (
     read_reply,
     read_sample,
     sorted_callback,
+    subscribe_with_kept,
 )
 from zbridge.bus.zenoh.opening import in_short, open_or_say_why, zenoh_config
 from zbridge.bus.zenoh.publishers import FramePublisher, Publishers
@@ -141,8 +142,11 @@ class ZenohBus:
         *,
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
+        kept: bool = False,
     ) -> Handle:
         """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
+
+        kept: the frames that publishers have kept come too, those of publishers that appear later as well.
 
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
@@ -154,6 +158,8 @@ class ZenohBus:
         else:
             source = self._inbox.source(handler)
             store = sorted_callback(lane, source)
+        if kept:
+            return self._keep(Declared(subscribe_with_kept(self._session, key_expr, store)))
         return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))
 
     def answer(

@@ -1,0 +1,137 @@
+"""Who publishes a robot's topics and who takes its commands, as the liveliness tokens of ROS nodes tell. Sans-IO."""
+
+from __future__ import annotations
+
+import msgspec
+
+from gateways.ros2.messages import HEARD, KEPT, TWIST, TWIST_STAMPED, Command, Heard
+from gateways.ros2.settings import Options
+from zbridge.protocol import ProtocolError
+from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
+
+ENDPOINTS = 64
+"""Publishers of the robot, takers of its commands, and other drivers that are known, each; more are not looked at."""
+
+
+class Wanted(msgspec.Struct, frozen=True):
+    """One topic that is read. kept: the last message from before is wanted too."""
+
+    name: str
+    heard: type[Heard]
+    types: tuple[str, ...]
+    kept: bool
+
+
+class Graph:
+    """The endpoints of one robot's topics."""
+
+    def __init__(self, options: Options, types: Types) -> None:
+        self._domain = options.domain
+        self._types = types
+        self.command_topic = options.topic("cmd_vel")
+        topics = ((option, options.topic(option)) for option in HEARD)
+        self._wanted = {
+            name: Wanted(name, HEARD[option][0], (HEARD[option][1],), option in KEPT)
+            for option, name in topics
+            if name is not None
+        }
+        self._command = Wanted(self.command_topic or "", Command, (TWIST, TWIST_STAMPED), kept=False)
+        self.publishers: dict[str, Endpoint] = {}
+        """By their tokens, as the next two."""
+        self.takers: dict[str, Endpoint] = {}
+        self.drivers: dict[str, Endpoint] = {}
+        """Other nodes that publish on the topic of commands."""
+        self.wrong: dict[str, str] = {}
+        """Endpoints on the robot's topics that are not what they should be, and why."""
+        self.gids: dict[bytes, Endpoint] = {}
+        self.keys: dict[str, tuple[Wanted, str]] = {}
+        """For each key that is read: what it is, and the type of its messages."""
+
+    def __repr__(self) -> str:
+        return f"<Graph of {len(self.publishers)} publishers, {len(self.takers)} takers, {len(self.drivers)} drivers>"
+
+    def watched(self) -> list[str]:
+        """List the expressions of the tokens that matter."""
+        watched = [endpoints_of(self._domain, Kind.PUBLISHER, name) for name in self._wanted]
+        if self.command_topic is not None:
+            watched += [
+                endpoints_of(self._domain, kind, self.command_topic) for kind in (Kind.SUBSCRIBER, Kind.PUBLISHER)
+            ]
+        return watched
+
+    def appeared(self, token: str) -> Endpoint:
+        """Enter an endpoint; raise ProtocolError for one that is not of this robot, or not as it should be."""
+        endpoint = read_token(token)
+        if not isinstance(endpoint, Endpoint):
+            raise ProtocolError(f"token {token[:200]!r}")
+        table, wanted = self._place(endpoint)
+        try:
+            self._check(endpoint, wanted)
+        except ProtocolError as error:
+            if len(self.wrong) < ENDPOINTS:
+                self.wrong[token] = str(error)
+            raise
+        if len(table) >= ENDPOINTS:
+            raise ProtocolError(f"{endpoint.name}: more than {ENDPOINTS} endpoints")
+        table[token] = endpoint
+        if endpoint.kind is Kind.PUBLISHER:
+            self.gids |= dict.fromkeys(endpoint.gids(), endpoint)
+        self.keys[endpoint.key] = (wanted, endpoint.type_name)
+        return endpoint
+
+    def knows(self, token: str) -> bool:
+        """Tell whether a token is one of those that were looked at."""
+        return any(token in table for table in (self.publishers, self.takers, self.drivers, self.wrong))
+
+    def gone(self, token: str) -> bool:
+        """Forget an endpoint; False if it was not known."""
+        if self.wrong.pop(token, None) is not None:
+            return True
+        for table in (self.publishers, self.takers, self.drivers):
+            endpoint = table.pop(token, None)
+            if endpoint is not None:
+                for gid in endpoint.gids():
+                    self.gids.pop(gid, None)
+                return True
+        return False
+
+    def of_topic(self, name: str) -> Wanted:
+        """Return what is wanted of a topic."""
+        return self._wanted.get(name, self._command)
+
+    @property
+    def waiting_for(self) -> str:
+        """Say why nothing of the robot is known."""
+        if self.publishers:
+            return "its publishers are silent"
+        if self.wrong:
+            return next(iter(self.wrong.values()))
+        return f"nobody publishes {', '.join(self._wanted)}"
+
+    @property
+    def idle_drive(self) -> str | None:
+        """Say why the robot cannot be driven; None if it can."""
+        if self.takers:
+            return None
+        if self.command_topic is None:
+            return "cmd_vel is turned off"
+        wrong = (text for text in self.wrong.values() if text.startswith(f"{self.command_topic} "))
+        return next(wrong, f"nobody subscribes to {self.command_topic}")
+
+    def _place(self, endpoint: Endpoint) -> tuple[dict[str, Endpoint], Wanted]:
+        if endpoint.name == self.command_topic:
+            if endpoint.kind is Kind.SUBSCRIBER:
+                return self.takers, self._command
+            if endpoint.kind is Kind.PUBLISHER:
+                return self.drivers, self._command
+        wanted = self._wanted.get(endpoint.name)
+        if wanted is None or endpoint.kind is not Kind.PUBLISHER:
+            raise ProtocolError(f"{endpoint.name}: nothing of this robot")
+        return self.publishers, wanted
+
+    def _check(self, endpoint: Endpoint, wanted: Wanted) -> None:
+        expected = " or ".join(wanted.types)
+        if endpoint.type_name not in wanted.types:
+            raise ProtocolError(f"{endpoint.name} is {endpoint.type_name}, expected {expected}")
+        if endpoint.type_hash not in (NO_HASH, self._types.computed_hash(endpoint.type_name)):
+            raise ProtocolError(f"{endpoint.name} has another {endpoint.type_name}: hash {endpoint.type_hash[:20]}")

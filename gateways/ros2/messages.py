@@ -1,0 +1,80 @@
+"""What a session with a ROS 2 robot hears: a class for each topic, whose body is the ROS message. Sans-IO.
+
+The bodies are those of rosbags: fields as in the ``.msg`` files, arrays as numpy arrays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from zbridge.protocol import KeyedSample
+
+TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+_NS_PER_S = 1_000_000_000
+
+
+class Event(msgspec.Struct, frozen=True):
+    """What the link tells about itself: it is open, a token appeared or is gone, samples were dropped."""
+
+    sample: KeyedSample
+
+
+class Heard(msgspec.Struct, frozen=True):
+    """One message of a topic. body: of rosbags; ``stamp_ns`` of its header."""
+
+    body: Any
+
+    @property
+    def stamp_ns(self) -> int:
+        """The stamp of the header on the robot's clock, ns: Unix time, or the time of a simulation."""
+        stamp = self.body.header.stamp
+        return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
+
+
+class LaserScan(Heard, frozen=True):
+    """sensor_msgs/msg/LaserScan."""
+
+
+class Odometry(Heard, frozen=True):
+    """nav_msgs/msg/Odometry."""
+
+
+class OccupancyGrid(Heard, frozen=True):
+    """nav_msgs/msg/OccupancyGrid."""
+
+
+class Imu(Heard, frozen=True):
+    """sensor_msgs/msg/Imu."""
+
+
+class BatteryState(Heard, frozen=True):
+    """sensor_msgs/msg/BatteryState."""
+
+
+class CompressedImage(Heard, frozen=True):
+    """sensor_msgs/msg/CompressedImage."""
+
+
+class Command(Heard, frozen=True):
+    """What another node wrote to the topic of commands: geometry_msgs/msg/Twist or TwistStamped."""
+
+
+class Ignored(msgspec.Struct, frozen=True):
+    """A sample of our own that came back."""
+
+
+HEARD: dict[str, tuple[type[Heard], str]] = {
+    "scan": (LaserScan, "sensor_msgs/msg/LaserScan"),
+    "odom": (Odometry, "nav_msgs/msg/Odometry"),
+    "map": (OccupancyGrid, "nav_msgs/msg/OccupancyGrid"),
+    "imu": (Imu, "sensor_msgs/msg/Imu"),
+    "battery_state": (BatteryState, "sensor_msgs/msg/BatteryState"),
+    "image": (CompressedImage, "sensor_msgs/msg/CompressedImage"),
+}
+"""For each option that names a topic: the class of its messages, and their type."""
+KEPT = frozenset({"map"})
+"""Topics whose last message comes to who is late."""
+LIVE = (LaserScan, Odometry, Imu)
+"""Messages that are sent as soon as they are measured: their stamps tell the robot's clock."""

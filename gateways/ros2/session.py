@@ -1,0 +1,330 @@
+"""A session with a ROS 2 robot, as a node beside its nodes: topics are read, commands are repeated. Sans-IO.
+
+The link is a Zenoh session (:mod:`zbridge.protocol.samples`). The handshake: the link is open; a publisher of one of
+the robot's topics has a token; something came from it. The session ends when all tokens are gone or nothing came for
+``silent_s``; before it ends, the robot is told to stand still. ROS has no handshake of its own: ``busy`` says what is
+missing, and after :data:`HANDSHAKE_S` the link is opened anew.
+
+What others write to the topic of commands is answered by what we said last, unless the robot is ``shared``: another
+node's motion must not outlive a stop.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+from gateways.ros2.graph import Graph
+from gateways.ros2.messages import LIVE, TWIST_STAMPED, Command, Event, Ignored
+from gateways.ros2.settings import Options
+from gateways.ros2.twists import REST, Velocity, write_twist
+from zbridge.protocol import (
+    SAMPLE_BYTES,
+    Count,
+    KeyedSample,
+    Limits,
+    NotReady,
+    Outbox,
+    ProtocolError,
+    RateLimit,
+    Role,
+    SampleKind,
+    Session,
+    State,
+    read_sample,
+    sample_end,
+    subscription,
+    write_sample,
+)
+from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, Attachment, Endpoint, Kind, Node, Types, read_attachment
+
+HANDSHAKE_S = 60.0
+"""Seconds after which the link is opened anew where nothing of the robot was heard."""
+LAST_S = 0.5
+"""Seconds for which zeros are repeated before a session ends."""
+REST_S = 1.0
+"""Seconds for which zeros are repeated after neutral."""
+WATCH_S = 2.0
+"""Seconds between two questions for tokens, while something of the robot is missing."""
+ANSWERS_HZ = 100.0
+"""Times a second that other nodes' commands are answered."""
+_DRIVE = "drive"
+_KIND_AT = 4
+"""Offset of the kind in a frame."""
+_STAMP = struct.Struct("<iI")
+_STAMP_AT = 4
+"""Offset of the stamp in a TwistStamped as CDR: behind the encapsulation header."""
+_NS_PER_S = 1_000_000_000
+_SHOWN = 64
+"""Longest name of another node that is shown."""
+
+
+class RosRole(Session[Any]):
+    """We play a node that reads one robot's topics and writes its commands. overruled: counts others' commands."""
+
+    role = Role.HQ
+    frame_end = staticmethod(sample_end)
+    handled = frozenset({Event, Command, Ignored})
+
+    def __init__(self, options: Options, types: Types, overruled: Count) -> None:
+        super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=HANDSHAKE_S))
+        self.transport = "zenoh"
+        self.outbox = _Dated(self)
+        self.graph = Graph(options, types)
+        self._options = options
+        self._types = types
+        self._overruled = overruled
+        self._node: Node | None = None
+        self._endpoints = 0
+        self._own: dict[tuple[str, Kind], Endpoint] = {}
+        """Our endpoints, by the keys that they read or write."""
+        self._gids: dict[str, bytes] = {}
+        """Our gids, by the keys that we write."""
+        self._numbers: dict[str, int] = {}
+        self._lost, self._lost_at = "", -math.inf
+        """Why the session will end, and since when that is known."""
+        self._velocity = REST
+        self._now = self._heard_at = -math.inf
+        self._time: tuple[int, float] = (0, 0.0)
+        """Unix time of the last frame, and when it came on the session's own time line."""
+        self._robot_time: tuple[int, float] | None = None
+        """The same of the robot's clock, by its last stamp."""
+        self._watch_at = -math.inf
+        self._answers = RateLimit(ANSWERS_HZ)
+
+    # Messages
+
+    def encode(self, message: KeyedSample) -> bytes:
+        return write_sample(message)
+
+    def receive(self, data: bytes, now: float) -> list[Any]:
+        self._now = now
+        return super().receive(data, now)
+
+    def decode(self, frame: bytes) -> Any:
+        sample = read_sample(frame)
+        self._time = sample.stamp_ns, self._now
+        if sample.kind is not SampleKind.SAMPLE:
+            return Event(sample)
+        found = self.graph.keys.get(sample.key)
+        if found is None:
+            raise ProtocolError(f"{sample.key[:200]}: nothing of this robot")
+        wanted, type_name = found
+        gid = read_attachment(sample.attachment).gid
+        if gid == self._gids.get(sample.key):
+            return Ignored()
+        if gid not in self.graph.gids and wanted.heard is not Command:  # robots obey whoever writes
+            raise ProtocolError(f"{wanted.name}: from no publisher that has a token")
+        message = wanted.heard(self._types.decode(type_name, sample.payload))
+        if wanted.heard is not Command:
+            self._heard_at = self._now
+            if self._lost and self.graph.publishers:
+                self._lost = ""
+                self._look()
+            if isinstance(message, LIVE):
+                self._robot_time = message.stamp_ns, self._now
+        return message
+
+    def accept(self, message: Any, now: float) -> bool:
+        if isinstance(message, Event):
+            self._on_event(message.sample)
+            return False
+        if isinstance(message, Command):
+            self._answer(now)
+            return False
+        if isinstance(message, Ignored):
+            return False
+        if self.state is State.HANDSHAKING:
+            self.establish("", self._features())
+            self._look()
+        return True
+
+    # The link and the graph
+
+    def opened(self, now: float) -> None:
+        self.busy = "no word of the router yet"
+
+    def _on_event(self, sample: KeyedSample) -> None:
+        if sample.kind is SampleKind.DROPPED:
+            self.traffic.dropped += sample.count
+        elif sample.kind is SampleKind.OPENED and self._node is None:
+            self._begin(sample.payload.decode("ascii", "replace"))
+        elif sample.kind is SampleKind.OPENED:
+            self._watch_again()
+        elif sample.kind is SampleKind.APPEARED and not self._is_own(sample.key) and not self.graph.knows(sample.key):
+            try:
+                self._appeared(self.graph.appeared(sample.key))
+            finally:
+                self._look()
+        elif sample.kind is SampleKind.GONE and self.graph.gone(sample.key):
+            self._look()
+            if self.state is State.ESTABLISHED and not self.graph.publishers:
+                self._lose("its publishers are gone", self._now)
+
+    def _begin(self, zid: str) -> None:
+        self._node = Node(self._options.domain, zid, 0, self._options.full_namespace, "zbridge")
+        self.send_first(KeyedSample(SampleKind.ANNOUNCE, self._node.token()))
+        for expression in self.graph.watched():
+            self.send_first(KeyedSample(SampleKind.WATCH, expression))
+        self._look()
+
+    def _watch_again(self) -> None:
+        """Ask for tokens again while something is missing: Zenoh may lose the news of some."""
+        if self.busy is not None and self._now >= self._watch_at:
+            self._watch_at = self._now + WATCH_S
+            for expression in self.graph.watched():
+                self.send_first(KeyedSample(SampleKind.WATCH, expression))
+
+    def _is_own(self, token: str) -> bool:
+        return self._node is not None and token.split("/", 3)[2:3] == [self._node.zid]
+
+    def _appeared(self, endpoint: Endpoint) -> None:
+        """Read or write the key of a new endpoint, unless that is done already; show that by a token of our own."""
+        wanted = self.graph.of_topic(endpoint.name)
+        if endpoint.kind is Kind.SUBSCRIBER:
+            self._show(endpoint, Kind.PUBLISHER)
+        if wanted.heard is not Command or not self._options.shared:
+            self._show(endpoint, Kind.SUBSCRIBER, kept=wanted.kept)
+            self.send_first(subscription(endpoint.key, kept=wanted.kept))
+
+    def _show(self, endpoint: Endpoint, kind: Kind, *, kept: bool = False) -> None:
+        if (endpoint.key, kind) in self._own or self._node is None:
+            return
+        self._endpoints += 1
+        qos = KEEP_LAST_10 if kind is Kind.PUBLISHER else LATCHED if kept else SENSOR_DATA
+        own = Endpoint(self._node, self._endpoints, kind, endpoint.name, endpoint.type_name, endpoint.type_hash, qos)
+        self._own[endpoint.key, kind] = own
+        if kind is Kind.PUBLISHER:
+            self._gids[endpoint.key] = own.gid()
+        self.send_first(KeyedSample(SampleKind.ANNOUNCE, own.token()))
+
+    def _features(self) -> tuple[str, ...]:
+        return tuple(sorted({endpoint.name for endpoint in self.graph.publishers.values()}))
+
+    def _look(self) -> None:
+        """Say what is missing, and who else drives."""
+        if self.over:
+            return
+        if self.state is State.ESTABLISHED:
+            self.busy, self.features = self._lost or self.graph.idle_drive, self._features()
+            nodes = sorted({driver.node.full_name[:_SHOWN] for driver in self.graph.drivers.values()})
+            others = f"{', '.join(nodes[:3])} {'publish' if len(nodes) > 1 else 'publishes'} {self.graph.command_topic}"
+            self.doubts = (f"{others} too, and is overruled",) if nodes and not self._options.shared else ()
+        else:
+            self.busy = self.graph.waiting_for
+
+    # Time
+
+    def timers(self) -> float:
+        if self.state is not State.ESTABLISHED:
+            return math.inf
+        return self._lost_at + LAST_S if self._lost else self._heard_at + self._options.silent_s
+
+    def on_timer(self, now: float) -> None:
+        if self._lost:
+            self.close(self._lost, now)
+        else:
+            self._lose(f"nothing came for {self._options.silent_s:g} s", now)
+
+    def _lose(self, reason: str, now: float) -> None:
+        """Take no drives and repeat zeros; end after :data:`LAST_S`: one frame alone may be lost on the way."""
+        self._lost, self._lost_at = reason, now
+        if self.graph.takers and not (self._options.shared and not self.moving):
+            self.drive(REST, now, urgent=True)
+        self._look()
+
+    def close(self, reason: str, now: float) -> None:
+        """Tell the robot to stand still, and end."""
+        if self.state is State.ESTABLISHED and self.graph.takers and not (self._options.shared and not self.moving):
+            self.drive(REST, now, until=now, urgent=True)
+        super().close(reason, now)
+
+    # Commands
+
+    @property
+    def moving(self) -> bool:
+        """Whether the robot was told to move last."""
+        return self._velocity != REST
+
+    def drive(self, velocity: Velocity, now: float, *, until: float | None = None, urgent: bool = False) -> None:
+        """Say how to move at once, then again at ``cmd_vel_hz``; zeros until ``until``, or for :data:`REST_S`.
+
+        Raises NotReady if nobody takes it, EncodeError.
+        """
+        frames = self._commands(velocity)
+        if not frames:
+            raise NotReady(self.graph.idle_drive or "nobody takes commands")
+        if velocity != REST:
+            until = math.inf
+        elif until is None:
+            until = now + REST_S
+        self._velocity = velocity
+        period_s = 1.0 / self._options.cmd_vel_hz
+        self.outbox.set(_DRIVE, frames, now, period_s=period_s, until=until, urgent=urgent)
+
+    def _commands(self, velocity: Velocity) -> tuple[bytes, ...]:
+        """Write a velocity for each type that is taken; :class:`_Dated` completes the frames when they leave."""
+        keys = {taker.key: taker.type_name for taker in self.graph.takers.values()}
+        return tuple(
+            write_sample(KeyedSample(SampleKind.PUT, key, write_twist(self._types, type_name, velocity)))
+            for key, type_name in keys.items()
+        )
+
+    def _answer(self, now: float) -> None:
+        """Say again what we said last: another node has said something else."""
+        if self.state is not State.ESTABLISHED or self._options.shared or not self._answers.take(now):
+            return
+        self._overruled.value += 1
+        until = None if self.moving else now
+        if self.outbox.is_set(_DRIVE):  # zeros of a stop are not cut short
+            until = None
+        if self.graph.takers:
+            self.drive(self._velocity, now, until=until, urgent=not self.moving)
+
+    def dated(self, frame: bytes, now: float) -> bytes:
+        """Complete a command that leaves now: its number, our gid, the time, and the stamp on the robot's clock."""
+        if frame[_KIND_AT] != SampleKind.PUT:
+            return frame
+        sample = read_sample(frame)
+        gid = self._gids[sample.key]
+        number = self._numbers[sample.key] = self._numbers.get(sample.key, 0) + 1
+        sent_ns = self._time[0] + round((now - self._time[1]) * _NS_PER_S)
+        payload = self._stamped(sample, self._robot_stamp(now))
+        attachment = Attachment(number, max(0, sent_ns), gid).encode()
+        return write_sample(KeyedSample(SampleKind.PUT, sample.key, payload, attachment))
+
+    def undated(self, frame: bytes) -> bytes:
+        if frame[_KIND_AT] != SampleKind.PUT:
+            return frame
+        sample = read_sample(frame)
+        return write_sample(KeyedSample(SampleKind.PUT, sample.key, self._stamped(sample, bytes(_STAMP.size))))
+
+    def _stamped(self, sample: KeyedSample, stamp: bytes) -> bytes:
+        """Write a stamp into a command, if its type has one."""
+        if self.graph.keys[sample.key][1] != TWIST_STAMPED:
+            return sample.payload
+        return sample.payload[:_STAMP_AT] + stamp + sample.payload[_STAMP_AT + _STAMP.size :]
+
+    def overdue(self) -> str:
+        return self.graph.waiting_for
+
+    def _robot_stamp(self, now: float) -> bytes:
+        """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
+        if self._robot_time is None:
+            return _STAMP.pack(0, 0)
+        stamp_ns, heard_at = self._robot_time
+        seconds, ns = divmod(stamp_ns + round((now - heard_at) * _NS_PER_S), _NS_PER_S)
+        return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
+
+
+class _Dated(Outbox):
+    """Completes commands as they leave: their numbers and times rise although their frames are repeated."""
+
+    def __init__(self, session: RosRole) -> None:
+        super().__init__(0.0)
+        self._session = session
+
+    def take(self, now: float) -> bytes | None:
+        frame = super().take(now)
+        return self._session.dated(frame, now) if frame is not None else None

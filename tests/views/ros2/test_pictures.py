@@ -10,8 +10,10 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from zbridge.fleet.messages import (
+    Battery,
     Control,
     Device,
+    Image,
     Map,
     Motion,
     Pose,
@@ -242,6 +244,8 @@ def test_every_message_is_written_for_every_distro(distro: str) -> None:
         ("map", Map(1, 1, 1.0, (0, 0), np.zeros((1, 1), np.uint8))),
         ("sensor/front%20left", Reading(1.0, "distance", 1)),
         ("sensor/wheel", Reading(1.0, "rotational", 2)),
+        ("battery", Battery(level=1.0)),
+        ("image", Image("jpeg", b"picture")),
     ]
     shown = {
         name: cdr(made, distro)
@@ -254,3 +258,19 @@ def test_every_message_is_written_for_every_distro(distro: str) -> None:
 
 def test_only_what_is_listened_to_is_made() -> None:
     assert [name for name, _ in robot().make("pose", Pose(0, 0, 0), NOW_NS, {"tf"})] == ["tf"]
+
+
+@pytest.mark.parametrize(("charging", "status"), [(None, 0), (True, 1), (False, 2)])
+def test_a_battery_tells_what_the_robot_tells_and_no_more(charging: bool | None, status: int) -> None:
+    shown = made(robot(), Battery(level=0.5, voltage=24.5, charging=charging, stamp_ns=STAMP_NS))["battery_state"]
+    assert (shown.header.frame_id, stamp(shown.header)) == ("r1/base_link", STAMP_NS)
+    assert (shown.percentage, shown.voltage, shown.power_supply_status, shown.present) == (0.5, 24.5, status, True)
+    unknown = (shown.current, shown.temperature, shown.charge, shown.capacity, shown.design_capacity)
+    assert all(map(math.isnan, unknown))
+
+
+def test_a_picture_is_the_same_bytes() -> None:
+    shown = made(robot(), Image("jpeg", b"\xff\xd8picture\xff\xd9", stamp_ns=STAMP_NS))["image/compressed"]
+    assert (shown.header.frame_id, stamp(shown.header)) == ("r1/camera", STAMP_NS)
+    assert (shown.format, shown.data.tobytes()) == ("jpeg", b"\xff\xd8picture\xff\xd9")
+    assert made(robot(), Image("jpeg", b"")) == {}

@@ -8,7 +8,20 @@ from typing import Any
 import msgspec
 
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, Device, FleetMessage, Map, Motion, Pose, Reading, Scan, Scanner, Status
+from zbridge.fleet.messages import (
+    Battery,
+    Control,
+    Device,
+    FleetMessage,
+    Image,
+    Map,
+    Motion,
+    Pose,
+    Reading,
+    Scan,
+    Scanner,
+    Status,
+)
 from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
 from zbridge.views.ros2.description import urdf
@@ -49,6 +62,8 @@ TOPICS = (
     RosTopic("odom", "nav_msgs/msg/Odometry", KEEP_LAST_10, (topics.POSE.path, topics.MOTION.path)),
     RosTopic("pose", "geometry_msgs/msg/PoseStamped", KEEP_LAST_10, (topics.POSE.path,)),
     RosTopic("imu", "sensor_msgs/msg/Imu", SENSOR_DATA, (topics.MOTION.path,)),
+    RosTopic("battery_state", "sensor_msgs/msg/BatteryState", KEEP_LAST_10, (topics.BATTERY.path,)),
+    RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", SENSOR_DATA, (topics.IMAGE.path,)),
     RosTopic("map", "nav_msgs/msg/OccupancyGrid", LATCHED, (topics.MAP.path,)),
     RosTopic("tf", "tf2_msgs/msg/TFMessage", QoS(depth=100), (topics.POSE.path, topics.MOTION.path), True),
     RosTopic("tf_static", "tf2_msgs/msg/TFMessage", LATCHED, (), True),
@@ -184,6 +199,14 @@ class RobotPictures:
         if "map" in wanted:
             yield "map", self._shapes.occupancy_grid(fleet_map, stamp_ns)
 
+    def _on_battery(self, path: str, battery: Battery, stamp_ns: int, wanted: Container[str]) -> Made:
+        if "battery_state" in wanted:
+            yield "battery_state", self._shapes.battery_state(battery, stamp_ns)
+
+    def _on_image(self, path: str, image: Image, stamp_ns: int, wanted: Container[str]) -> Made:
+        if "image/compressed" in wanted:
+            yield "image/compressed", self._shapes.compressed_image(image, stamp_ns)
+
     def _on_reading(self, path: str, reading: Reading, stamp_ns: int, wanted: Container[str]) -> Made:
         name = self._names.get(topics.unescape(path.rpartition("/")[2]))
         kind = _KINDS.get(reading.kind or "")
@@ -211,6 +234,8 @@ _MAKERS: dict[type[FleetMessage], Callable[[RobotPictures, str, Any, int, Contai
     Pose: RobotPictures._on_pose,
     Motion: RobotPictures._on_motion,
     Map: RobotPictures._on_map,
+    Battery: RobotPictures._on_battery,
+    Image: RobotPictures._on_image,
     Reading: RobotPictures._on_reading,
     Status: RobotPictures._on_status,
     Control: RobotPictures._on_control,

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from zbridge.fleet.messages import Map, Motion, Pose, Reading, Scan, Scanner
+from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
 from zbridge.ros2 import Types
 
 POSITION_VARIANCE = 0.05**2
@@ -32,6 +32,8 @@ _SECOND_NS = 1_000_000_000
 _CELLS = np.array([-1, 0, 100] + [-1] * 253, np.int8)
 """Occupancy by the fleet's cell: unknown, free, occupied."""
 _LONGEST_SCAN_S = 1.0
+_UNKNOWN_STATUS, _CHARGING, _DISCHARGING = 0, 1, 2
+"""``POWER_SUPPLY_STATUS`` of BatteryState."""
 _FIELD_OF_VIEW_RAD, _RANGE_MIN_M, _RANGE_MAX_M = 0.26, 0.0, 10.0
 """Of a distance sensor, which tells neither."""
 
@@ -55,6 +57,11 @@ class Frames(msgspec.Struct, frozen=True):
     def base(self) -> str:
         """The robot, on the ground."""
         return f"{self.prefix}/base_link"
+
+    @property
+    def camera(self) -> str:
+        """The camera."""
+        return f"{self.prefix}/camera"
 
     @property
     def laser(self) -> str:
@@ -194,6 +201,34 @@ class Shapes:
             linear_acceleration_covariance=_not_given() if motion.acceleration is None else np.zeros(9),
         )
 
+    def battery_state(self, battery: Battery, stamp_ns: int) -> Any | None:
+        """Make a BatteryState; NaN is what the robot does not tell."""
+        status = _UNKNOWN_STATUS if battery.charging is None else _CHARGING if battery.charging else _DISCHARGING
+        return self._make(
+            "sensor_msgs/msg/BatteryState",
+            header=self.header(stamp_ns, self.frames.base),
+            voltage=_told(battery.voltage),
+            temperature=math.nan,
+            current=_told(battery.current),
+            charge=math.nan,
+            capacity=math.nan,
+            design_capacity=math.nan,
+            percentage=_told(battery.level),
+            power_supply_status=status,
+            present=True,
+        )
+
+    def compressed_image(self, image: Image, stamp_ns: int) -> Any | None:
+        """Make a CompressedImage of a picture, its bytes as they are."""
+        if not image.data:
+            return None
+        return self._make(
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(stamp_ns, self.frames.camera),
+            format=image.format,
+            data=np.frombuffer(image.data, np.uint8),
+        )
+
     def range_of(self, name: str, reading: Reading, stamp_ns: int) -> Any | None:
         """Make a Range of a distance sensor; a fault is NaN."""
         value = math.nan if reading.fault else reading.value
@@ -266,6 +301,10 @@ def _between_s(scan: Scan, scanner: Scanner | None, period_s: float) -> float:
     between_s = scanner.time_increment_s if scanner is not None and scan.angle_increment > 0 else 0.0
     longest_s = period_s or _LONGEST_SCAN_S
     return between_s if 0.0 < between_s * (len(scan.ranges) - 1) <= longest_s else 0.0
+
+
+def _told(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _is_finite(pose: Pose) -> bool:

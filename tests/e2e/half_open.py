@@ -32,7 +32,7 @@ from tests.e2e.conftest import HOST, until
 from tests.e2e.secure import ROLES, SecureBus, declared
 
 GARBAGE, HALF_OPEN = 1000, 300
-ROUNDS = 5
+ROUNDS = 3
 POSES, POSES_HZ, WARM = 600, 200.0, 50
 """WARM: the first poses, which are slower whatever happens, are not counted."""
 COMES_S = 2.0

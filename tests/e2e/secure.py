@@ -91,7 +91,8 @@ class SecureBus:
     def stop(self) -> None:
         if self._process is not None:
             self._process.terminate()
-            assert self._process.wait(10) == 0
+            code = self._process.wait(10)
+            assert code == 0, f"the router ended with {code}: {self.log()[-2000:]}"
             self._process = None
             (self.folder / "log").unlink()
 

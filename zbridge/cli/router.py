@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import msgspec
@@ -17,6 +18,8 @@ from zbridge.bus.tls.files import folder_tls
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 
+RUNTIME = "(rx: (worker_threads: 2), acc: (worker_threads: 1))"
+"""Threads of Zenoh's in a router: who knocks with garbage keeps the thread busy that accepts, not those that route."""
 HEAD = """\
 // The configuration of a Zenoh router, for `zenohd --config FILE`, as `zbridge router --print-config` prints it.
 // Print it again after every change of roles.toml, and restart the router: Zenoh reads rules at its start only.
@@ -48,6 +51,7 @@ def run_router(
     if print_nftables:
         print(nftables(plan.settings), end="")  # noqa: T201
         return
+    os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
     hear_zenoh(ZenohWarnings().take)
     run_loop(until_signal(Router(plan).run()))
 

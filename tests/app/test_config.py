@@ -54,7 +54,7 @@ def test_a_minimal_file_takes_all_defaults(tmp_path: Path) -> None:
     made = loaded(tmp_path, MINIMAL)
     assert (made.config.robot.name, made.config.robot.realm) == ("r1", "fleet")
     assert (made.device.addresses, made.device.protocol.name) == ((Address("127.0.0.1", 11001),), "tcpudp")
-    assert (made.device.options, made.metrics) == (made.device.protocol.options(), None)
+    assert (made.device.options, made.metrics, made.camera) == (made.device.protocol.options(), None, None)
     control, bus = made.config.control, made.config.bus
     assert (control.lease_s, control.deadman_s, control.rate_hz, control.slew_per_s) == (3.0, 2.0, None, None)
     assert (control.audit, control.audit_bytes, control.audit_files) == (None, 1_000_000, 5)
@@ -147,6 +147,13 @@ audit_days = 7.0
 idle_stop_s = 0.5
 [metrics]
 listen = "127.0.0.1:9100"
+[camera]
+url = "http://[fd00::7]/stream.mjpg?w=640"
+rate_hz = 5.0
+stall_s = 2.5
+relay = "0.0.0.0:8000"
+clients = 4
+allow = ["192.168.1.0/24", "fd00::/8"]
 [[hq]]
 protocol = "tcpudp"
 listen = "tcp://[::1]:0"
@@ -171,6 +178,10 @@ def test_every_key_is_read(tmp_path: Path) -> None:
         values = msgspec.json.decode(msgspec.json.encode(read))
         assert {name: value for name, value in values.items() if name in table} == table
     assert made.metrics == Address("127.0.0.1", 9100)
+    camera, table = made.camera, given["camera"]
+    assert (str(camera.source), camera.source.target) == ("http://[fd00::7]:80/stream.mjpg", "/stream.mjpg?w=640")
+    assert (camera.relay, [str(network) for network in camera.allow]) == (Address("0.0.0.0", 8000), table["allow"])
+    assert msgspec.json.decode(msgspec.json.encode(camera.settings)) == table
     (listener,) = made.listeners
     assert listener.address == Address("::1", 0)
     assert [str(network) for network in listener.allow] == ["10.0.0.0/8", "192.168.1.7/32", "fd00::/8"]
@@ -222,6 +233,7 @@ def secure(**bus: Any) -> dict[str, Any]:
 TLS = {"certificate": "/none.pem", "key": "/key.pem"}
 
 
+URL = "http://192.168.0.10:8000/stream.mjpg"
 INF, NAN = math.inf, math.nan
 NOT_NAMES = ("a/b", "", "@r", "*")
 
@@ -279,6 +291,28 @@ ERRORS: list[tuple[dict[str, Any], str]] = [
     ),
     (serving(hq(listen="tls://a:1", tls=TLS)), "hq[0].tls: certificate '/none.pem' with key '/key.pem': No such file"),
     (serving(hq(), hq(listen="tls://127.0.0.1:11002", tls=TLS)), "hq[1].tls: certificate '/none.pem'"),
+    # The camera
+    ({**serving(hq()), "camera": {"url": URL}}, "camera: expected only where there is a table device"),
+    (minimal(camera={}), "camera.url: missing, it is required"),
+    (minimal(camera={"url": URL, "rate": 5}), "camera.rate = 5: unknown key; expected one of url, rate_hz, stall_s,"),
+    *[
+        (minimal(camera={"url": url}), f"camera.url = {url!r}: expected http://host:port/path")
+        for url in (
+            "",
+            "192.168.0.10:8000",
+            "https://robot/",
+            "http:///x",
+            "http://r:0/",
+            "http://u:p@r/",
+            "http://r/#a",
+        )
+    ],
+    (minimal(camera={"url": "http://r/a\r\nX: y"}), "camera.url = 'http://r/a\\r\\nX: y': expected http://host"),
+    (minimal(camera={"url": "http://r/a b"}), "camera.url = 'http://r/a b': expected http://host:port/path"),
+    (minimal(camera={"url": "http://r:99999/"}), "camera.url = 'http://r:99999/': Port out of range 0-65535; expected"),
+    (minimal(camera={"url": URL, "relay": "8000"}), "camera.relay = '8000': expected host:port"),
+    (minimal(camera={"url": URL, "relay": "a:1", "allow": ["home"]}), "camera.allow[0] = 'home': expected a network"),
+    (minimal(camera={"url": URL, "allow": ["::/0"]}), "camera.allow = ['::/0']: expected only with camera.relay"),
     # The environment
     (serving(hq(listen="tcp://${NONE}:1")), "hq[0].listen = 'tcp://${NONE}:1': expected the environment variable NONE"),
     (device(connect=["${NONE}"]), "device.connect[0] = '${NONE}': expected the environment variable NONE"),

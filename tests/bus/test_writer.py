@@ -46,7 +46,7 @@ class Rig:
     def play(self, steps: str) -> str:
         """Put calls: ``a:7`` a call of size 7, ``status=on`` one under a key; ``fail`` raises. Tell which ask to pause.
 
-        ``hold`` keeps the thread busy until the end, ``end`` ends it.
+        In capitals, the newest of a key. ``hold`` keeps the thread busy until the end, ``end`` ends it.
         """
         paused = []
         for step in steps.split():
@@ -56,7 +56,8 @@ class Rig:
             name, _, size = step.partition(":")
             key, by_key, _ = name.partition("=")
             call = _fail if "fail" in name else lambda name=name: self.written.append(name)
-            goes_on = self.writer.replace(key, call) if by_key else self.writer.put(call, int(size or 1))
+            by = self.writer.newest if name.isupper() else self.writer.replace
+            goes_on = by(key, call) if by_key else self.writer.put(call, int(size or 1))
             paused += [] if goes_on else [name]
         return " ".join(paused)
 
@@ -87,6 +88,7 @@ COURSES = {
     "a large call stays alone": (NEWEST, f"hold a:7 b:{FULL + 1}", "", "b", 7, 0, 0),
     "what was written or forgotten makes room": (NEWEST, f"a:{FULL} hold b:{FULL} c:{FULL}", "", "a c", FULL, 0, 0),
     "lossless, all of a key is written in order": (LOSSLESS, "hold a s=1 s=2 s=3", "", "a s=1 s=2 s=3", 0, 0, 0),
+    "lossless, of an image the newest wins": (LOSSLESS, "hold a I=1 I=2 I=3", "", "I=3 a", 0, 2, 0),
     "beyond the backlog a pause is asked for": (LOSSLESS, f"hold a:{FULL} b c:0 s=1", "b c s=1", "a b c s=1", 0, 0, 1),
     "without a pause there is no relief": (LOSSLESS, f"hold a:{FULL}", "", "a", 0, 0, 0),
     "what failed does not stay in the backlog": (LOSSLESS, f"hold fail:{FULL + 1}", "fail", "", FULL + 1, 0, 1),

@@ -13,7 +13,7 @@ import pytest
 
 from tests.client import Gateway, World, at, settle, subscriptions
 from zbridge.client import Feed
-from zbridge.client.feed import WAITING
+from zbridge.client.feed import WAITING, WAITING_IMAGES
 from zbridge.errors import NotReady
 from zbridge.fleet import messages as fleet
 from zbridge.fleet import payload as payloads
@@ -26,11 +26,13 @@ pytestmark = pytest.mark.jumping
 RANGES, CELLS = np.array([1.5, math.nan, 3.25], np.float32), np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
 SCAN = fleet.Scan(angle_min=-0.5, angle_increment=0.5, range_min=0.1, range_max=4.0, ranges=RANGES)
 MAP = fleet.Map(rows=2, columns=3, cell=0.1, origin=(-1.0, 2.0), cells=CELLS)
+IMAGE = fleet.Image(format="jpeg", data=b"\xff\xd8\xff", width=640, height=480, stamp_ns=7)
 STREAMS: list[tuple[Topic, FleetMessage]] = [
     (topics.SCAN, SCAN),
     (topics.MOTION, fleet.Motion(speed=0.5, acceleration=(1.0, 2.0, 3.0))),
     (topics.POSE, Pose(x=1.0, y=2.0, heading=0.5, stamp_ns=7)),
     (topics.TEXT, Text(text="hello", kind="debug")),
+    (topics.IMAGE, IMAGE),
 ]
 STATES: list[tuple[Topic, FleetMessage]] = [
     (topics.STATUS, Status(state="established", features=("cam",))),
@@ -144,6 +146,16 @@ async def test_a_slow_program_gets_the_newest_and_is_told_how_many_it_lost(world
         world.pose(*range(1, WAITING + 4))
         assert await messages(WAITING) == [at(number) for number in range(4, WAITING + 4)], "the oldest make room"
         assert (world.robot.pose.lost, world.robot.pose.malformed) == (3, 0)
+
+
+async def test_of_images_only_the_newest_wait_for_they_are_large(world: World) -> None:
+    async with reading(world.robot.image) as messages:
+        await settle()
+        publisher = world.bus.publisher(world.robot.image.key_expr, topics.IMAGE)
+        for number in range(5):
+            publisher.put(payloads.encode(fleet.Image(format="jpeg", data=bytes([number]))))
+        assert [image.data for image in await messages(WAITING_IMAGES)] == [b"\3", b"\4"]
+        assert world.robot.image.lost == 3
 
 
 async def test_every_iteration_has_a_queue_of_its_own(world: World) -> None:

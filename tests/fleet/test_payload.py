@@ -48,6 +48,10 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     (m.Switch(on=True), {"on": True}),
     (m.Switch(on=True, stamp_ns=0, seq=0, device_ms=0), {"on": True, "stamp_ns": 0, "seq": 0, "device_ms": 0}),
     (m.Text("hi"), {"text": "hi", "kind": "debug", "sender": None}),
+    (
+        m.Image(format="jpeg", data=b"\xff\xd8\xff", width=640, stamp_ns=5),
+        {"stamp_ns": 5, "format": "jpeg", "data": b"\xff\xd8\xff", "width": 640, "height": None},
+    ),
     (m.Raw(40, b"\x01"), {"id": 40, "body": b"\x01"}),
     (
         m.Status("established", links=(m.LinkStatus(**LINK),)),

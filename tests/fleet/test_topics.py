@@ -9,7 +9,7 @@ from zbridge.fleet import topics
 from zbridge.fleet.topics import Congestion, Delivery, KeySpace, Priority, Topic, escape, find, unescape
 
 TABLE: dict[Delivery, dict[str, type[m.FleetMessage]]] = {
-    Delivery.STREAM: {"scan": m.Scan, "motion": m.Motion, "pose": m.Pose, "text": m.Text}
+    Delivery.STREAM: {"scan": m.Scan, "motion": m.Motion, "pose": m.Pose, "text": m.Text, "image": m.Image}
     | {"sensor/front": m.Reading, "raw/tcpudp": m.Raw},
     Delivery.STATE: {"status": m.Status, "control": m.Control, "scanner": m.Scanner, "map": m.Map}
     | {"lidar": m.Switch, "camera": m.Switch, "devices": m.Devices},
@@ -51,6 +51,7 @@ FIRST = (Priority.REAL_TIME, Congestion.BLOCK, True, False)
     ("topic", "priority", "congestion", "express", "keeps_last"),
     [
         (topics.SCAN, Priority.DATA, Congestion.DROP, False, False),
+        (topics.IMAGE, Priority.DATA, Congestion.DROP, False, False),
         (topics.STATUS, Priority.DATA_HIGH, Congestion.BLOCK, False, True),
         (topics.CMD_DRIVE, Priority.REAL_TIME, Congestion.DROP, True, False),
         *((topic, *FIRST) for topic in (topics.CMD_STOP, topics.CMD_MOTOR("y"), topics.RPC_RENEW)),

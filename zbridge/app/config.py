@@ -21,6 +21,7 @@ import msgspec
 from zbridge.app.toml import convert, read_toml
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
+from zbridge.camera import CameraPlan, CameraSettings, plan_camera
 from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
@@ -56,6 +57,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bus: BusSettings = BusSettings()
     control: ControlSettings = ControlSettings()
     metrics: MetricsSettings | None = None
+    camera: CameraSettings | None = None
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -65,6 +67,7 @@ class Plan(msgspec.Struct, frozen=True):
     device: DevicePlan | None
     listeners: tuple[ListenerPlan, ...] = ()
     metrics: Address | None = None
+    camera: CameraPlan | None = None
 
     @property
     def setup(self) -> dict[str, Any]:
@@ -124,7 +127,10 @@ def plan(raw: dict[str, Any], environment: Mapping[str, str] = os.environ) -> Pl
         if taken[_port(listener.address)] > 1:
             raise ConfigError(f"hq[{number}].listen = {config.hq[number].listen!r}: expected an address of its own")
     metrics = _metrics_address(config.metrics.listen) if config.metrics else None
-    return Plan(config, device, listeners, metrics)
+    camera = plan_camera(config.camera) if config.camera is not None else None
+    if camera is not None and device is None:
+        raise ConfigError("camera: expected only where there is a table device")
+    return Plan(config, device, listeners, metrics, camera)
 
 
 def _device(settings: DeviceSettings) -> DevicePlan:

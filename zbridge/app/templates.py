@@ -52,8 +52,19 @@ stream = "drop"                         # "block": no loss when the bus is slowe
 # tls = { ... }                         # a secure bus: put the [bus] table of `zbridge certs bundle` here instead
 
 """
+CAMERA_TEMPLATE = """\
+# [camera]                              # the robot streams pictures (MJPEG by HTTP): docs/camera.md
+# url = "http://192.168.0.10:8000/stream.mjpg"  # fetched only while somebody watches
+# rate_hz = 30.0                        # most pictures a second on the bus
+# stall_s = 5.0                         # a stream without a picture for so long is ended, and fetched anew
+# relay = "127.0.0.1:8000"              # HQ programs find /stream.mjpg here, all from one connection to the robot
+# clients = 16                          # most of them at a time
+# allow = []                            # networks that they may connect from, ["192.168.1.0/24"]; empty: all
+
+"""
 COMMON_TEMPLATE = (
-    """\
+    CAMERA_TEMPLATE
+    + """\
 # [[hq]]                                # HQ programs connect here as if this were the robot; any number of tables;
 # protocol = "alf"                      # zbridge init --hq PROTOCOL prints all settings
 # listen = "tcp://127.0.0.1:6667"

@@ -90,8 +90,10 @@ class Writer:
 
     def replace(self, key: str, call: Call, size: int = 1) -> bool:
         """Queue a call in place of an older one of the same key; a lossless writer makes every call."""
-        if self._lossless:
-            return self.put(call, size)
+        return self.put(call, size) if self._lossless else self.newest(key, call)
+
+    def newest(self, key: str, call: Call) -> bool:
+        """Queue a call in place of an older one of the same key, of a lossless writer too."""
         with self._lock:
             if self._ended:
                 self._dropped.value += 1

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from zbridge.app import listener_template, load, robot_template, until_signal
+from zbridge.app import listener_template, load, robot_template, together, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
@@ -86,6 +86,9 @@ def check(file: File, tls: FileTls = None) -> None:
         raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:
         parts.append(f"{plan.device.protocol.name} at {', '.join(map(str, plan.device.addresses))}")
+    if plan.camera is not None:
+        relayed = f", relayed at {plan.camera.relay}" if plan.camera.relay is not None else ""
+        parts.append(f"camera at {plan.camera.source}{relayed}")
     parts += [f"{listener.protocol.name} HQ programs at {listener.address}" for listener in plan.listeners]
     parts.append(f"bus as {plan.config.bus.effective_mode}")
     if certificate is not None:
@@ -128,6 +131,7 @@ def simulate(
     dialect: Annotated[str, typer.Option(help="dialect of the protocol, where it has several")] = "",
     udp: Annotated[bool, typer.Option("--udp", help="offer datagrams")] = False,
     fragile: Annotated[bool, typer.Option("--fragile", help="be as fragile as deployed robots")] = False,
+    camera: Annotated[str, typer.Option(help="stream pictures too: HOST:PORT, for example 127.0.0.1:8000")] = "",
     verbose: Verbose = False,
 ) -> None:
     """Simulate a robot, or an HQ program, until SIGTERM or SIGINT."""
@@ -135,6 +139,8 @@ def simulate(
     simulated = find_protocol(protocol)
     if bool(listen) == bool(hq):
         give_up(2, "give either --listen, to be a robot, or --hq, to be an HQ program")
+    if camera and hq:
+        give_up(2, "--camera is a robot's: expected without --hq")
     if hq:
         simulate_hq(simulated, HqSimulation(Address.parse(hq), version or None, dialect or None, udp))
         return
@@ -147,7 +153,19 @@ def simulate(
         fragile,
         lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
     )
-    run_loop(until_signal(simulated.simulate(simulation)))
+    run_loop(until_signal(simulate_robot(simulated, simulation, camera)))
+
+
+async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: str) -> None:
+    """Simulate a robot, and its camera where an address is given, until cancelled."""
+    if not camera:
+        await simulated.simulate(simulation)
+        return
+    from zbridge.simulation.camera import serve_camera
+
+    address = Address.parse(f"tcp://{camera}")
+    work = serve_camera(address, lambda url: print(f"camera at {url}", flush=True))  # noqa: T201
+    await together(simulated.simulate(simulation), work)
 
 
 def simulate_hq(simulated: Protocol, simulation: HqSimulation) -> None:

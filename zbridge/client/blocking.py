@@ -27,6 +27,7 @@ from zbridge.fleet.messages import (
     Control,
     Devices,
     FleetMessage,
+    Image,
     Map,
     Motion,
     Pose,
@@ -187,6 +188,7 @@ class Robot:
         self.motion: Feed[Motion] = Feed(loop, robot.motion)
         self.pose: Feed[Pose] = Feed(loop, robot.pose)
         self.text: Feed[Text] = Feed(loop, robot.text)
+        self.image: Feed[Image] = Feed(loop, robot.image)
         self.status: StateFeed[Status] = StateFeed(loop, robot.status)
         self.scanner: StateFeed[Scanner] = StateFeed(loop, robot.scanner)
         self.map: StateFeed[Map] = StateFeed(loop, robot.map)

@@ -19,6 +19,8 @@ F = TypeVar("F", bound=FleetMessage)
 
 WAITING = 256
 """Messages that may wait for an iterating program; a new one replaces the oldest, which is counted as lost."""
+WAITING_IMAGES = 2
+"""The same of a key with large messages."""
 
 
 class Feed(Generic[T]):
@@ -28,13 +30,22 @@ class Feed(Generic[T]):
     be decoded as their key's message; they are left out.
     """
 
-    def __init__(self, bus: Bus, key_expr: str, read: Callable[[Sample], T], *, history: bool = False) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        key_expr: str,
+        read: Callable[[Sample], T],
+        *,
+        history: bool = False,
+        most_waiting: int = WAITING,
+    ) -> None:
         self.key_expr = key_expr
         self.lost = 0
         self.malformed = 0
         self._bus = bus
         self._read = read
         self._history = history
+        self._most_waiting = most_waiting
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.key_expr}>"
@@ -44,7 +55,7 @@ class Feed(Generic[T]):
         came = asyncio.Event()
 
         def take(sample: Sample) -> None:
-            if len(waiting) >= WAITING:
+            if len(waiting) >= self._most_waiting:
                 waiting.popleft()
                 self.lost += 1
             waiting.append(sample)

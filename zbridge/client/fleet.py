@@ -10,7 +10,7 @@ from typing import Any
 
 from zbridge.bus import Bus, Sample
 from zbridge.client.driver import Driver, default_who, holding
-from zbridge.client.feed import Feed, StateFeed, reader
+from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.settled import settled
 from zbridge.errors import BusError, Malformed, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
@@ -20,6 +20,7 @@ from zbridge.fleet.messages import (
     Control,
     Devices,
     FleetMessage,
+    Image,
     Map,
     Motion,
     Pose,
@@ -209,6 +210,7 @@ class Robot:
         self.motion: Feed[Motion] = self._feed(topics.MOTION)
         self.pose: Feed[Pose] = self._feed(topics.POSE)
         self.text: Feed[Text] = self._feed(topics.TEXT)
+        self.image: Feed[Image] = self._feed(topics.IMAGE)
         self.status: StateFeed[Status] = StateFeed(bus, keys, topics.STATUS)
         self.scanner: StateFeed[Scanner] = StateFeed(bus, keys, topics.SCANNER)
         self.map: StateFeed[Map] = StateFeed(bus, keys, topics.MAP)
@@ -298,7 +300,8 @@ class Robot:
         await self._put(topics.CMD_SENSOR(name), setting)
 
     def _feed(self, topic: Topic) -> Feed[Any]:
-        return Feed(self._bus, self._keys.key(topic.path), reader(topic))
+        most_waiting = WAITING_IMAGES if topic.qos.newest else WAITING
+        return Feed(self._bus, self._keys.key(topic.path), reader(topic), most_waiting=most_waiting)
 
     async def _put(self, topic: Topic, message: FleetMessage) -> None:
         with contextlib.closing(self._bus.publisher(self._keys.key(topic.path), topic)) as publisher:

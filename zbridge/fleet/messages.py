@@ -124,6 +124,15 @@ class Switch(FleetMessage, frozen=True):
     on: bool
 
 
+class Image(FleetMessage, frozen=True):
+    """One picture of a camera. format: ``jpeg``; data: its bytes; width, height: pixels, None where not known."""
+
+    format: str
+    data: bytes
+    width: int | None = None
+    height: int | None = None
+
+
 class Text(FleetMessage, frozen=True):
     """A text for people. kind ``request``: asks programs on the bus for something."""
 

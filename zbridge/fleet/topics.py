@@ -20,6 +20,7 @@ from zbridge.fleet.messages import (
     Devices,
     Drive,
     FleetMessage,
+    Image,
     Map,
     Mode,
     Motion,
@@ -64,12 +65,16 @@ class Priority(Enum):
 
 
 class QoS(msgspec.Struct, frozen=True):
-    """How the bus treats a class of messages."""
+    """How the bus treats a class of messages.
+
+    newest: of a key only the newest message waits where the bus is slower, whatever ``bus.stream`` says.
+    """
 
     priority: Priority
     congestion: Congestion
     express: bool = False
     keeps_last: bool = False
+    newest: bool = False
 
 
 class Topic(msgspec.Struct, frozen=True):
@@ -85,8 +90,8 @@ class Topic(msgspec.Struct, frozen=True):
 
     @property
     def qos(self) -> QoS:
-        """The quality of service. A drive is dropped under congestion: the next one comes soon."""
-        return _DRIVE_QOS if self.message is Drive else QOS[self.delivery]
+        """The quality of service. A drive is dropped under congestion: the next one comes soon. An image is large."""
+        return _SPECIAL_QOS.get(self.message) or QOS[self.delivery]
 
 
 SizeBounds = Sequence[tuple[tuple[str, ...], int]]
@@ -100,7 +105,10 @@ QOS = {
     Delivery.COMMAND: QoS(Priority.REAL_TIME, Congestion.BLOCK, express=True),
     Delivery.QUERY: QoS(Priority.REAL_TIME, Congestion.BLOCK, express=True),
 }
-_DRIVE_QOS = QoS(Priority.REAL_TIME, Congestion.DROP, express=True)
+_SPECIAL_QOS: dict[type[FleetMessage], QoS] = {
+    Drive: QoS(Priority.REAL_TIME, Congestion.DROP, express=True),
+    Image: QoS(Priority.DATA, Congestion.DROP, newest=True),
+}
 
 SMALL_BYTES = 256
 """Bound of a small message: a motion, a switch, a proof."""
@@ -170,6 +178,7 @@ SCAN = Topic("scan", Scan, Delivery.STREAM)
 MOTION = Topic("motion", Motion, Delivery.STREAM)
 POSE = Topic("pose", Pose, Delivery.STREAM)
 TEXT = Topic("text", Text, Delivery.STREAM)
+IMAGE = Topic("image", Image, Delivery.STREAM)
 SENSOR = _family("sensor", Reading, Delivery.STREAM)
 RAW = _family("raw", Raw, Delivery.STREAM)
 
@@ -206,7 +215,7 @@ RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_
 _TOPICS = {
     topic.path: topic
     for topic in (
-        *(SCAN, MOTION, POSE, TEXT, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
+        *(SCAN, MOTION, POSE, TEXT, IMAGE, STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
         *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE),
     )

@@ -49,6 +49,8 @@ class Publishers:
             if last is not None:
                 self._last_values.note(key, last)
             return _StatePublisher(self._session, key, options, self._states, self._last_values)
+        if qos.newest:
+            return _NewestPublisher(self._session, key, options, self._streams)
         if topic.delivery is Delivery.STREAM:
             known = len(self.stream_keys) < STREAM_PUBLISHERS or key in self.stream_keys
             if known:
@@ -114,6 +116,20 @@ class _StreamPublisher(Declared):
             self._writer.put(super().close)
         else:
             super().close()
+
+
+class _NewestPublisher(Declared):
+    """Writes a stream of large messages, always on the writer's thread; of those that wait only the newest is put."""
+
+    def __init__(self, session: zenoh.Session, key: str, options: dict[str, Any], writer: Writer) -> None:
+        self.key = key
+        self.last: bytes | None = None
+        self._writer = writer
+        self._publisher = session.declare_publisher(key, **options)
+        super().__init__(self._publisher)
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        return self._writer.newest(self.key, lambda: self._publisher.put(payload, attachment=attachment))
 
 
 class _StreamKey(_StreamPublisher):

@@ -1,0 +1,169 @@
+"""One robot's camera on the bus: fetches its stream while somebody watches, publishes the images, feeds the relay.
+
+Theory of operation. Two tasks. One waits until somebody watches (:class:`Demand`), fetches the stream until it ends or
+nobody has watched for two seconds, and tries again with a back-off. The other is the relay, if there is one. A fault is
+a condition that ``status`` shows while somebody watches. Whatever the camera does, the robot is served as ever.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+
+from zbridge.bus import Bus
+from zbridge.camera import jpeg
+from zbridge.camera.demand import Demand
+from zbridge.camera.latest import Latest
+from zbridge.camera.mjpeg import MjpegReader, Part
+from zbridge.camera.pace import Pace
+from zbridge.camera.relay import Relay
+from zbridge.camera.settings import CameraPlan
+from zbridge.camera.upstream import fetch
+from zbridge.control.conditions import Conditions
+from zbridge.errors import LinkError, ProtocolError, describe
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Image
+from zbridge.fleet.topics import KeySpace
+from zbridge.metrics import Metrics
+from zbridge.protocol.session_table import Backoff
+
+log = logging.getLogger("zbridge.camera")
+
+STEADY_S = 10.0
+"""A stream that lasted so long was a good one: the next attempt comes soon."""
+RETRY_S = 5.0
+"""Longest time between two attempts, but for jitter: less than the relay's clients wait for a picture."""
+_CONDITION, _RELAY = "camera", "camera relay"
+
+
+class Camera:
+    """One camera; ``run`` serves it. conditions: what ``status`` shows. clock_ns: Unix time, for stamps."""
+
+    def __init__(
+        self,
+        plan: CameraPlan,
+        keys: KeySpace,
+        bus: Bus,
+        metrics: Metrics,
+        conditions: Conditions,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._plan = plan
+        self._key = keys.key(topics.IMAGE.path)
+        self._bus = bus
+        self._conditions = conditions
+        self._clock_ns = clock_ns
+        self._loop = asyncio.get_running_loop()
+        self._demand = demand = Demand()
+        self._latest = latest = Latest()
+        self._relay: Relay | None = None
+        if plan.relay is not None:
+            self._relay = Relay(plan, plan.relay, demand, latest, metrics, lambda text: conditions.set(_RELAY, text))
+        self._publisher = bus.publisher(self._key, topics.IMAGE)
+        self._pace: Pace[tuple[Part, int]] = Pace(plan.settings.rate_hz)
+        self._timer: asyncio.TimerHandle | None = None
+        self._pictures = metrics.count("camera_pictures")
+        self._rejected = metrics.count("camera_not_jpeg")
+        self._dropped = metrics.count("camera_rate_dropped")
+        self._published = metrics.count("camera_published")
+        self._failures = metrics.count("camera_failures")
+
+    def __repr__(self) -> str:
+        return f"<Camera {self._plan.source} {self._demand!r}>"
+
+    async def run(self) -> None:
+        """Serve the camera until cancelled."""
+        watch = self._bus.watch_listeners(self._key, self._demand.listen)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._follow())
+                if self._relay is not None:
+                    tasks.create_task(self._relay.run())
+        finally:
+            self._rest()
+            watch.close()
+            self._publisher.close()
+            for name in (_CONDITION, _RELAY):
+                self._conditions.set(name, None)
+
+    async def _follow(self) -> None:
+        """Fetch the stream whenever somebody watches."""
+        backoff = Backoff(most_s=RETRY_S)
+        while True:
+            if not self._demand.wanted:
+                self._conditions.set(_CONDITION, None)
+            await self._demand.begin()
+            begun = self._loop.time()
+            reason = await self._fetch()
+            self._rest()
+            if self._loop.time() - begun >= STEADY_S:
+                backoff.reset()
+            if reason is None:
+                log.info("camera %s: nobody watches", self._plan.source)
+                continue
+            self._failures.value += 1
+            delay_s = backoff.delay_s()
+            log.info("camera %s: %s; next attempt in %.1f s", self._plan.source, reason, delay_s)
+            self._conditions.set(_CONDITION, f"camera {self._plan.source}: {reason}")
+            await asyncio.sleep(delay_s)
+
+    async def _fetch(self) -> str | None:
+        """Fetch until the stream ends; return why it ended. None: nobody watches any more."""
+        log.info("camera %s: connecting", self._plan.source)
+        fetching = asyncio.create_task(fetch(self._plan.source, self._plan.settings.stall_s, self._take))
+        idle = asyncio.create_task(self._demand.end())
+        try:
+            await asyncio.wait((fetching, idle), return_when=asyncio.FIRST_COMPLETED)
+            error = fetching.exception() if fetching.done() else None
+        finally:
+            for task in (fetching, idle):
+                task.cancel()
+            await asyncio.gather(fetching, idle, return_exceptions=True)
+        if error is None or isinstance(error, LinkError | ProtocolError):
+            return str(error) if error is not None else None
+        log.error("camera %s: %s", self._plan.source, describe(error), exc_info=error)
+        return describe(error)
+
+    def _take(self, stream: MjpegReader, parts: list[Part]) -> None:
+        """Take the parts of one read, of which the newest counts."""
+        self._rejected.value += stream.rejected
+        if not parts:
+            return
+        self._pictures.value += len(parts)
+        self._conditions.set(_CONDITION, None)
+        for part in parts:
+            self._latest.show(stream, part)
+        if self._demand.listened:
+            self._dropped.value += len(parts) - 1
+            self._pace.offer((parts[-1], self._clock_ns()))
+            self._publish()
+
+    def _publish(self) -> None:
+        """Publish the newest picture if it is due, else when it is."""
+        now = self._loop.time()
+        due = self._pace.due(now)
+        self._dropped.value += self._pace.dropped
+        self._pace.dropped = 0
+        if due is not None:
+            part, stamp_ns = due
+            width, height = jpeg.size(part.jpeg) or (None, None)
+            image = Image(format="jpeg", data=part.jpeg, width=width, height=height, stamp_ns=stamp_ns)
+            self._publisher.put(payloads.encode(image))
+            self._published.value += 1
+        deadline = self._pace.deadline()
+        if deadline is not None and self._timer is None:
+            self._timer = self._loop.call_at(deadline, self._on_due)
+
+    def _on_due(self) -> None:
+        self._timer = None
+        self._publish()
+
+    def _rest(self) -> None:
+        """Forget the pictures of a stream that has ended."""
+        self._latest.forget()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None

@@ -1,0 +1,65 @@
+"""Who watches a camera: programs on the bus, and clients of the relay. Nothing is fetched for nobody."""
+
+from __future__ import annotations
+
+import asyncio
+
+LINGER_S = 2.0
+"""Seconds for which the stream is still fetched after the last one who watched has gone: many come back at once."""
+
+
+class Demand:
+    """Tells whether anybody watches, and waits until somebody does or nobody does any more."""
+
+    def __init__(self) -> None:
+        self.listened = False
+        """Whether a program on the bus listens to the images."""
+        self.clients = 0
+        """Clients of the relay that get the stream."""
+        self._changed = asyncio.Event()
+
+    def __repr__(self) -> str:
+        return f"<Demand {'bus' if self.listened else 'no bus'}, {self.clients} clients>"
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody watches."""
+        return self.listened or self.clients > 0
+
+    def listen(self, anybody: bool) -> None:
+        """Note that the first listener on the bus has come, or that the last one has gone."""
+        self.listened = anybody
+        self._tell()
+
+    def join(self) -> None:
+        """Note one more client of the relay; :meth:`leave` must follow."""
+        self.clients += 1
+        self._tell()
+
+    def leave(self) -> None:
+        """Note that a client of the relay has gone."""
+        self.clients -= 1
+        self._tell()
+
+    async def begin(self) -> None:
+        """Wait until somebody watches."""
+        while not self.wanted:
+            await self._change()
+
+    async def end(self) -> None:
+        """Wait until nobody has watched for :data:`LINGER_S`."""
+        while True:
+            while self.wanted:
+                await self._change()
+            try:
+                async with asyncio.timeout(LINGER_S):
+                    await self.begin()
+            except TimeoutError:
+                return
+
+    def _tell(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def _change(self) -> None:
+        await self._changed.wait()

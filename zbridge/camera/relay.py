@@ -1,0 +1,203 @@
+"""Serves ``/stream.mjpg`` to HQ programs from the one stream that is fetched, as if this were the camera.
+
+Deployed programs read multipart naively. So they get what the camera itself wrote: its HTTP head, and of each picture
+the delimiter and header, byte for byte and in their order. Each client has a task of its own that sends the newest
+picture, waits until the socket has taken it, and goes on with the newest then: a slow client sees fewer pictures and
+holds nobody up. Clients are accepted one by one, bounded in number; refused ones are closed at most 100 a second.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import socket
+from collections.abc import Callable
+
+from zbridge.camera.demand import Demand
+from zbridge.camera.latest import Latest
+from zbridge.camera.settings import CameraPlan
+from zbridge.camera.upstream import explain
+from zbridge.metrics import Metrics
+from zbridge.protocol.address import Address
+from zbridge.protocol.session_table import Backoff
+
+log = logging.getLogger("zbridge.camera")
+
+PATH = b"/stream.mjpg"
+REQUEST_S = 5.0
+"""Longest time for a client's request."""
+AWAY_S = 10.0
+"""A client is closed when the camera has shown no picture for so long, as a camera that is gone would close it."""
+SEND_S = 10.0
+"""Longest time in which a client must take one picture."""
+UNSENT_BYTES = 128 * 1024
+"""The kernel's buffer for a client (it doubles the number): what waits there is no longer the newest."""
+WAITING = 16
+"""Clients that wait in the operating system's queue; further ones are refused."""
+_REFUSAL_S = 0.01
+_REQUEST_BYTES = 8192
+_NOT_FOUND = b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n"
+_FORBIDDEN = b"HTTP/1.0 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
+
+
+class Relay:
+    """Listens at ``address`` until cancelled. tell: shows people why it does not listen; None: it does."""
+
+    def __init__(
+        self,
+        plan: CameraPlan,
+        address: Address,
+        demand: Demand,
+        latest: Latest,
+        metrics: Metrics,
+        tell: Callable[[str | None], object],
+    ) -> None:
+        self._address = address
+        self._allow = plan.allow
+        self._most = plan.settings.clients
+        self._demand = demand
+        self._latest = latest
+        self._tell = tell
+        self._clients: set[asyncio.Task[None]] = set()
+        self._accepted = metrics.count("camera_relay_accepted")
+        self._refused = metrics.count("camera_relay_refused")
+        self._sent = metrics.count("camera_relay_pictures")
+        self._skipped = metrics.count("camera_relay_skipped")
+
+    def __repr__(self) -> str:
+        return f"<Relay {self._address}, {len(self._clients)} clients>"
+
+    async def run(self) -> None:
+        """Accept clients until cancelled; where the address is not available, try again."""
+        backoff = Backoff()
+        while True:
+            try:
+                sockets = await _listen(self._address)
+            except OSError as error:
+                self._tell(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
+                await asyncio.sleep(backoff.delay_s())
+                continue
+            self._tell(None)
+            log.info("camera: HQ programs find %s at %s", PATH.decode(), self._address)
+            try:
+                async with asyncio.TaskGroup() as tasks:
+                    for listening in sockets:
+                        tasks.create_task(self._accept(listening))
+            finally:
+                for listening in sockets:
+                    listening.close()
+                await self._end_clients()
+
+    async def _accept(self, listening: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                client, peer = await loop.sock_accept(listening)
+            except OSError as error:  # no descriptor left: an immediate retry would use up the processor
+                log.debug("camera relay: %s", error)
+                await asyncio.sleep(1.0)
+                continue
+            if len(self._clients) >= self._most or not self._allowed(peer[0]):
+                self._refused.value += 1
+                client.close()
+                await asyncio.sleep(_REFUSAL_S)
+                continue
+            self._accepted.value += 1
+            task = asyncio.create_task(self._serve(client))
+            self._clients.add(task)
+            task.add_done_callback(self._clients.discard)
+
+    def _allowed(self, host: str) -> bool:
+        address = ipaddress.ip_address(host.partition("%")[0])
+        address = getattr(address, "ipv4_mapped", None) or address
+        return not self._allow or any(address in network for network in self._allow)
+
+    async def _serve(self, client: socket.socket) -> None:
+        """Answer one client, and give it pictures until it goes or takes none."""
+        with contextlib.suppress(OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            try:
+                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UNSENT_BYTES)
+                reader, writer = await asyncio.open_connection(sock=client, limit=_REQUEST_BYTES)
+            except BaseException:
+                client.close()
+                raise
+            try:
+                async with asyncio.timeout(REQUEST_S):
+                    refusal = _refusal(await reader.readuntil(b"\r\n\r\n"))
+                    if refusal is not None:
+                        writer.write(refusal)
+                        await writer.drain()
+                        writer.close()
+                        await writer.wait_closed()
+                        return
+                await self._give(reader, writer)
+            finally:
+                writer.transport.abort()
+
+    async def _give(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Send pictures until the client ends the connection, or sends more than a request."""
+        writer.transport.set_write_buffer_limits(0)  # drain() returns when the socket has taken all
+        self._demand.join()
+        sending = asyncio.create_task(self._send(writer))
+        leaving = asyncio.create_task(reader.read(1))
+        try:
+            await asyncio.wait((sending, leaving), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._demand.leave()
+            sending.cancel()
+            leaving.cancel()
+            await asyncio.gather(sending, leaving, return_exceptions=True)
+
+    async def _send(self, writer: asyncio.StreamWriter) -> None:
+        number, boundary = 0, None
+        while True:
+            async with asyncio.timeout(AWAY_S):
+                shot = await self._latest.after(number)
+            if boundary is None:
+                boundary = shot.boundary
+                writer.write(shot.answer)
+            elif boundary != shot.boundary:
+                return  # another camera answers now: the client cannot read its parts
+            elif shot.number > number + 1:
+                self._skipped.value += shot.number - number - 1
+            for data in (shot.part.head, shot.part.jpeg, b"\r\n"):
+                writer.write(data)
+            async with asyncio.timeout(SEND_S):
+                await writer.drain()
+            number = shot.number
+            self._sent.value += 1
+
+    async def _end_clients(self) -> None:
+        clients = tuple(self._clients)
+        for task in clients:
+            task.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+
+
+def _refusal(request: bytes) -> bytes | None:
+    """Return the answer to a request that gets no stream; None where it gets one.
+
+    A page of a browser that reads across origins says so with ``Origin``; HQ programs have none.
+    """
+    line, _, fields = request.partition(b"\r\n")
+    method, _, target = line.partition(b" ")
+    path = target.partition(b" ")[0].partition(b"?")[0]
+    if method != b"GET" or path != PATH:
+        return _NOT_FOUND
+    return _FORBIDDEN if b"\r\norigin:" in b"\r\n" + fields.lower() else None
+
+
+async def _listen(address: Address) -> list[socket.socket]:
+    """Listen at every address of the host; raise OSError if one of them is not available."""
+    loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
+    try:
+        for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
+            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
+            listening.setblocking(False)
+    except OSError:
+        for listening in sockets:
+            listening.close()
+        raise
+    return sockets

@@ -1,0 +1,83 @@
+"""Fetches one camera's stream by plain HTTP/1.0 over one connection. Knows no bus and no relay.
+
+HTTP/1.0 asks for the stream as it is: a server must not cut it into chunks. Redirects are not followed: a camera must
+not choose what else this machine asks. Plain sockets suffice for this, and every wait and buffer has a bound here; an
+HTTP library would add a dependency and hide them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+
+from zbridge.camera.mjpeg import MjpegReader, Part
+from zbridge.camera.pace import Budget
+from zbridge.camera.settings import Source
+from zbridge.errors import LinkError
+
+CONNECT_S = 5.0
+"""Longest time until the connection stands."""
+_READ_BYTES = 64 * 1024
+
+Took = Callable[[MjpegReader, list[Part]], None]
+"""Called with the parts of one read, of which there may be none; ``rejected`` counts those of this read left out."""
+
+
+async def fetch(source: Source, stall_s: float, took: Took) -> None:
+    """Fetch a stream and give its pictures until it ends, which always raises: LinkError or ProtocolError.
+
+    A stream that brings no whole picture for ``stall_s`` seconds is ended. One that sends more than a camera does is
+    read more slowly (:class:`Budget`).
+    """
+    reader, writer = await _connect(source)
+    try:
+        writer.write(_request(source))
+        await _read(reader, stall_s, took)
+    except OSError as error:
+        raise LinkError(explain(error)) from error
+    finally:
+        writer.transport.abort()
+
+
+def explain(error: OSError) -> str:
+    """Say why in the operating system's words, on every event loop: ``Connection refused``."""
+    known = error.errno is not None and error.errno > 0 and not isinstance(error, socket.gaierror)
+    return os.strerror(error.errno) if known and error.errno is not None else error.strerror or str(error)
+
+
+async def _connect(source: Source) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            return await asyncio.open_connection(source.host, source.port)
+    except TimeoutError:
+        raise LinkError(f"no connection within {CONNECT_S:g} s") from None
+    except OSError as error:
+        raise LinkError(explain(error)) from error
+
+
+def _request(source: Source) -> bytes:
+    lines = (f"GET {source.target} HTTP/1.0", f"Host: {source.authority}", "User-Agent: zbridge", "", "")
+    return "\r\n".join(lines).encode("ascii")
+
+
+async def _read(reader: asyncio.StreamReader, stall_s: float, took: Took) -> None:
+    loop, mjpeg, budget = asyncio.get_running_loop(), MjpegReader(), Budget()
+    deadline = loop.time() + stall_s
+    while not mjpeg.ended:
+        try:
+            async with asyncio.timeout_at(deadline):
+                data = await reader.read(_READ_BYTES)
+        except TimeoutError:
+            raise LinkError(f"no picture for {stall_s:g} s") from None
+        if not data:
+            break
+        parts = mjpeg.receive(data)
+        rest_s = budget.rest_s(len(data), len(parts) + mjpeg.rejected, loop.time())
+        took(mjpeg, parts)
+        mjpeg.rejected = 0
+        await asyncio.sleep(min(rest_s, stall_s))
+        if parts:
+            deadline = loop.time() + stall_s
+    raise LinkError("the stream ended")

@@ -167,7 +167,12 @@ def wired(name: str, path: Path, links: dict[str, tuple[str, int]]) -> Path:
 CAPTURES: dict[str, tuple[str, dict[str, tuple[str, int]], str, set[str]]] = {
     "tcpudp 1.3 by UDP": ("tcpudp", {"robot": ("tcpudp-1.3-udp.hex", 11001)}, "", {"pose", "map", "text"}),
     "tcpudp 1.1": ("tcpudp", {"robot": ("tcpudp-1.1-tcp.hex", 11001)}, "", {"pose", "map"}),
-    "alf": ("alf", {"vehicle": ("alf-laser.hex", 16667)}, "", {"scan", "scanner"}),
+    "alf by two links": (
+        "alf",
+        {"drive": ("alf-drive.hex", 16668), "laser": ("alf-laser.hex", 16667)},
+        "",
+        {"scan", "scanner"},
+    ),
     "wc2ec": ("wc2ec", {"robot": ("wc2ec-deployed.hex", 27515)}, "", {"devices"}),
 }
 

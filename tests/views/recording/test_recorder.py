@@ -98,7 +98,7 @@ async def test_channels_say_how_their_messages_are_encoded(tmp_path: Path) -> No
         scene.put("fleet/r1/pose", POSE)
         scene.put("fleet/r1/@wire/robot/in", b"\x02\x00")
         scene.put("fleet/r1/@wire/robot/in", b"\x03\x00", b"datagram")
-        scene.put("fleet/r1/image", b"\x80")
+        scene.put("fleet/r1/unknown", b"\x80")
     with scene.path.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -111,7 +111,7 @@ async def test_channels_say_how_their_messages_are_encoded(tmp_path: Path) -> No
         ("fleet/r1/pose", "msgpack", "zbridge.Pose.v1", ()),
         ("fleet/r1/@wire/robot/in", "octet-stream", "", ()),
         ("fleet/r1/@wire/robot/in", "octet-stream", "", (("transport", "datagram"),)),
-        ("fleet/r1/image", "msgpack", "", ()),
+        ("fleet/r1/unknown", "msgpack", "", ()),
     }
     (schema,) = summary.schemas.values()
     assert schema.encoding == "jsonschema"

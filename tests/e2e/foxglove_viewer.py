@@ -118,8 +118,8 @@ class Viewer:
 
 
 @contextlib.contextmanager
-def viewing(port: int, path: str = "/", **options: Any) -> Iterator[Viewer]:
+def viewing(port: int, path: str = "/", scheme: str = "ws", **options: Any) -> Iterator[Viewer]:
     """Connect a viewer; raise InvalidStatus where it is turned away."""
     options = {"compression": None, "max_size": None, "close_timeout": 0.2, "open_timeout": 10, **options}
-    with connect(f"ws://127.0.0.1:{port}{path}", subprotocols=[Subprotocol(SUBPROTOCOL)], **options) as socket:
+    with connect(f"{scheme}://127.0.0.1:{port}{path}", subprotocols=[Subprotocol(SUBPROTOCOL)], **options) as socket:
         yield Viewer(socket)

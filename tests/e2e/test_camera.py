@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import os
 import socket
@@ -16,8 +17,12 @@ import pytest
 import zenoh
 
 from tests.camera.camera_bytes import HEAD, jpeg
-from tests.e2e.conftest import Bench, Fleet, device, free_port, until
+from tests.e2e.conftest import Bench, Fleet, device, end, free_port, until
 from tests.e2e.fake_camera import FakeCamera
+from tests.e2e.foxglove_viewer import viewing
+from tests.views.protobuf import read
+from tests.views.recording import files
+from zbridge.views.pictures import foxglove_schema
 
 HOST = "127.0.0.1"
 
@@ -197,3 +202,28 @@ def test_two_hq_programs_get_what_the_camera_writes_from_one_connection_and_a_th
         viewer.leave()
     ended_for_want_of_viewers(camera)
     assert "camera" not in fleet.reason()
+
+
+def test_pictures_are_recorded_and_shown_to_foxglove_byte_for_byte(bench: Bench, camera: FakeCamera) -> None:
+    with_camera(bench, camera)
+    path, port, picture = bench.folder / "a.mcap", free_port(), jpeg(9, 5000)
+
+    def image(payload: bytes) -> bytes:
+        return base64.b64decode(read(foxglove_schema("CompressedImage"), payload)["data"])
+
+    recorder = bench.zbridge("record", "r1", "-o", str(path), "--connect", bench.endpoint)
+    server = bench.zbridge("foxglove", "--listen", f"{HOST}:{port}", "--connect", bench.endpoint)
+    assert "recording" in recorder.stdout.readline()
+    assert "Foxglove connects" in server.stdout.readline()
+    with viewing(port) as viewer:
+        viewer.subscribe("/r1/image")
+
+        def seen() -> bool:
+            camera.show(picture)
+            return picture in [image(payload) for _, payload in viewer.shown.get("/r1/image", ())]
+
+        viewer.until(seen, "the picture")
+    end(recorder)
+    kept = files.read(path)
+    assert picture in [msgpack.unpackb(data)["data"] for topic, _, _, data in kept if topic == "fleet/r1/image"]
+    assert picture in [image(data) for topic, _, _, data in kept if topic == "/r1/image"]

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import ssl
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
+from tests.certificates import Authority
 from tests.e2e.conftest import HOST, Bench, free_port, until
 from tests.e2e.foxglove_viewer import Viewer, viewing
 from tests.views.foxglove.recordings import BEGIN_NS, record
@@ -184,10 +187,11 @@ def test_switches_are_parameters_that_follow_the_robot(bench: Bench, server: Ser
         other.until(lambda: values(other)["r1.mode"] == "none", "the end of the mode")
 
 
-def test_foreign_origins_and_missing_tokens_are_turned_away(bench: Bench) -> None:
+def test_foreign_origins_and_missing_tokens_are_turned_away_and_counted(bench: Bench) -> None:
     token = bench.folder / "token"
     token.write_text(TOKEN)
-    server = Server(bench, "--connect", bench.endpoint, "--token", str(token), "--drive")
+    metrics = f"{HOST}:{free_port()}"
+    server = Server(bench, "--connect", bench.endpoint, "--token", str(token), "--drive", "--metrics", metrics)
     for path, origin, status in (
         ("/", EVIL, 403),
         (f"/?token={TOKEN}", EVIL, 403),
@@ -200,10 +204,31 @@ def test_foreign_origins_and_missing_tokens_are_turned_away(bench: Bench) -> Non
         assert refused.value.response.status_code == status
     with viewing(server.port, f"/?token={TOKEN}") as viewer:
         viewer.until(lambda: viewer.told, "a greeting")
+    with urlopen(f"http://{metrics}/metrics") as answer:
+        counted = answer.read().decode()
+    assert 'zbridge_foxglove_refused_total{reason="origin"} 2' in counted
+    assert 'zbridge_foxglove_refused_total{reason="token"} 3' in counted
     server.process.send_signal(signal.SIGTERM)
     said = server.process.communicate()[0]
     assert TOKEN not in said
     assert "may drive" in said
+
+
+def test_a_server_with_a_certificate_is_reached_by_tls_alone(bench: Bench) -> None:
+    authority = Authority(bench.folder / "lab")
+    files = authority.issue("server")
+    certificate, key = files / "certificate.pem", files / "key.pem"
+    path = record(bench.folder / "a.mcap", 1)
+    server = Server(bench, str(path), "--tls-certificate", str(certificate), "--tls-key", str(key))
+    trusting = ssl.create_default_context(cafile=authority.ca)
+    with viewing(server.port, scheme="wss", ssl=trusting) as viewer:
+        viewer.subscribe("/r1/pose")
+        viewer.until(lambda: viewer.shown.get("/r1/pose"), "a pose")
+        assert viewer.socket.socket.version() in ("TLSv1.2", "TLSv1.3")
+    with pytest.raises(ssl.SSLCertVerificationError), viewing(server.port, scheme="wss"):
+        pass
+    with pytest.raises((InvalidMessage, ConnectionClosed, ConnectionError)), viewing(server.port):
+        pass
 
 
 def test_hostile_viewers_are_refused_and_ended_and_nothing_moves_or_grows(bench: Bench, server: Server) -> None:

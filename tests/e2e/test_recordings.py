@@ -167,7 +167,12 @@ def wired(name: str, path: Path, links: dict[str, tuple[str, int]]) -> Path:
 CAPTURES: dict[str, tuple[str, dict[str, tuple[str, int]], str, set[str]]] = {
     "tcpudp 1.3 by UDP": ("tcpudp", {"robot": ("tcpudp-1.3-udp.hex", 11001)}, "", {"pose", "map", "text"}),
     "tcpudp 1.1": ("tcpudp", {"robot": ("tcpudp-1.1-tcp.hex", 11001)}, "", {"pose", "map"}),
-    "alf": ("alf", {"vehicle": ("alf-laser.hex", 16667)}, "", {"scan", "scanner"}),
+    "alf by two links": (
+        "alf",
+        {"drive": ("alf-drive.hex", 16668), "laser": ("alf-laser.hex", 16667)},
+        "",
+        {"scan", "scanner"},
+    ),
     "wc2ec": ("wc2ec", {"robot": ("wc2ec-deployed.hex", 27515)}, "", {"devices"}),
 }
 
@@ -200,12 +205,12 @@ def test_replayed_frames_of_a_capture_give_the_messages_that_the_capture_gave(
     given = []
     for number, source in (("1", first), ("2", tmp_path / "r1.mcap")):
         robot, path = f"r{number}", tmp_path / f"r{number}.mcap"
-        recorder = record(bench, path, robot, "--wire", "--only", "fleet")
         replay = bench.zbridge(
             *("replay", str(source), "--as-robot", protocol, "--speed", "4"),
             *(argument for _ in links for argument in ("--listen", f"tcp://{HOST}:0")),
             *(("--robot", "r1") if number == "2" else ()),
         )
+        recorder = record(bench, path, robot, "--wire", "--only", "fleet")  # starts while the replay does
         assert replay.stdout is not None
         ports = [int(replay.stdout.readline().rpartition(":")[2]) for _ in links]
         gateway = bench.gateway(device(ports[0], protocol, options, *ports[1:]), robot=robot)

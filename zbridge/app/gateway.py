@@ -250,30 +250,25 @@ class Gateway:
 
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
-    async def _film(self, bus: Bus) -> None:
-        """Serve the robot's camera where it has one."""
-        if self._plan.camera is None:
-            return
-        from zbridge.camera.camera import Camera
-
-        await Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run()
-
     async def _serve(
         self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None
     ) -> None:
-        """Serve the robot until another gateway has to take it."""
+        """Serve the robot, and its camera, until another gateway has to take it."""
         self._device_served = device
-        serving = asyncio.ensure_future(together(device.run(begin), self._film(bus)))
-        watching = asyncio.ensure_future(ownership.watch(lambda: device.reached, self._rival_teller(device)))
+        work = [device.run(begin), ownership.watch(lambda: device.reached, self._rival_teller(device))]
+        if self._plan.camera is not None:
+            from zbridge.camera.camera import Camera
+
+            work.append(Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run())
+        tasks = [asyncio.ensure_future(each) for each in work]
         try:
-            await asyncio.wait((serving, watching), return_when=asyncio.FIRST_COMPLETED)
-            for task in (serving, watching):
-                if task.done():
-                    task.result()
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
         finally:
-            for task in (serving, watching):
+            for task in tasks:
                 task.cancel()
-            await asyncio.shield(asyncio.gather(serving, watching, return_exceptions=True))
+            await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
             self._device_served = None
             self.conditions.set(_RIVALS, None)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli import run_loop
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
@@ -28,6 +28,8 @@ def run_foxglove(bus: BusSettings, realm: str, file: Path | None, given: dict[st
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     given["who"] = given["who"] or own_name(bus.tls) or "foxglove"
     options: Options = Options(**given)  # type: ignore[arg-type]
+    if options.drive and (role := own_role(bus.tls)) in ("viewer", "recorder"):
+        raise ConfigError(f"--drive: a {role} may not drive: expected the certificate of an operator")
     planned, metrics = plan(options), Metrics()
 
     def ready(front: Front) -> None:

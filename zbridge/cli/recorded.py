@@ -15,7 +15,7 @@ from rich.table import Table
 import zbridge
 from zbridge.app import until_signal
 from zbridge.bus import BusSettings
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli.bus import cell, console, errors, joined
 from zbridge.client.driver import default_who
 from zbridge.errors import ConfigError, ZbridgeError
@@ -36,6 +36,7 @@ from zbridge.views.recording.summary import Summary, summarize
 _LOSSES = 20
 """Keys with losses that are printed."""
 _LEAST_BUFFER = 2**20
+_MARKS_NOT = ("viewer", "recorder")
 _TABLE = 180
 """Characters of a line of a table, at least, also where the terminal has fewer."""
 
@@ -140,7 +141,9 @@ def _tell_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
 
 
 async def put_mark(settings: BusSettings, realm: str, text: str, who: str | None) -> None:
-    """Put a mark on the bus."""
+    """Put a mark on the bus; raise ConfigError for a role that may not: the router would drop it without a word."""
+    if (role := own_role(settings.tls)) in _MARKS_NOT:
+        raise ConfigError(f"a {role} may not mark: expected the certificate of an operator")
     async with joined(settings, realm) as bus:
         await marks.put(bus, realm, text, who or own_name(settings.tls) or default_who())
 

@@ -117,7 +117,10 @@ def replay(
     file: Recorded,
     robot: Annotated[
         list[str] | None,
-        typer.Option(help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay"),
+        typer.Option(
+            help="the new name; of several robots RECORDED=NEW for each. By default all, as NAME-replay; "
+            "with --as-robot: which robot of the recording"
+        ),
     ] = None,
     speed: Annotated[float, typer.Option(help="seconds of the recording per second", min=0.01, max=1000.0)] = 1.0,
     loop: Annotated[bool, typer.Option("--loop", help="begin anew at the end")] = False,

@@ -40,6 +40,7 @@ def foxglove(
         str, typer.Option(help="what drivers are called first: the name of the certificate, else foxglove")
     ] = "",
     viewers: Annotated[int, typer.Option(help="most viewers at a time", min=1, max=1000)] = 32,
+    metrics: Annotated[str, typer.Option(help="host:port at which Prometheus reads the counters")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
@@ -63,6 +64,7 @@ def foxglove(
         "turn_full_radps": turn_full_radps,
         "who": who,
         "viewers": viewers,
+        "metrics": metrics,
     }
     run_foxglove(bus_settings(connect, tls), realm, file, given)
 

@@ -6,7 +6,7 @@ import pytest
 
 from tests.certificates import Authority
 from zbridge.bus import Tls
-from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.member import own_name, own_role
 from zbridge.errors import ConfigError
 
 
@@ -15,6 +15,8 @@ def test_the_name_is_what_follows_the_role_and_nobody_has_one_without_a_certific
     names = {each: authority.issue(each) / "certificate.pem" for each in ("operator.ann", "lab")}
     assert own_name(Tls("ca.pem", str(names["operator.ann"]))) == "ann"
     assert own_name(Tls("ca.pem", str(names["lab"]))) is None
+    assert own_role(Tls("ca.pem", str(names["operator.ann"]))) == "operator"
+    assert own_role(Tls("ca.pem", str(names["lab"]))) is own_role(None) is None
     assert own_name(Tls("ca.pem")) is own_name(None) is None
 
 

@@ -12,6 +12,7 @@ GOOD, SHORT, SPOILED = "a" * 32, "short", "with space and more letters"
 
 REFUSED = [
     (Options(listen="nowhere"), "--listen nowhere: expected host:port"),
+    (Options(metrics="nowhere"), "--metrics nowhere: expected host:port"),
     (Options(listen="0.0.0.0:1"), "--listen 0.0.0.0:1: other machines need --tls-certificate"),
     (Options(listen="0.0.0.0:1", insecure=True, drive=True), "--drive at 0.0.0.0:1: expected --token"),
     (Options(tls_key=Path("key.pem")), "--tls-certificate and --tls-key: expected both"),

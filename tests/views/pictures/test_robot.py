@@ -37,6 +37,7 @@ CHANNELS = [
         },
     ),
     ("map", {"/r1/map": "foxglove.Grid"}),
+    ("image", {"/r1/image": "foxglove.CompressedImage"}),
     ("text", {"/r1/log": "foxglove.Log"}),
     ("status", {"/r1/status": "zbridge.Status.v1", "/r1/log": "foxglove.Log"}),
     ("control", {"/r1/control": "zbridge.Control.v1", "/r1/log": "foxglove.Log"}),
@@ -173,17 +174,20 @@ def test_every_message_that_a_robot_publishes_has_a_schema_of_plain_types() -> N
 NOTHING = [
     (topics.POSE, m.Pose(math.nan, 0.0, 0.0)),
     (topics.POSE, m.Pose(0.0, 0.0, math.inf)),
+    (topics.IMAGE, m.Image("jpeg", b"")),
     (topics.MAP, m.Map(rows=0, columns=2**40, cell=1.0, origin=(0.0, 0.0), cells=np.zeros((0, 2**40), np.uint8))),
 ]
 
 
 @pytest.mark.parametrize(("topic", "message"), NOTHING)
 def test_what_has_no_content_has_no_picture(topic: Topic, message: m.FleetMessage) -> None:
-    assert RobotPictures("r1").draw(topic, message, NOW_NS, {"pose", "map", "trail"}) == []
+    assert RobotPictures("r1").draw(topic, message, NOW_NS, {"pose", "map", "trail", "image"}) == []
 
 
-def test_a_map_and_a_scan_stand_in_the_frames_of_their_robot() -> None:
+def test_a_map_a_scan_and_an_image_stand_in_the_frames_of_their_robot() -> None:
     robot = RobotPictures("r.2")
     (grid,) = robot.draw(topics.MAP, MAP, NOW_NS)
     (scan,) = robot.draw(topics.SCAN, SCAN, NOW_NS, {"scan"})
-    assert [read(drawn.channel.schema, drawn.payload)["frame_id"] for drawn in (grid, scan)] == ["r.2/map", "r.2/scan"]
+    (image,) = robot.draw(topics.IMAGE, m.Image("jpeg", b"\xff\xd8"), NOW_NS)
+    frames = [read(drawn.channel.schema, drawn.payload)["frame_id"] for drawn in (grid, scan, image)]
+    assert frames == ["r.2/map", "r.2/scan", "r.2/base"]

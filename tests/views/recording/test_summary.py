@@ -42,9 +42,9 @@ def test_a_file_that_is_not_there_is_an_error_that_names_it(tmp_path: Path) -> N
 def test_a_configuration_is_kept_without_its_secrets(tmp_path: Path) -> None:
     (tmp_path / "r1.toml").write_text(
         '[robot]\nname = "r1"\n[device]\nconnect = ["tcp://10.0.0.1:1"]\n[device.options]\npassword = "hidden1"\n'
-        'gap_s = 0.01\nurl = "http://me:hidden2@cam/x"\nfrom_environment = "${SECRET}"\n'
+        'gap_s = 0.01\nurl = "http://me:hidden2@cam/x?size=4&token=hidden5"\nfrom_environment = "${SECRET}"\n'
         '[bus]\ntls = { ca = "hidden3", key = "hidden4" }\n'
     )
     kept = describe_configuration(tmp_path / "r1.toml")["configuration"]
     assert "hidden" not in kept
-    assert all(part in kept for part in ("tcp://10.0.0.1:1", "0.01", "${SECRET}", "http://***@cam/x"))
+    assert all(part in kept for part in ("tcp://10.0.0.1:1", "0.01", "${SECRET}", "http://***@cam/x?size=4&token=***"))

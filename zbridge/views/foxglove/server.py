@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Callable
 from pathlib import Path
 
+from zbridge.app.prometheus import serve_metrics
 from zbridge.bus import Bus, BusSettings, open_bus
 from zbridge.client import Fleet
 from zbridge.metrics import Metrics
@@ -55,6 +57,11 @@ async def serve_file(plan: Plan, file: Path, metrics: Metrics, on_ready: Callabl
 async def _serve(plan: Plan, source: Source, metrics: Metrics, on_ready: Callable[[Front], None]) -> None:
     tls = tls_context(*plan.tls) if plan.tls is not None else None
     front = Front(source, plan.address, plan.policy, metrics, tls)
-    async with front.serve():
+    async with front.serve(), _counters(plan, metrics):
         on_ready(front)
         await source.run()
+
+
+def _counters(plan: Plan, metrics: Metrics) -> contextlib.AbstractAsyncContextManager[object]:
+    """Serve the counters to Prometheus, where that was asked for."""
+    return serve_metrics(plan.metrics, metrics) if plan.metrics is not None else contextlib.nullcontext()

@@ -36,6 +36,7 @@ class Options(msgspec.Struct, frozen=True):
     turn_full_radps: Sequence[str] = ()
     who: str = "foxglove"
     viewers: int = 32
+    metrics: str = ""
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -46,11 +47,12 @@ class Plan(msgspec.Struct, frozen=True):
     scales: Scales
     robots: frozenset[str]
     tls: tuple[str, str] | None
+    metrics: Address | None = None
 
 
 def plan(options: Options) -> Plan:
     """Check the options; raise ConfigError, which names the option."""
-    address = _address(options.listen)
+    address = _address("--listen", options.listen)
     if (options.tls_certificate is None) != (options.tls_key is None):
         raise ConfigError("--tls-certificate and --tls-key: expected both")
     tls = (str(options.tls_certificate), str(options.tls_key)) if options.tls_certificate is not None else None
@@ -73,14 +75,15 @@ def plan(options: Options) -> Plan:
         viewers=options.viewers,
         who=options.who,
     )
-    return Plan(address, policy, _scales(options), frozenset(options.robots), tls)
+    metrics = _address("--metrics", options.metrics) if options.metrics else None
+    return Plan(address, policy, _scales(options), frozenset(options.robots), tls, metrics)
 
 
-def _address(text: str) -> Address:
+def _address(option: str, text: str) -> Address:
     try:
         return Address.parse(text if "://" in text else f"tcp://{text}")
     except LinkError as error:
-        raise ConfigError(f"--listen {text}: expected host:port: {error}") from error
+        raise ConfigError(f"{option} {text}: expected host:port: {error}") from error
 
 
 def _is_loopback(host: str) -> bool:

@@ -16,7 +16,7 @@ from foxglove.messages import LogLevel
 
 from zbridge.control.refusal_news import RefusalNews
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, FleetMessage, Map, Pose, Scan, Status, Text
+from zbridge.fleet.messages import Control, FleetMessage, Image, Map, Pose, Scan, Status, Text
 from zbridge.fleet.topics import Topic
 from zbridge.views.pictures import drawing
 from zbridge.views.pictures.schemas import Schema, foxglove_schema, json_schema
@@ -123,6 +123,9 @@ class RobotPictures:
         elif isinstance(message, Map):
             if message.rows and message.columns:
                 yield drawing.grid(message, self._map, stamp_ns)
+        elif isinstance(message, Image):
+            if message.data:
+                yield drawing.compressed_image(message.data, message.format, self._base, stamp_ns)
         else:
             yield _ENCODE(message)
 
@@ -168,7 +171,12 @@ def _is_finite(pose: Pose) -> bool:
 
 _KNOWN = 4096
 """Paths whose channels are remembered."""
-_SHAPES: dict[type[FleetMessage], str] = {Scan: "LaserScan", Pose: "PoseInFrame", Map: "Grid"}
+_SHAPES: dict[type[FleetMessage], str] = {
+    Scan: "LaserScan",
+    Pose: "PoseInFrame",
+    Map: "Grid",
+    Image: "CompressedImage",
+}
 """The Foxglove message of a fleet message; JSON for all others."""
 _ALSO = {"tf": "FrameTransforms", "trail": "SceneUpdate", "log": "Log"}
 """The channels without a key of their own, and their Foxglove messages."""

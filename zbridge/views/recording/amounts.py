@@ -45,10 +45,8 @@ def read_moment(name: str, text: str, begin_ns: int) -> int:
         seconds = int(clock[1] or 0) * 3600 + int(clock[2]) * 60 + float(clock[3])
         return begin_ns + int(seconds * 1e9)
     try:
-        return int(datetime.fromisoformat(text).timestamp() * 1e9) if "T" in text else _after(name, text, begin_ns)
-    except (ValueError, OverflowError) as error:
-        raise ConfigError(f"{name} = {text!r}: {error}") from error
-
-
-def _after(name: str, text: str, begin_ns: int) -> int:
-    return begin_ns + int(read_seconds(name, text) * 1e9)
+        if "T" in text:
+            return int(datetime.fromisoformat(text).timestamp() * 1e9)
+        return begin_ns + int(read_seconds(name, text) * 1e9)
+    except (ValueError, OverflowError, ConfigError) as error:
+        raise ConfigError(f"{name} = {text!r}: expected 12.5, 1:30 or 2026-11-22T05:00:00") from error

@@ -11,6 +11,7 @@ from zbridge.app.toml import read_toml
 
 _SECRET = re.compile(r"pass|secret|token|key|credential|private|auth", re.IGNORECASE)
 _IN_ADDRESS = re.compile(r"(?<=//)[^/@\s]*@")
+_IN_QUERY = re.compile(rf"(?<=[?&;])([^=&#\s]*(?:{_SECRET.pattern})[^=&#\s]*=)[^&;#\s]*", re.IGNORECASE)
 HIDDEN = "***"
 
 
@@ -28,5 +29,5 @@ def without_secrets(value: Any, name: str = "") -> Any:
     if isinstance(value, list):
         return [without_secrets(item) for item in value]
     if isinstance(value, str):
-        return _IN_ADDRESS.sub(f"{HIDDEN}@", value)
+        return _IN_QUERY.sub(rf"\g<1>{HIDDEN}", _IN_ADDRESS.sub(f"{HIDDEN}@", value))
     return value

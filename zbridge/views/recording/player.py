@@ -8,6 +8,7 @@ stands before it is due at once. A pause moves all that follows by its length.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -163,8 +164,9 @@ class Player:
         """Sleep until a moment is due; False where the player ends."""
         while not self._closing:
             with self._lock:
-                wait_s = NAP_S if self._pace.paused else self._pace.due(log_ns) - self._clock()
-            if wait_s <= 0:
-                return True
-            self._sleep(min(wait_s, NAP_S))
+                wait_s = math.inf if self._pace.paused else self._pace.due(log_ns) - self._clock()
+            if wait_s > 0:
+                self._sleep(min(wait_s, NAP_S))
+            if wait_s <= NAP_S and not self._pace.paused:  # another look at the clock would only make it late
+                return not self._closing
         return False

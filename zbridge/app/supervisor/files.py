@@ -100,6 +100,19 @@ def _doubled(file: RobotFile, other: Path) -> RobotFile:
     return msgspec.structs.replace(file, identity=None, fault=fault)
 
 
+def first_look(sources: tuple[Path, ...]) -> list[RobotFile]:
+    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
+    files = [read(path) for path in paths_of(sources)]
+    if not files:
+        raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
+    sound = [file for file in files if file.fault is None]
+    if not sound:
+        raise ConfigError(files[0].fault or "")
+    for file in compare({}, sound).faulty:
+        raise ConfigError(file.fault or "")
+    return files
+
+
 class Follower:
     """Looks at the files again and again; what changed counts when two looks show the same.
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from zbridge.app.host import HostSettings
-from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, paths_of, read
+from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, first_look
 from zbridge.app.supervisor.forks import Forks
 from zbridge.app.supervisor.installation import Stamp
 from zbridge.app.supervisor.notify import Systemd
@@ -329,19 +329,6 @@ class Supervisor:
         restarts = sum(runner.restarts for runner in self._runners.values())
         parts += [f"{restarts} restarts"] * bool(restarts) + [f"{len(self._faults)} faulty files"] * bool(self._faults)
         return ", ".join(parts)
-
-
-def first_look(sources: tuple[Path, ...]) -> list[RobotFile]:
-    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
-    files = [read(path) for path in paths_of(sources)]
-    if not files:
-        raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
-    sound = [file for file in files if file.fault is None]
-    if not sound:
-        raise ConfigError(files[0].fault or "")
-    for file in compare({}, sound).faulty:
-        raise ConfigError(file.fault or "")
-    return files
 
 
 def _become_reaper() -> None:

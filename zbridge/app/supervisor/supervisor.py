@@ -3,7 +3,8 @@
 Theory of operation. The supervisor opens no bus and serves no robot. Its processes are forked by a fork server
 (:mod:`zbridge.app.supervisor.fork_server`) and are its children, since it is the reaper of its descendants. One timer
 watches the beats of all processes: it fires at the earliest deadline, first takes what the processes told meanwhile,
-and kills those that are silent. Each robot has a :class:`Runner`, a task of its own.
+and kills those that are silent. Each robot has a :class:`Runner`, a task of its own. When the installation has changed,
+the supervisor gives its place to the installed code (:mod:`zbridge.app.supervisor.replacement`).
 """
 
 from __future__ import annotations

@@ -167,6 +167,7 @@ async def running() -> AsyncIterator[tuple[Runner, asyncio.Task[None], Post]]:
     assert made.process is not None
     made.process.close()
     task.cancel()
+    await asyncio.wait([task])
     end.close()
 
 
@@ -205,6 +206,7 @@ async def test_a_resumed_runner_waits_for_its_next_process_until_the_same_time()
     assert made.is_calm
     assert made.kept.next_at == at
     task.cancel()
+    await asyncio.wait([task])
 
 
 # The replacement

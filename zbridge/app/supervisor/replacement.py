@@ -87,6 +87,7 @@ async def _rehearse(command: Sequence[str], state: SupervisorState) -> None:
     finally:
         if process.returncode is None:
             process.kill()
+            await process.communicate()
     if process.returncode:
         reason = said.decode(errors="replace").strip().rpartition("\n")[2] or f"exit code {process.returncode}"
         raise HandoverError(f"the installed code does not start: {reason[:300]}")

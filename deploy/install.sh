@@ -162,5 +162,5 @@ install_files
 up zbridge.service "there is a robot in $etc/robots" "$etc/robots/*.toml"
 [ -z "$recorder" ] || up zbridge-recorder.service "the recorder's bundle is in $etc/recorder" "$etc/recorder/key.pem"
 if booted && systemctl is-active --quiet zbridge.service; then
-    say "running gateways keep the version that they were started with: zbridge restart --all"
+    say "what runs keeps the version that it was started with: systemctl reload zbridge, then zbridge restart --all"
 fi

@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import socket
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import pytest
 
 from tests.e2e.conftest import Bench, device, end, start, until
 from tests.e2e.crashes import measure
-from tests.e2e.robots import STOP, Robot
+from tests.e2e.robots import MOVE, STOP, Robot
 from tests.e2e.supervised import Supervised
 
 ROBOTS = 8
@@ -23,17 +25,45 @@ ROBOTS = 8
 class Host:
     """A supervisor and its robots: scripted ones, in this process."""
 
-    def __init__(self, bench: Bench, systemd: socket.socket) -> None:
+    def __init__(self, bench: Bench, systemd: socket.socket, robots: int = ROBOTS, more: str = "") -> None:
         self.bench = bench
         self.folder = bench.folder / "robots"
         self.folder.mkdir()
         self.robots: list[Robot] = []
-        for number in range(ROBOTS):
+        for number in range(robots):
             self.robots.append(bench.stack.enter_context(contextlib.closing(Robot())))
-            self.write(number)
+            self.write(number, more)
         self.systemd = systemd
         environment = {**os.environ, "NOTIFY_SOCKET": str(systemd.getsockname())}
         self.supervisor = Supervised(bench.stack, self.folder, environment=environment)
+
+    def ready(self) -> None:
+        """Wait until all robots are established, and systemd was told."""
+        names = [f"r{number}" for number in range(len(self.robots))]
+        until(lambda: {self.bench.fleet.state(name) for name in names} == {"established"}, 30, "all robots")
+        told = b""
+        while b"READY=1" not in told:
+            told = self.systemd.recv(1000)
+
+    @contextlib.contextmanager
+    def driven(self) -> Iterator[None]:
+        """Drive all robots, again and again, until the block ends."""
+        over, names = threading.Event(), [f"r{number}" for number in range(len(self.robots))]
+        for name in names:
+            self.bench.fleet.hold(name)
+
+        def drive() -> None:
+            while not over.wait(0.05):
+                for name in names:
+                    self.bench.fleet.put(f"{name}/@cmd/drive", forward=0.5)
+
+        thread = threading.Thread(target=drive)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
 
     def write(self, number: int, more: str = "", name: str = "") -> Path:
         """Write the file of a robot."""
@@ -55,20 +85,21 @@ class Host:
 
 
 @pytest.fixture
-def host(bench: Bench) -> Iterator[Host]:
-    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as systemd:
-        systemd.bind(str(bench.folder / "systemd"))
-        systemd.settimeout(20)
-        yield Host(bench, systemd)
+def systemd(bench: Bench) -> Iterator[socket.socket]:
+    with contextlib.closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as mine:
+        mine.bind(str(bench.folder / "systemd"))
+        mine.settimeout(20)
+        yield mine
+
+
+@pytest.fixture
+def host(bench: Bench, systemd: socket.socket) -> Host:
+    return Host(bench, systemd)
 
 
 def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host) -> None:
     fleet, supervisor = host.bench.fleet, host.supervisor
-    names = [f"r{number}" for number in range(ROBOTS)]
-    until(lambda: {fleet.state(name) for name in names} == {"established"}, 30, "all robots")
-    told = b""
-    while b"READY=1" not in told:
-        told = host.systemd.recv(1000)
+    host.ready()
 
     for count, words in enumerate((r"r3: process \d+ goes on with its connections", "r3: next process in"), 1):
         os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # soon after the first crash what was kept is not trusted
@@ -135,3 +166,41 @@ def test_the_gateways_end_in_order_when_the_supervisor_is_killed(host: Host) -> 
     until(lambda: host.supervisor.log.count("the supervisor is gone") == ROBOTS, what="the end of all gateways")
     until(lambda: all(robot.ended for robot in host.robots), what="the end of all connections")
     assert "Traceback" not in host.supervisor.log
+
+
+def test_a_supervisor_goes_on_by_the_installed_code_and_driven_robots_notice_nothing(
+    bench: Bench, systemd: socket.socket
+) -> None:
+    host = Host(bench, systemd, 3, more="[control]\ndeadman_s = 10.0\n")
+    supervisor, robots = host.supervisor, host.robots
+    host.ready()
+    pids = [supervisor.gateway(f"r{number}") for number in range(3)]
+    with host.driven():
+        until(lambda: all(robot.packets(MOVE) for robot in robots), what="the robots drive")
+        since = time.monotonic()
+        for count in (1, 2):  # the code that has taken over is replaced in its turn
+            supervisor.process.send_signal(signal.SIGUSR2)
+            supervisor.reload()  # comes at a moment when nobody may have asked for it yet
+            until(lambda count=count: supervisor.log.count("has taken over in") == count, 30, "the other code")  # type: ignore[misc]
+        taken = time.monotonic()
+        until(lambda: all(robot.packets(MOVE, taken) for robot in robots), what="the robots are driven on")
+        assert not any(robot.packets(STOP, since) for robot in robots)
+        assert host.connections == [1, 1, 1]
+        assert [supervisor.gateway(f"r{number}") for number in range(3)] == pids
+
+        killed = time.monotonic()
+        os.kill(pids[1], signal.SIGKILL)
+        until(lambda: robots[1].packets(STOP, killed), what="the stop over the duplicate")
+        until(
+            lambda: re.search(r"r1: process \d+ goes on with its connections", supervisor.log), 20, "the next process"
+        )
+        os.kill(pids[2], signal.SIGSTOP)
+        until(lambda: "gave no sign of life" in supervisor.log, 20, "the one that hangs")
+        until(lambda: re.search(r"r2: (process \d+ goes on|next process in)", supervisor.log), 20, "the next process")
+    supervisor.gateway("r2", not_pid=pids[2])
+    until(lambda: [bench.fleet.state(f"r{number}") for number in range(3)] == ["established"] * 3, 20, "all robots")
+    assert host.connections[:2] == [1, 1]
+    supervisor.process.send_signal(signal.SIGTERM)
+    bench.ended_within(supervisor.process, 5.0)
+    assert "Traceback" not in supervisor.log, supervisor.log
+    until(lambda: all(robot.ended for robot in robots), what="the end of all connections")

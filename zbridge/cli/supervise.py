@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
 from pathlib import Path
 
 from zbridge.app import until_signal
 from zbridge.app.host import HostSettings, load_host
-from zbridge.app.supervisor.forks import fork_server_command
+from zbridge.app.supervisor.forks import fork_server_command, module_command
+from zbridge.app.supervisor.state import restore
 from zbridge.app.supervisor.supervisor import Supervisor
 from zbridge.cli import set_up_log
 from zbridge.errors import ConfigError
@@ -19,9 +21,42 @@ def supervise(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> None:
     set_up_log(verbose=False)
     if missing := [path for path in paths if not path.exists()]:
         raise ConfigError(f"{missing[0]}: No such file or directory")
-    supervisor = Supervisor(paths, _host(paths), fork_server_command(), watch=watch, verbose=verbose)
+    itself = _itself(paths, watch=watch, verbose=verbose)
+    supervisor = Supervisor(paths, _host(paths), fork_server_command(), watch=watch, verbose=verbose, itself=itself)
+    _run(supervisor)
+
+
+def resume(descriptor: int, *, only_check: bool) -> None:
+    """Go on as a supervisor, in place of the code that left the state behind ``descriptor``.
+
+    only_check: end at once, with an error where the state cannot be taken. Raises HandoverError.
+    """
+    set_up_log(verbose=False)
+    state = restore(descriptor)
+    paths = tuple(map(Path, state.sources))
+    supervisor = Supervisor(
+        paths,
+        HostSettings(stagger_s=state.stagger_s),
+        fork_server_command(),
+        watch=state.watch,
+        verbose=state.verbose,
+        itself=_itself(paths, watch=state.watch, verbose=state.verbose),
+        resumed=state,
+    )
+    if not only_check:
+        os.close(descriptor)
+        _run(supervisor)
+
+
+def _run(supervisor: Supervisor) -> None:
     gc.freeze()
     asyncio.run(until_signal(supervisor.run()))
+
+
+def _itself(paths: tuple[Path, ...], *, watch: bool, verbose: bool) -> list[str]:
+    """Give the command of the installed code that goes on in place of this one; the options are for those who look."""
+    options = ["--watch"] * watch + ["--verbose"] * verbose
+    return [*module_command("zbridge"), "run", *options, *map(str, paths)]
 
 
 def _host(paths: tuple[Path, ...]) -> HostSettings:

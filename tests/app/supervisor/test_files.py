@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from zbridge.app.supervisor.files import Changes, Follower, RobotFile, paths_of, read
-from zbridge.app.supervisor.supervisor import first_look
+from zbridge.app.supervisor.files import Changes, Follower, RobotFile, first_look, paths_of, read
 from zbridge.errors import ConfigError
 
 

@@ -14,6 +14,7 @@ import stat
 from collections.abc import Sequence
 
 from zbridge.app.supervisor.post import close_all
+from zbridge.app.supervisor.state import LinkState
 from zbridge.robot.observer import Boundary, LastStop
 
 log = logging.getLogger("zbridge.app.supervisor")
@@ -38,6 +39,17 @@ class Duplicate:
 
     def __repr__(self) -> str:
         return f"<Duplicate {self.name}>"
+
+    @classmethod
+    def of(cls, state: LinkState) -> Duplicate:
+        """Make one of descriptors that are open already."""
+        duplicate = cls(state.name, drives=state.drives)
+        duplicate.boundary, duplicate._stream, duplicate._datagrams = state.boundary, state.stream, state.datagrams
+        return duplicate
+
+    def state(self, link: int) -> LinkState:
+        """Give what :meth:`of` needs; ``link``: its number."""
+        return LinkState(link, self.name, self.drives, self.boundary, self._stream, self._datagrams)
 
     def take(self, descriptors: Sequence[int]) -> None:
         """Keep descriptors: the stream's first, then the one of datagrams; those before are closed."""
@@ -113,6 +125,15 @@ class Duplicates:
 
     def __len__(self) -> int:
         return len(self._links)
+
+    @property
+    def state(self) -> tuple[LinkState, ...]:
+        """The descriptors and where the streams stand, for :meth:`resume`."""
+        return tuple(duplicate.state(link) for link, duplicate in self._links.items())
+
+    def resume(self, links: Sequence[LinkState]) -> None:
+        """Go on with descriptors that are open already."""
+        self._links.update({each.link: Duplicate.of(each) for each in links})
 
     def opened(self, link: int, name: str, descriptors: Sequence[int], *, drives: bool) -> None:
         """Keep the descriptors of a link; too many links, and what is no socket or line, are closed at once."""

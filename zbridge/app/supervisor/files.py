@@ -11,28 +11,26 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.app.config import Plan, load
+from zbridge.app.config import load
 from zbridge.app.host import robot_files
 from zbridge.errors import ConfigError
 
 
 class RobotFile(msgspec.Struct, frozen=True):
-    """One file as it was read. fault: why nothing can run by it; plan is None then."""
+    """One file as it was read. fault: why nothing can run by it.
+
+    identity: realm and name of the robot; None of a faulty file.
+    """
 
     path: Path
     content: bytes
-    plan: Plan | None = None
+    identity: tuple[str, str] | None = None
     fault: str | None = None
 
     @property
     def robot(self) -> str:
         """The robot's name on the bus; of a faulty file the file's name."""
-        return self.plan.config.robot.name if self.plan is not None else self.path.stem
-
-    @property
-    def identity(self) -> tuple[str, str] | None:
-        """Realm and name of the robot; None of a faulty file."""
-        return (self.plan.config.robot.realm, self.plan.config.robot.name) if self.plan is not None else None
+        return self.identity[1] if self.identity is not None else self.path.stem
 
 
 class Changes(msgspec.Struct, frozen=True):
@@ -61,9 +59,10 @@ def read(path: Path) -> RobotFile:
     except OSError as error:
         return RobotFile(path, b"", fault=f"{path}: {error.strerror or error}")
     try:
-        return RobotFile(path, content, load(path))
+        robot = load(path).config.robot
     except ConfigError as error:
         return RobotFile(path, content, fault=str(error))
+    return RobotFile(path, content, (robot.realm, robot.name))
 
 
 def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Changes:
@@ -98,16 +97,32 @@ def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Cha
 
 def _doubled(file: RobotFile, other: Path) -> RobotFile:
     fault = f"{file.path}: robot.name = {file.robot!r}: expected another name than that of {other}"
-    return msgspec.structs.replace(file, plan=None, fault=fault)
+    return msgspec.structs.replace(file, identity=None, fault=fault)
+
+
+def first_look(sources: tuple[Path, ...]) -> list[RobotFile]:
+    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
+    files = [read(path) for path in paths_of(sources)]
+    if not files:
+        raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
+    sound = [file for file in files if file.fault is None]
+    if not sound:
+        raise ConfigError(files[0].fault or "")
+    for file in compare({}, sound).faulty:
+        raise ConfigError(file.fault or "")
+    return files
 
 
 class Follower:
-    """Looks at the files again and again; what changed counts when two looks show the same."""
+    """Looks at the files again and again; what changed counts when two looks show the same.
 
-    def __init__(self, sources: tuple[Path, ...]) -> None:
+    reported: the faults that are known already.
+    """
+
+    def __init__(self, sources: tuple[Path, ...], reported: Mapping[Path, str | None] | None = None) -> None:
         self._sources = sources
         self._shown: dict[Path, bytes] = {}
-        self._reported: dict[Path, str | None] = {}
+        self._reported = dict(reported or {})
 
     def __repr__(self) -> str:
         return f"<Follower of {', '.join(map(str, self._sources))}>"

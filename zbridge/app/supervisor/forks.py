@@ -7,6 +7,7 @@ import contextlib
 import logging
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from zbridge.app.supervisor.installation import HOME, Stamp
 from zbridge.app.supervisor.messages import Fork, Forked, Message, Ready
 from zbridge.app.supervisor.post import Post, close_all
+from zbridge.app.supervisor.state import ServerState
 from zbridge.errors import NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
@@ -28,22 +30,62 @@ FORK_S = 10.0
 """Longest time for one fork."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """What numpy's libraries must be told, before they are loaded, to start no threads."""
-_NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+SIGNALS = (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM, signal.SIGINT)
+"""What a supervisor is told by signals."""
+NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+
+
+class _Adopted:
+    """A child that the code before this one has started: as much of a ``Popen`` as is needed here."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self._ended = False
+
+    @property
+    def ended(self) -> bool:
+        return self.poll() is not None
+
+    def poll(self) -> int | None:
+        return self._wait(os.WNOHANG)
+
+    def wait(self) -> int | None:
+        return self._wait(0)
+
+    def _wait(self, options: int) -> int | None:
+        if not self._ended:
+            try:
+                self._ended = os.waitpid(self.pid, options)[0] != 0
+            except ChildProcessError:
+                self._ended = True
+        return 0 if self._ended else None
+
+    def kill(self) -> None:
+        if not self._ended:
+            os.kill(self.pid, signal.SIGKILL)
 
 
 class _Server:
     """One running fork server. Answers come in the order of the requests."""
 
-    def __init__(self, command: Sequence[str], stamp: Stamp) -> None:
+    def __init__(self, process: subprocess.Popen[bytes] | _Adopted, post: Post, stamp: Stamp) -> None:
         self.stamp = stamp
+        self.alive = True
+        self._process = process
+        self._post = post
         self._answers: asyncio.Queue[Message | None] = asyncio.Queue()
-        self._post, far = Post.pair()
+        asyncio.get_running_loop().add_reader(post.fileno(), self._hear)
+
+    @classmethod
+    def start(cls, command: Sequence[str], stamp: Stamp) -> _Server:
+        """Start one; raise OSError."""
+        post, far = Post.pair()
         environment = {**os.environ, **ONE_THREAD}
-        for name in _NOT_INHERITED:
+        for name in NOT_INHERITED:
             environment.pop(name, None)
         with far:
             try:
-                self._process = subprocess.Popen(
+                process = subprocess.Popen(
                     [*command, str(far.fileno())],
                     pass_fds=[far.fileno()],
                     stdin=subprocess.DEVNULL,
@@ -51,14 +93,22 @@ class _Server:
                     start_new_session=True,
                 )
             except OSError:
-                self._post.close()
+                post.close()
                 raise
-        self.alive = True
-        asyncio.get_running_loop().add_reader(self._post.fileno(), self._hear)
+        return cls(process, post, stamp)
+
+    @classmethod
+    def resume(cls, state: ServerState) -> _Server:
+        """Go on with one that the code before this one has started."""
+        return cls(_Adopted(state.pid), Post.inherited(state.post), Stamp.of(state.stamp))
 
     @property
     def pid(self) -> int:
         return self._process.pid
+
+    @property
+    def state(self) -> ServerState:
+        return ServerState(self.pid, self._post.fileno(), self.stamp.digest)
 
     async def ready(self) -> None:
         """Wait until it can fork; raise NotReady with the reason if it cannot."""
@@ -125,7 +175,9 @@ class Forks:
         self._server: _Server | None = None
         self._refused: Stamp | None = None
         """The installation whose fork server did not start."""
-        self._leaving: list[_Server] = []
+        self._leaving: list[_Server | _Adopted] = []
+        self.unsettled = False
+        """Whether the installation was being changed when it was looked at last."""
         self._looked_at = -math.inf
         self._turn = asyncio.Lock()
 
@@ -136,6 +188,27 @@ class Forks:
     def pid(self) -> int | None:
         """The process id of the fork server."""
         return self._server.pid if self._server is not None else None
+
+    @property
+    def stamp(self) -> Stamp | None:
+        """The installation that the fork server loaded."""
+        return self._server.stamp if self._server is not None else None
+
+    @property
+    def refused(self) -> bool:
+        """Whether the fork server of the installed code did not start."""
+        return self._refused is not None
+
+    @property
+    def state(self) -> tuple[ServerState | None, tuple[int, ...]]:
+        """The fork server, and the process ids of those before it, for :meth:`resume`."""
+        leaving = tuple(each.pid for each in self._leaving if not each.ended)
+        return self._server.state if self._server is not None and self._server.alive else None, leaving
+
+    def resume(self, server: ServerState | None, leaving: Sequence[int]) -> None:
+        """Go on with the fork server that the code before this one has started."""
+        self._server = _Server.resume(server) if server is not None else None
+        self._leaving = [_Adopted(pid) for pid in leaving]
 
     async def fork(
         self, request: Fork, post: socket.socket, take_over: int | None = None, *, at_once: bool = False
@@ -165,8 +238,11 @@ class Forks:
     async def _renew(self) -> None:
         self._looked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
-        old, stamp = self._server, await asyncio.to_thread(Stamp)
+        old, stamp = self._server, await asyncio.to_thread(_look)
         if old is not None and old.alive:
+            if stamp == old.stamp:
+                self._refused = None
+            self.unsettled = stamp != old.stamp and not stamp.settled
             if stamp == old.stamp or stamp == self._refused or not stamp.settled:
                 return
             log.info("the installation has changed: its code is loaded")
@@ -178,7 +254,7 @@ class Forks:
             self._refused = stamp
             log.error("%s: the code of before goes on", error)
             return
-        self._server = server
+        self._server, self._refused = server, None
         if old is not None:
             old.close()
             self._leaving.append(old)
@@ -190,10 +266,16 @@ class Forks:
                 each.kill()
 
 
+def _look() -> Stamp:
+    """Look at the installation, in a thread that takes no signals of the process: they would be lost at its exec."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    return Stamp()
+
+
 async def _started(command: Sequence[str], stamp: Stamp) -> _Server:
     """Start a fork server and wait until it can fork; raise NotReady with the reason."""
     try:
-        server = _Server(command, stamp)
+        server = _Server.start(command, stamp)
     except OSError as error:
         raise NotReady(f"the fork server did not start: {error.strerror or error}") from error
     try:
@@ -206,5 +288,10 @@ async def _started(command: Sequence[str], stamp: Stamp) -> _Server:
 
 def fork_server_command() -> list[str]:
     """Give the command that starts a fork server of the installed code; its last argument is still missing."""
+    return module_command("zbridge.cli.fork_server")
+
+
+def module_command(module: str) -> list[str]:
+    """Give the command that runs a module of the installed code."""
     here = Path.cwd() == HOME.parent  # the folder is searched for modules then
-    return [sys.executable, *([] if here else ["-P"]), "-m", "zbridge.cli.fork_server"]
+    return [sys.executable, *([] if here else ["-P"]), "-m", module]

@@ -7,6 +7,8 @@ itself, the beats may be late for the same reason, and get a little longer.
 
 from __future__ import annotations
 
+import msgspec
+
 DRIVEN_S = 0.8
 """Longest time without a beat while the robot is driven."""
 IDLE_S = 5.0
@@ -15,6 +17,15 @@ FIRST_S = 30.0
 """Longest time until the first beat: thirty processes that start at once share the processors."""
 EXCUSED_S = 0.2
 """Most that is added for a supervisor that was held up itself."""
+
+
+class HeartState(msgspec.Struct, frozen=True):
+    """What a heart knows, in seconds of the monotonic clock."""
+
+    last: float
+    patience_s: float
+    excused_s: float = 0.0
+    beats: int = 0
 
 
 class Heart:
@@ -28,6 +39,18 @@ class Heart:
 
     def __repr__(self) -> str:
         return f"<Heart {self.beats} beats>"
+
+    @classmethod
+    def of(cls, state: HeartState) -> Heart:
+        """Make a heart that goes on."""
+        heart = cls(state.last)
+        heart._patience_s, heart._excused_s, heart.beats = state.patience_s, state.excused_s, state.beats
+        return heart
+
+    @property
+    def state(self) -> HeartState:
+        """What :meth:`of` needs."""
+        return HeartState(self._last, self._patience_s, self._excused_s, self.beats)
 
     def beat(self, now: float, *, driven: bool) -> None:
         """Note a beat."""

@@ -29,6 +29,7 @@ from zbridge.app.supervisor.messages import (
     WantSuccessor,
 )
 from zbridge.app.supervisor.post import Post, close_all
+from zbridge.app.supervisor.state import ProcessState
 from zbridge.robot.observer import LastStop
 from zbridge.transport import Parcel
 
@@ -70,6 +71,7 @@ class GatewayProcess:
         self.kept = Kept()
         """What a successor needs if the process dies."""
         self._page: mmap.mmap | None = None
+        self._page_descriptor: int | None = None
         self._killed: str | None = None
         self._hung = asyncio.Event()
         self._began = time.monotonic()
@@ -165,14 +167,49 @@ class GatewayProcess:
             case Kept():
                 self.kept = message
             case Shared() if descriptors and self._page is None:
-                with contextlib.suppress(OSError, ValueError):
-                    self._page = mmap.mmap(descriptors[0], PAGE_BYTES, prot=mmap.PROT_READ)
+                self._share(descriptors.pop(0))
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
             case Succeeded():
                 self.succeeded = True
                 self.duplicates.close()
         close_all(descriptors)
+
+    def _share(self, descriptor: int) -> None:
+        try:
+            self._page = mmap.mmap(descriptor, PAGE_BYTES, prot=mmap.PROT_READ)
+        except (OSError, ValueError):
+            os.close(descriptor)
+            return
+        self._page_descriptor = descriptor
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the process has ended, is being ended, or has handed over."""
+        return self.over.done() or self._hung.is_set() or self.told_to_end or self.succeeded
+
+    @property
+    def state(self) -> ProcessState:
+        """What the code that takes the supervisor's place needs to go on, while the process is not over."""
+        return ProcessState(
+            self.pid,
+            self.post.fileno(),
+            self._began,
+            self.heart.state,
+            self.last,
+            self._page_descriptor,
+            self.hands_over,
+            self.kept,
+            self.duplicates.state,
+        )
+
+    def resume(self, state: ProcessState) -> None:
+        """Go on with a process as the code before this one knew it."""
+        self._began, self.heart, self.last = state.began, Heart.of(state.heart), state.last
+        self.hands_over, self.kept = state.hands_over, state.kept
+        self.duplicates.resume(state.links)
+        if state.page is not None:
+            self._share(state.page)
 
     def inheritance(self) -> tuple[Given, Parcel] | None:
         """Give what a successor of this dead process can take over; None where it would read or write half a frame."""
@@ -197,3 +234,6 @@ class GatewayProcess:
         if self._page is not None:
             self._page.close()
             self._page = None
+        if self._page_descriptor is not None:
+            os.close(self._page_descriptor)
+            self._page_descriptor = None

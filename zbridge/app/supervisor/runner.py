@@ -25,6 +25,7 @@ from zbridge.app.supervisor.inheritance import bequeath
 from zbridge.app.supervisor.messages import Fork, Started
 from zbridge.app.supervisor.post import Post
 from zbridge.app.supervisor.process import KILLED_S, GatewayProcess
+from zbridge.app.supervisor.state import RunnerState
 from zbridge.errors import HandoverError, NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
@@ -59,6 +60,11 @@ class Runner:
         self._ending = False
         self._now = asyncio.Event()
         """Set to start the next process without waiting."""
+        self._next_at: float | None = None
+        """When the next process starts, while none runs."""
+        self._restarting = 0
+        self._waits = False
+        """Whether :meth:`run` waits for the end of the process, or for the time of the next."""
 
     def __repr__(self) -> str:
         return f"<Runner {self.file.robot} {self.process}>"
@@ -73,12 +79,42 @@ class Runner:
         """The state of the robot, as on ``status``; ``down``: no process runs."""
         return self.process.last.state if self.process is not None else "down"
 
+    @property
+    def is_calm(self) -> bool:
+        """Whether nothing is under way but a process that runs, or the wait for the next: :attr:`state` is all then."""
+        succeeding = self._successor is not None or not (self._succession is None or self._succession.done())
+        process = self.process
+        over = process.is_over if process is not None else self._now.is_set()
+        return self._waits and not (self._ending or self._restarting or succeeding or over)
+
+    @property
+    def kept(self) -> RunnerState:
+        """What :meth:`resume` needs, of a calm runner."""
+        return RunnerState(
+            str(self.file.path),
+            self.file.content,
+            self.file.identity,
+            self.restarts,
+            self._back_off.failures,
+            self._next_at,
+            self.process.state if self.process is not None else None,
+        )
+
+    def resume(self, state: RunnerState) -> None:
+        """Go on where the code before this one was; then call :meth:`run`."""
+        self.restarts, self._back_off.failures, self._next_at = state.restarts, state.failures, state.next_at
+        if state.process is not None:
+            self.process = self._process(state.process.pid, Post.inherited(state.process.post))
+            self.process.resume(state.process)
+
     async def run(self) -> None:
         """Keep a process running until :meth:`end`."""
+        if self._next_at is not None:
+            await self._wait_until(self._next_at)
         while not self._ending:
-            began = time.monotonic()
+            began = time.monotonic() - (self.process.lived_s if self.process is not None else 0.0)
             try:
-                self.process = await self._start()
+                self.process = self.process or await self._start()
             except NotReady as error:
                 log.error("%s: no process: %s", self.file.robot, error)
             else:
@@ -95,6 +131,13 @@ class Runner:
 
     async def restart(self, file: RobotFile) -> None:
         """Run by a changed file from now on: hand over where the process can, else end it and start another one."""
+        self._restarting += 1
+        try:
+            await self._restart(file)
+        finally:
+            self._restarting -= 1
+
+    async def _restart(self, file: RobotFile) -> None:
         other = file.identity != self.file.identity
         self.file = file
         self._back_off.forget()
@@ -118,15 +161,20 @@ class Runner:
             post.close()
             raise
         log.info("%s: process %d", self.file.robot, pid)
-        process = GatewayProcess(pid, post, wants_successor=self._succeed, changed=self._changed)
+        process = self._process(pid, post)
         if self._ending:
             process.signal(signal.SIGTERM)
         return process
 
+    def _process(self, pid: int, post: Post) -> GatewayProcess:
+        return GatewayProcess(pid, post, wants_successor=self._succeed, changed=self._changed)
+
     async def _keep(self) -> None:
         """Wait for the end of the process, and of its successors; stop the robot if it was no orderly one."""
         while (process := self.process) is not None:
+            self._waits = True
             how = await process.ended()
+            self._waits = False
             successor, self._successor = self._successor, None
             self.process = successor
             self._settled.set()
@@ -194,13 +242,20 @@ class Runner:
 
     async def _wait(self, lived_s: float) -> None:
         """Wait before the next process; not at all where it was asked for."""
+        at = time.monotonic()
         if not self._now.is_set():
             self.restarts += 1
             delay_s = self._back_off.failed(lived_s)
             log.info("%s: next process in %.1f s", self.file.robot, delay_s)
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(delay_s):
-                    await self._now.wait()
+            at += delay_s
+        await self._wait_until(at)
+
+    async def _wait_until(self, at: float) -> None:
+        self._next_at, self._waits = at, True
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(at - time.monotonic()):
+                await self._now.wait()
+        self._next_at, self._waits = None, False
         self._now.clear()
 
     # Handing over

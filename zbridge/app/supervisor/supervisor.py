@@ -3,7 +3,8 @@
 Theory of operation. The supervisor opens no bus and serves no robot. Its processes are forked by a fork server
 (:mod:`zbridge.app.supervisor.fork_server`) and are its children, since it is the reaper of its descendants. One timer
 watches the beats of all processes: it fires at the earliest deadline, first takes what the processes told meanwhile,
-and kills those that are silent. Each robot has a :class:`Runner`, a task of its own.
+and kills those that are silent. Each robot has a :class:`Runner`, a task of its own. When the installation has changed,
+the supervisor gives its place to the installed code (:mod:`zbridge.app.supervisor.replacement`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import asyncio
 import contextlib
 import ctypes
 import logging
+import math
+import os
 import random
 import signal
 import time
@@ -21,12 +24,15 @@ from pathlib import Path
 from typing import Any
 
 from zbridge.app.host import HostSettings
-from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, paths_of, read
+from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, first_look
 from zbridge.app.supervisor.forks import Forks
+from zbridge.app.supervisor.installation import Stamp
 from zbridge.app.supervisor.notify import Systemd
 from zbridge.app.supervisor.process import GatewayProcess
+from zbridge.app.supervisor.replacement import release_signals, replace
 from zbridge.app.supervisor.runner import Runner
-from zbridge.errors import ConfigError, NotReady
+from zbridge.app.supervisor.state import VERSION, SupervisorState
+from zbridge.errors import ConfigError, HandoverError, NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -46,27 +52,49 @@ _PR_SET_CHILD_SUBREAPER = 36
 
 
 class Supervisor:
-    """Runs the gateways of robot files. command: of the fork server. host: how gateways run on this host."""
+    """Runs the gateways of robot files.
+
+    host: how gateways run on this host. command: of the fork server. itself: the command that goes on in place of this
+    code. resumed: what the code before this one left.
+    """
 
     def __init__(
-        self, sources: tuple[Path, ...], host: HostSettings, command: Sequence[str], *, watch: bool, verbose: bool
+        self,
+        sources: tuple[Path, ...],
+        host: HostSettings,
+        command: Sequence[str],
+        *,
+        watch: bool,
+        verbose: bool,
+        itself: Sequence[str] = (),
+        resumed: SupervisorState | None = None,
     ) -> None:
         self._sources = sources
         self._host = host
         self._watch = watch
         self._verbose = verbose
+        self._itself = itself
+        self._resumed = resumed
         self._forks = Forks(command)
-        self._follower = Follower(sources)
+        self._code: Stamp | None = None
+        """The installation that this code is from."""
+        self._refused: Stamp | None = None
+        """The installation whose code has not taken over."""
+        self._forced = False
+        """Set to replace this code though the installation is the same."""
+        self._faults = {Path(path): fault for path, fault in resumed.faults.items()} if resumed is not None else {}
+        self._follower = Follower(sources, self._faults)
         self._systemd = Systemd()
         self._runners: dict[Path, Runner] = {}
         self._leaving: set[Runner] = set()
         """Those whose file is gone, until their process has ended."""
-        self._faults: dict[Path, str] = {}
         self._running: set[asyncio.Task[None]] = set()
         self._timer: asyncio.TimerHandle | None = None
+        self._look_at = math.inf
+        """When the hearts are looked at next."""
         self._told: asyncio.TimerHandle | None = None
         self._reload = asyncio.Event()
-        self._all_started = False
+        self._all_started = self._ends = False
         self._is_ready = False
 
     def __repr__(self) -> str:
@@ -77,13 +105,18 @@ class Supervisor:
 
         Raise ConfigError where two files name one robot, or no file is sound.
         """
-        files = first_look(self._sources)
+        files = first_look(self._sources) if self._resumed is None else []
         loop = asyncio.get_running_loop()
         _become_reaper()
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
         loop.add_signal_handler(signal.SIGHUP, self._reload.set)
+        loop.add_signal_handler(signal.SIGUSR2, self._renew)
         try:
-            await self._start_forks()
+            if self._resumed is not None:
+                self._resume(self._resumed)
+            else:
+                await self._start_forks()
+            self._code = self._forks.stamp
             for task in (self._follow(), self._live()):
                 self._run(task)
             self._look_at_hearts()
@@ -93,8 +126,8 @@ class Supervisor:
             await asyncio.Event().wait()
         finally:
             await asyncio.shield(self._end())
-            loop.remove_signal_handler(signal.SIGCHLD)
-            loop.remove_signal_handler(signal.SIGHUP)
+            for number in (signal.SIGCHLD, signal.SIGHUP, signal.SIGUSR2):
+                loop.remove_signal_handler(number)
 
     async def _start_forks(self) -> None:
         while True:
@@ -105,6 +138,7 @@ class Supervisor:
                 await asyncio.sleep(FORKED_S)
 
     async def _end(self) -> None:
+        self._ends = True
         self._systemd.tell("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
         await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
         for task in self._running:
@@ -128,23 +162,25 @@ class Supervisor:
     # Files
 
     async def _follow(self) -> None:
-        """Follow the files: at SIGHUP, and with ``watch`` every WATCH_S."""
+        """Follow the files and the installation: at SIGHUP, and with ``watch`` every WATCH_S."""
         while True:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WATCH_S if self._watch else None):
+                async with asyncio.timeout(WATCH_S if self._watch or self._forks.unsettled else None):
                     await self._reload.wait()
             asked = self._reload.is_set()
             self._reload.clear()
             if asked:
                 self._systemd.tell("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
             try:
-                running = {path: runner.file for path, runner in self._runners.items()}
-                await self._apply(self._follower.look(running, twice=not asked))
+                if asked or self._watch:
+                    running = {path: runner.file for path, runner in self._runners.items()}
+                    await self._apply(self._follower.look(running, twice=not asked))
                 await self._forks.renew()
             except (ConfigError, NotReady) as error:
                 log.error("%s", error)
             if asked:
                 self._systemd.tell("READY=1")
+            await self._follow_code(asked=asked)
 
     async def _apply(self, changes: Changes, *, first: bool = False) -> None:
         """Start, restart and end what the files ask for; report the faulty ones."""
@@ -168,9 +204,7 @@ class Supervisor:
                 await asyncio.sleep(self._host.stagger_s * random.uniform(1 - JITTER, 1 + JITTER))
             if not first:
                 log.info("%s: is new", file.path)
-            self._runners[file.path] = runner = Runner(
-                file, self._forks, verbose=self._verbose, changed=self._state_changed
-            )
+            self._runners[file.path] = runner = self._runner(file)
             self._run(runner.run())
         self._state_changed()
 
@@ -179,7 +213,66 @@ class Supervisor:
         await runner.end()
         self._leaving.discard(runner)
 
+    # Its own code
+
+    def _renew(self) -> None:
+        """Do what SIGUSR2 asks for."""
+        self._forced = True
+        self._reload.set()
+
+    async def _follow_code(self, *, asked: bool) -> None:
+        """Replace this code if the fork server's is of another installation; log why where that is not possible."""
+        stamp, forced, self._forced = self._forks.stamp, self._forced, False
+        if not forced and (stamp == self._code or (stamp == self._refused and not asked)):
+            return
+        try:
+            if self._forks.refused:
+                raise HandoverError("the installed code's fork server does not start")
+            await replace(self._itself, self._snapshot)
+        except HandoverError as error:
+            self._refused = stamp
+            log.error("the supervisor goes on with the code of before: %s", error)
+
+    def _snapshot(self) -> SupervisorState | None:
+        """Give all that the code in place of this one needs; None while something is under way."""
+        runners = self._runners.values()
+        if self._ends or self._leaving or not self._all_started or not all(runner.is_calm for runner in runners):
+            return None
+        server, leaving = self._forks.state
+        return SupervisorState(
+            VERSION,
+            tuple(map(str, self._sources)),
+            at=time.monotonic(),
+            look_at=self._look_at,
+            watch=self._watch,
+            verbose=self._verbose,
+            stagger_s=self._host.stagger_s,
+            is_ready=self._is_ready,
+            runners=tuple(runner.kept for runner in runners),
+            server=server,
+            leaving=leaving,
+            faults={str(path): fault for path, fault in self._faults.items()},
+        )
+
+    def _resume(self, state: SupervisorState) -> None:
+        """Go on where the code before this one was."""
+        for number in state.descriptors:
+            os.set_inheritable(number, False)
+        self._forks.resume(state.server, state.leaving)
+        self._is_ready, self._look_at = state.is_ready, state.look_at
+        for each in state.runners:
+            file = RobotFile(Path(each.path), each.content, each.identity)
+            self._runners[file.path] = runner = self._runner(file)
+            runner.resume(each)
+            self._run(runner.run())
+        release_signals()
+        taken_ms = (time.monotonic() - state.at) * 1000
+        log.info("the installed code has taken over in %.0f ms: %s", taken_ms, self.status)
+
     # Processes
+
+    def _runner(self, file: RobotFile) -> Runner:
+        return Runner(file, self._forks, verbose=self._verbose, changed=self._state_changed)
 
     def _processes(self) -> Iterator[GatewayProcess]:
         for runner in (*self._runners.values(), *self._leaving):
@@ -192,7 +285,7 @@ class Supervisor:
     def _look_at_hearts(self) -> None:
         """Kill every process that has been silent for too long; look again at the next deadline."""
         loop, now = asyncio.get_running_loop(), time.monotonic()
-        late_s = now - self._timer.when() if self._timer is not None else 0.0
+        late_s = now - self._look_at
         deadlines = [now + 1.0]
         for process in tuple(self._processes()):
             process.hear()
@@ -203,7 +296,8 @@ class Supervisor:
                 process.kill(f"gave no sign of life for {process.heart.silent_s(now):.1f} s")
             elif not process.over.done():
                 deadlines.append(process.heart.deadline)
-        self._timer = loop.call_at(max(now + 0.01, min(deadlines)), self._look_at_hearts)
+        self._look_at = max(now + 0.01, min(deadlines))
+        self._timer = loop.call_at(self._look_at, self._look_at_hearts)
 
     # systemd
 
@@ -236,19 +330,6 @@ class Supervisor:
         restarts = sum(runner.restarts for runner in self._runners.values())
         parts += [f"{restarts} restarts"] * bool(restarts) + [f"{len(self._faults)} faulty files"] * bool(self._faults)
         return ", ".join(parts)
-
-
-def first_look(sources: tuple[Path, ...]) -> list[RobotFile]:
-    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
-    files = [read(path) for path in paths_of(sources)]
-    if not files:
-        raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
-    sound = [file for file in files if file.fault is None]
-    if not sound:
-        raise ConfigError(files[0].fault or "")
-    for file in compare({}, sound).faulty:
-        raise ConfigError(file.fault or "")
-    return files
 
 
 def _become_reaper() -> None:

@@ -184,7 +184,7 @@ async def logged(lab: Lab, case: Case, caplog: pytest.LogCaptureFixture) -> bool
     except ConfigError as error:
         return case.said in str(error) or str(error)
     running = asyncio.create_task(Gateway(plan).run())
-    patience = Patience(WAIT_S)
+    patience = Patience(4 * WAIT_S)  # the third attempt asks the router
     while case.said not in caplog.text and not patience.over:  # noqa: ASYNC110 - a log, no event
         await asyncio.sleep(0.05)
     running.cancel()

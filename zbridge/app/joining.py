@@ -7,6 +7,7 @@ Zenoh's session would knock with an expired certificate every 4 s for good, and 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import random
 from collections.abc import Callable
@@ -27,6 +28,9 @@ RETRY_S = 1.0
 """Seconds between attempts to open the bus, while no router is there."""
 OPEN_MOST_S = 4.0
 """Longest time that an attempt is given; a process that ends waits for the attempt."""
+EXPLAIN_FROM, EXPLAIN_EVERY = 2, 10
+"""The third attempt that fails, and every tenth after it, asks the router why: a thousand that ask would keep it from
+letting them in."""
 RARELY_S = 60.0
 """Longest time between two attempts after refusals: each costs the router, and with it everybody, 0.1 s."""
 LOOK_S = 3600.0
@@ -55,6 +59,11 @@ class Pauses:
     def __repr__(self) -> str:
         return f"<Pauses after {self._refused} refusals>"
 
+    @property
+    def refused(self) -> bool:
+        """Whether the last error was a refusal."""
+        return self._refused > 0
+
     def after(self, error: BusError) -> float:
         """Return the seconds to wait after this error."""
         if not isinstance(error, BusRefused):
@@ -71,7 +80,7 @@ async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
     A thousand others may wait for the same router: attempts are given more time, and come at other times than theirs.
     """
     robot, pauses, within_s = plan.config.robot, Pauses(), OPEN_S
-    while True:
+    for failures in itertools.count():
         try:
             return await open_bus(
                 plan.config.bus,
@@ -80,12 +89,14 @@ async def join_bus(plan: Plan, metrics: Metrics) -> Bus:
                 within_s=within_s,
                 realm=robot.realm,
                 robot=robot.name,
+                explain=pauses.refused or failures % EXPLAIN_EVERY == EXPLAIN_FROM,
             )
         except BusError as error:
             within_s = min(2 * within_s, OPEN_MOST_S)
             pause = pauses.after(error)
             log.warning("no bus: %s; next attempt in %.2g s", error, pause)
             await asyncio.sleep(pause)
+    raise AssertionError("it tries for ever")
 
 
 async def watch_certificate(

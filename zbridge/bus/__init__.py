@@ -62,6 +62,7 @@ async def open_bus(
     realm: str | None = None,
     robot: str | None = None,
     timestamps: bool = False,
+    explain: bool = True,
 ) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
 
@@ -81,6 +82,7 @@ async def open_bus(
         realm=realm,
         robot=robot,
         timestamps=timestamps,
+        explain=explain,
     )
 
 

@@ -42,11 +42,16 @@ class Finding(msgspec.Struct, frozen=True):
     refused: bool = True
 
 
-async def why_not(settings: BusSettings) -> Finding | None:
-    """Say why none of the endpoints could be connected to; None where nothing is found to be wrong."""
+async def why_not(settings: BusSettings, *, ask: bool = True) -> Finding | None:
+    """Say why none of the endpoints could be connected to; None where nothing is found to be wrong.
+
+    ask: connect to them; else only our own files are looked at. A router pays for each connection that says nothing.
+    """
     local = own_fault(settings.tls)
     if local is not None:
         return Finding(local)
+    if not ask:
+        return None
     endpoints = settings.connect[:_MOST]
     findings = await asyncio.gather(*(_on_thread(ask_endpoint, at, settings.tls) for at in endpoints))
     found = [each for each in findings if each is not None]

@@ -112,13 +112,16 @@ def in_short(error: zenoh.ZError) -> str:
     return _ORIGIN.sub("", str(error))
 
 
-async def open_or_say_why(config: zenoh.Config, settings: BusSettings) -> zenoh.Session:
-    """Open a session; raise BusError, which says which case it is where that can be found."""
+async def open_or_say_why(config: zenoh.Config, settings: BusSettings, *, explain: bool = True) -> zenoh.Session:
+    """Open a session; raise BusError, which says which case it is where that can be found.
+
+    explain: whether the router may be asked; else only our own files are looked at.
+    """
     try:
         return await open_session(config)
     except BusError as error:
         # Others open without a connection: what failed is something else, an address to listen at.
-        finding = await why_not(settings) if settings.effective_mode == "client" else None
+        finding = await why_not(settings, ask=explain) if settings.effective_mode == "client" else None
         if finding is None:
             raise
         raise (BusRefused if finding.refused else BusError)(finding.text) from error

@@ -57,12 +57,13 @@ async def open_zenoh(
     realm: str | None = None,
     robot: str | None = None,
     timestamps: bool = False,
+    explain: bool = True,
 ) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
     config = zenoh_config(
         settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
-    session = await open_or_say_why(config, settings)
+    session = await open_or_say_why(config, settings, explain=explain)
     bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
     certificate = own_certificate(settings.tls)
     if certificate is not None and realm is not None:

@@ -41,6 +41,7 @@ def test_a_strict_robot_finds_nothing_to_complain_of_in_a_restart_while_it_is_dr
         assert gateway.ask() == [{}], gateway.gateway.log
     assert bench.fleet.state() == "established"
     until(lambda: bench.fleet.last("r1/control").get("state") == "free", what="the new authority")
+    time.sleep(0.5)  # the stop is on its way to the motors
     report = robot.ended()
     assert charges(report["violations"]) == []
     assert report["alive"]

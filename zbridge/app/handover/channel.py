@@ -22,6 +22,8 @@ M = TypeVar("M")
 
 MESSAGE_BYTES = 64 * 2**20
 """Bound of a message: a state with the largest map takes 4 MB."""
+LAST_WORD_S = 0.2
+"""Seconds for what the other side said before it took nothing any more."""
 SEND_S = 5.0
 """Longest time that a message may take to be sent."""
 _GROUP = 200
@@ -71,6 +73,8 @@ class Channel:
             for start in range(0, len(descriptors), _GROUP):
                 socket.send_fds(self._socket, [b"."], descriptors[start : start + _GROUP])
         except OSError as error:
+            with contextlib.suppress(EndError):
+                self._receive(Failed, LAST_WORD_S)  # it may have said why it ends
             raise HandoverError(f"the other side takes nothing: {error}") from error
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:

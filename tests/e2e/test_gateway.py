@@ -93,7 +93,7 @@ def test_a_second_gateway_leaves_the_robot_alone_when_the_router_dies_too_and_ta
     time.sleep(1.5)
     assert robot.connections == 1
     end(first.process, signal.SIGKILL)
-    until(lambda: robot.connections == 2, what="the second gateway's connection")
+    until(lambda: robot.connections == 2, timeout_s=40.0, what="the second gateway's connection")
     until(lambda: bench.fleet.tokens() == ["fleet/r1/@alive/gateway"], what="the second gateway's token")
     until(lambda: bench.fleet.state() == "established", what="established")
     bench.fleet.session.close()

@@ -42,6 +42,7 @@ def test_a_robot_is_recorded_with_its_commands_refusals_marks_and_frames(bench: 
     assert bench.zbridge("mark", "here", "--who", "me", "--connect", bench.endpoint).wait(timeout=30) == 0
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     bench.fleet.hold(who="op1")
+    until(lambda: bench.fleet.last("r1/control").get("holder") == "op1", what="the holder")
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: bench.fleet.last("r1/pose"), what="pose")
     until(lambda: bench.fleet.refusal(code="no_lease"), what="refusal")

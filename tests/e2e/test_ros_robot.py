@@ -108,7 +108,7 @@ def test_strangers_are_counted_and_move_nothing(tmp_path: Path, stack: contextli
         counters = table["sessions"][0]["counters"]
         return int(counters["malformed"] + counters["dropped"])
 
-    until(lambda: counted() >= 2000, what="counted")
+    until(lambda: counted() >= 2000, 40.0, what="counted")
     assert fleet.state() == "established"
     with scene.driven():
         pass

@@ -7,7 +7,6 @@ expected.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import re
 from collections import Counter
@@ -26,8 +25,8 @@ from zbridge.control.settings import ControlSettings
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
 from zbridge.hq import HqSettings, ListenerPlan
-from zbridge.hq.settings import Network
 from zbridge.protocol.address import Address, DeviceAddress
+from zbridge.protocol.networks import parse_networks
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.robot.settings import DevicePlan, DeviceSettings
 from zbridge.transport import server_context
@@ -152,7 +151,7 @@ def _listener(settings: HqSettings, key: str) -> ListenerPlan:
     if settings.name is not None and not is_name(settings.name):
         raise ConfigError(f"{key}.name = {settings.name!r}: expected letters, digits, '_', '.' and '-' only")
     options = convert(settings.options, protocol.hq_options, f"{key}.options.")
-    allow = tuple(_network(f"{key}.allow[{number}]", text) for number, text in enumerate(settings.allow))
+    allow = parse_networks(f"{key}.allow", settings.allow)
     address = _listener_address(f"{key}.listen", settings.listen)
     return ListenerPlan(protocol, options, address, settings, allow, _listener_tls(key, settings, address))
 
@@ -181,13 +180,6 @@ def _protocol(prefix: str, name: str) -> Protocol:
         return find_protocol(name)
     except ConfigError as error:
         raise ConfigError(f"{prefix}{error}") from error
-
-
-def _network(key: str, text: str) -> Network:
-    try:
-        return ipaddress.ip_network(text)
-    except ValueError as error:
-        raise ConfigError(f"{key} = {text!r}: expected a network like '192.168.1.0/24': {error}") from error
 
 
 def _listener_address(key: str, text: str) -> Address:

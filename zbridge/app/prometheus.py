@@ -14,6 +14,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
+from zbridge.transport.waiting import waiting_sockets
 
 log = logging.getLogger("zbridge.metrics")
 
@@ -21,8 +22,6 @@ REQUEST_S = 2.0
 """Longest time a client may take to send its request and read the answer."""
 CLIENTS = 4
 """Clients served at a time."""
-WAITING = 16
-"""Clients that wait in the operating system's queue; further ones are refused."""
 _REQUEST_BYTES = 8192
 
 Missing = Callable[[], tuple[str, ...]]
@@ -42,7 +41,7 @@ async def serve_metrics(
     starves the rest of the process meanwhile.
     """
     try:
-        sockets = list(given) or await _listen(address)
+        sockets = list(given) or await waiting_sockets(address)
     except OSError as error:
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
         yield []
@@ -57,20 +56,6 @@ async def serve_metrics(
         await asyncio.gather(*tasks, return_exceptions=True)
         for listening in sockets:
             listening.close()
-
-
-async def _listen(address: Address) -> list[socket.socket]:
-    """Listen at every address of the host; raise OSError if one of them is not available."""
-    loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
-    try:
-        for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
-            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
-            listening.setblocking(False)
-    except OSError:
-        for listening in sockets:
-            listening.close()
-        raise
-    return sockets
 
 
 async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics, missing: Missing) -> None:

@@ -7,7 +7,6 @@ and what was expected.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,6 +22,7 @@ from zbridge.bus.interface import SECURE, Connection
 from zbridge.bus.tls.files import tls_beside
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
+from zbridge.protocol.networks import is_loopback
 
 LISTEN = "tcp/127.0.0.1:7447"
 LISTEN_TLS = "tls/0.0.0.0:7447"
@@ -177,9 +177,4 @@ def _check_secure(settings: RouterSettings, tls: Tls, *, files: bool) -> None:
 def _is_loopback(address: str) -> bool:
     kind, _, at = address.partition("/")
     host = at.partition("#")[0].rpartition(":")[0].strip("[]")
-    if kind == "unixsock-stream" or host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return kind == "unixsock-stream" or is_loopback(host)

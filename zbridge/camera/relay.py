@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
 import socket
 from collections.abc import Callable
@@ -21,7 +20,9 @@ from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import explain
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
+from zbridge.protocol.networks import is_among
 from zbridge.protocol.session_table import Backoff
+from zbridge.transport.waiting import waiting_sockets
 
 log = logging.getLogger("zbridge.camera")
 
@@ -34,8 +35,6 @@ SEND_S = 10.0
 """Longest time in which a client must take one picture."""
 UNSENT_BYTES = 128 * 1024
 """The kernel's buffer for a client (it doubles the number): what waits there is no longer the newest."""
-WAITING = 16
-"""Clients that wait in the operating system's queue; further ones are refused."""
 _REFUSAL_S = 0.01
 _REQUEST_BYTES = 8192
 _NOT_FOUND = b"HTTP/1.0 404 Not Found\r\nContent-Length: 0\r\n\r\n"
@@ -74,7 +73,7 @@ class Relay:
         backoff = Backoff()
         while True:
             try:
-                sockets = await _listen(self._address)
+                sockets = await waiting_sockets(self._address)
             except OSError as error:
                 self._tell(f"camera relay {self._address.host}:{self._address.port}: {explain(error)}")
                 await asyncio.sleep(backoff.delay_s())
@@ -99,7 +98,7 @@ class Relay:
                 log.debug("camera relay: %s", error)
                 await asyncio.sleep(1.0)
                 continue
-            if len(self._clients) >= self._most or not self._allowed(peer[0]):
+            if len(self._clients) >= self._most or not self._admits(peer[0]):
                 self._refused.value += 1
                 client.close()
                 await asyncio.sleep(_REFUSAL_S)
@@ -109,10 +108,8 @@ class Relay:
             self._clients.add(task)
             task.add_done_callback(self._clients.discard)
 
-    def _allowed(self, host: str) -> bool:
-        address = ipaddress.ip_address(host.partition("%")[0])
-        address = getattr(address, "ipv4_mapped", None) or address
-        return not self._allow or any(address in network for network in self._allow)
+    def _admits(self, host: str) -> bool:
+        return not self._allow or is_among(host, self._allow)
 
     async def _serve(self, client: socket.socket) -> None:
         """Answer one client, and give it pictures until it goes or takes none."""
@@ -187,17 +184,3 @@ def _refusal(request: bytes) -> bytes | None:
     if method != b"GET" or path != PATH:
         return _NOT_FOUND
     return _FORBIDDEN if b"\r\norigin:" in b"\r\n" + fields.lower() else None
-
-
-async def _listen(address: Address) -> list[socket.socket]:
-    """Listen at every address of the host; raise OSError if one of them is not available."""
-    loop, sockets = asyncio.get_running_loop(), list[socket.socket]()
-    try:
-        for family, _, _, _, where in await loop.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM):
-            sockets.append(listening := socket.create_server(where, family=family, backlog=WAITING))
-            listening.setblocking(False)
-    except OSError:
-        for listening in sockets:
-            listening.close()
-        raise
-    return sockets

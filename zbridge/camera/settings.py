@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from typing import Annotated
 from urllib.parse import urlsplit
@@ -11,8 +10,7 @@ import msgspec
 
 from zbridge.errors import ConfigError, LinkError
 from zbridge.protocol.address import Address
-
-Network = ipaddress.IPv4Network | ipaddress.IPv6Network
+from zbridge.protocol.networks import Network, parse_networks
 
 _EXPECTED = "expected http://host:port/path"
 _TARGET = re.compile(r"[!-~]+")
@@ -64,7 +62,7 @@ def plan_camera(settings: CameraSettings) -> CameraPlan:
     """Check ``[camera]``; raise ConfigError that names key, value and what was expected."""
     if settings.relay is None and settings.allow:
         raise ConfigError(f"camera.allow = {list(settings.allow)}: expected only with camera.relay")
-    allow = tuple(_network(f"camera.allow[{number}]", text) for number, text in enumerate(settings.allow))
+    allow = parse_networks("camera.allow", settings.allow)
     relay = _relay(settings.relay) if settings.relay is not None else None
     return CameraPlan(_source(settings.url), settings, relay, allow)
 
@@ -88,10 +86,3 @@ def _relay(text: str) -> Address:
         return Address.parse(f"tcp://{text}")
     except LinkError as error:
         raise ConfigError(f"camera.relay = {text!r}: expected host:port") from error
-
-
-def _network(key: str, text: str) -> Network:
-    try:
-        return ipaddress.ip_network(text)
-    except ValueError as error:
-        raise ConfigError(f"{key} = {text!r}: expected a network like '192.168.1.0/24': {error}") from error

@@ -150,10 +150,7 @@ def stop(
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
-    if bool(robot) == everything:
-        give_up(2, "name one ROBOT, or give --all")
-    if robot:
-        check_name("ROBOT", robot)
+    _check_one_or_all(robot, everything=everything)
     if not run_loop(bus.stop(bus_settings(connect, tls), realm, robot or None)):
         raise typer.Exit(1)
 
@@ -171,10 +168,7 @@ def restart(
     from zbridge.cli.restart import restart as ask
 
     set_up_log(verbose=False, level=logging.ERROR)
-    if bool(robot) == everything:
-        give_up(2, "name one ROBOT, or give --all")
-    if robot:
-        check_name("ROBOT", robot)
+    _check_one_or_all(robot, everything=everything)
     if not run_loop(ask(bus_settings(connect, tls), realm, robot or None, who=who or None)):
         raise typer.Exit(1)
 
@@ -211,3 +205,11 @@ def ros2(
         "realm": realm or None,
     }
     run_ros2(bus_settings(connect, tls) if connect or tls else None, bus_settings(), file, given)
+
+
+def _check_one_or_all(robot: str, *, everything: bool) -> None:
+    """Give up unless either one robot is named or all are meant."""
+    if bool(robot) == everything:
+        give_up(2, "name one ROBOT, or give --all")
+    if robot:
+        check_name("ROBOT", robot)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import ipaddress
 from collections import deque
 
 from zbridge.hq.settings import ListenerPlan
+from zbridge.protocol.networks import is_among
 
 ADDRESSES = 1024
 """Addresses whose connections are counted separately; beyond that the address seen longest ago is forgotten."""
@@ -32,11 +32,9 @@ class Admission:
             return f"more than {self._arrivals.rate_hz:g} connections a second of its address"
         if clients >= self._clients:
             return FULL
-        if not self._allow:
-            return None
-        address = ipaddress.ip_address(host.partition("%")[0])
-        address = getattr(address, "ipv4_mapped", None) or address
-        return None if any(address in network for network in self._allow) else "its network is not allowed"
+        if self._allow and not is_among(host, self._allow):
+            return "its network is not allowed"
+        return None
 
 
 class Arrivals:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
 from zbridge.protocol.address import Address
+from zbridge.protocol.networks import Network
 from zbridge.protocol.plugin import Protocol
 
 if TYPE_CHECKING:
     from ssl import SSLContext
 
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
-Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 class ListenerTls(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

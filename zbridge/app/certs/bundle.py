@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from datetime import datetime
 from pathlib import Path
@@ -25,6 +24,7 @@ from zbridge.app.certs.files import (
 from zbridge.app.certs.reading import fault, load_certificate, load_name
 from zbridge.app.roles import Roles, load_roles
 from zbridge.errors import ConfigError
+from zbridge.protocol.networks import is_loopback
 
 PORT = 7447
 """Where Zenoh routers listen."""
@@ -91,18 +91,11 @@ def _routers(folder: Folder, roles: Roles) -> tuple[str, ...]:
         if member.role == "router":
             _, certificate = load_name(folder, name)
             hosts = [host for host in x509.hosts_of(certificate) if x509.is_reachable(host)]
-            hosts.sort(key=_is_local)
+            hosts.sort(key=is_loopback)
             endpoints += [f"tls/{host}:{PORT}" for host in hosts[:1]]
     if not endpoints:
         raise ConfigError(f"--connect: missing: no router is issued yet; expected an endpoint like {_EXAMPLE}")
     return tuple(endpoints)
-
-
-def _is_local(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _quoted(text: str) -> str:

@@ -7,7 +7,6 @@ does not let it lie. A program can send any Origin, or none: only the token tell
 from __future__ import annotations
 
 import hmac
-import ipaddress
 from collections.abc import Sequence
 from http import HTTPStatus
 from urllib.parse import parse_qs, urlsplit
@@ -16,7 +15,7 @@ import msgspec
 
 from zbridge.fleet.topics import escape
 from zbridge.hq.admission import Arrivals
-from zbridge.hq.settings import Network
+from zbridge.protocol.networks import Network, is_among
 from zbridge.views.foxglove.replies import SUBPROTOCOL
 
 FOXGLOVE_ORIGINS = ("https://app.foxglove.dev",)
@@ -77,7 +76,7 @@ class Admission:
 
     def refusal(self, host: str, connections: int, now: float) -> str | None:
         """Return why a connection is closed before it says anything, as one word; None if it may go on."""
-        if self.policy.networks and not self._is_near(host):
+        if self.policy.networks and not is_among(host, self.policy.networks):
             return "network"
         if not self._arrivals.admit(host, now):
             return "arrivals"
@@ -99,8 +98,3 @@ class Admission:
         trusted = self.policy.token is not None or bool(request.origins)
         name = escape(query.get("name", [""])[0] or host)[:LABEL]
         return Admitted(name, self.policy.drive and trusted)
-
-    def _is_near(self, host: str) -> bool:
-        address = ipaddress.ip_address(host.partition("%")[0])
-        address = getattr(address, "ipv4_mapped", None) or address
-        return any(address in network for network in self.policy.networks)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,8 +10,8 @@ import msgspec
 
 from zbridge.errors import ConfigError, LinkError
 from zbridge.fleet.topics import is_name
-from zbridge.hq.settings import Network
 from zbridge.protocol.address import Address
+from zbridge.protocol.networks import is_loopback, parse_network
 from zbridge.views.foxglove.admission import FOXGLOVE_ORIGINS, Policy
 from zbridge.views.foxglove.twist import Scale, Scales
 
@@ -57,7 +56,7 @@ def plan(options: Options) -> Plan:
         raise ConfigError("--tls-certificate and --tls-key: expected both")
     tls = (str(options.tls_certificate), str(options.tls_key)) if options.tls_certificate is not None else None
     token = _token(options.token) if options.token is not None else None
-    near = _is_loopback(address.host)
+    near = is_loopback(address.host)
     if not near and tls is None and not options.insecure:
         raise ConfigError(
             f"--listen {options.listen}: other machines need --tls-certificate and --tls-key, or --insecure"
@@ -69,7 +68,7 @@ def plan(options: Options) -> Plan:
             raise ConfigError(f"{name!r}: expected letters, digits, '_', '.' and '-' only")
     policy = Policy(
         origins=(*FOXGLOVE_ORIGINS, *map(_origin, options.origins)),
-        networks=tuple(map(_network, options.allow)),
+        networks=tuple(parse_network(f"--allow {text}", text) for text in options.allow),
         token=token,
         drive=options.drive,
         viewers=options.viewers,
@@ -86,13 +85,6 @@ def _address(option: str, text: str) -> Address:
         raise ConfigError(f"{option} {text}: expected host:port: {error}") from error
 
 
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def _token(path: Path) -> str:
     try:
         token = path.read_text(encoding="utf-8").strip()
@@ -107,13 +99,6 @@ def _origin(text: str) -> str:
     if "://" not in text or text.endswith("/") or text == "*":
         raise ConfigError(f"--origin {text}: expected an Origin like 'https://example.org'")
     return text
-
-
-def _network(text: str) -> Network:
-    try:
-        return ipaddress.ip_network(text)
-    except ValueError as error:
-        raise ConfigError(f"--allow {text}: expected a network like '192.168.1.0/24': {error}") from error
 
 
 def _scales(options: Options) -> Scales:

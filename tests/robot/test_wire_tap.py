@@ -55,6 +55,17 @@ async def test_a_late_listener_is_shown_the_handshake_first_and_then_what_comes(
 
 
 @pytest.mark.jumping
+async def test_a_direction_whose_listener_is_heard_of_much_later_misses_nothing_and_repeats_nothing() -> None:
+    scene = Scene()
+    scene.says(b"a", b"B", b"c")
+    await scene.listen("out")
+    scene.says(b"D", b"e")
+    await scene.listen("in")
+    scene.says(b"F", b"g")
+    assert scene.frames == [b"B", b"D", b"a", b"c", b"e", b"F", b"g"]
+
+
+@pytest.mark.jumping
 async def test_of_a_conversation_without_a_handshake_the_first_frames_are_kept() -> None:
     scene = Scene(State.ESTABLISHED)
     frames = [b"%d" % number for number in range(FIRST + 5)]

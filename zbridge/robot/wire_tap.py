@@ -1,9 +1,10 @@
 """Shows the raw frames of one link to those who listen (``@wire``). Knows no bus.
 
 Theory of operation. Who listens from the start may still be heard of after the first frames of a connection: these are
-kept, in order, to the end of the handshake, and the first listener is shown them first, whenever it comes. A listener
-of one direction appears shortly before the listener of the other one, so that what is kept is shown :data:`SETTLE_S`
-after the first appeared; what comes meanwhile waits behind it. While nobody listens and nothing more is kept the
+kept, in order, to the end of the handshake, and the first listener of a direction is shown those of its direction
+first, whenever it comes. The listeners of both directions mostly appear shortly one after the other. So what is kept
+is shown :data:`SETTLE_S` after the first appeared, in the order in which it was said, and what comes meanwhile waits
+behind it; a direction that appears later still misses nothing. While nobody listens and nothing more is kept the
 session calls nobody.
 """
 
@@ -29,6 +30,8 @@ SETTLE_S = 0.02
 _LOGGED = 64
 
 Show = Callable[[bytes], object]
+Entry = tuple[int, str, bytes]
+"""The running number of a frame, its direction (``in`` or ``out``), and the frame."""
 
 
 class WireTap:
@@ -38,10 +41,13 @@ class WireTap:
         self._label = label
         self._session: Session[Any] | None = None
         self._shows: dict[str, Show] = {}
-        self._kept: list[tuple[str, bytes]] = []
+        self._shown: dict[str, int] = {}
+        """The number of the last frame that was shown in a direction that is listened to."""
+        self._number = 0
+        self._kept: list[Entry] = []
         self._kept_bytes = 0
-        self._waiting: list[tuple[str, bytes]] | None = None
-        """What the first listener is to be shown: what was kept before it appeared, and what came since."""
+        self._waiting: list[Entry] | None = None
+        """What came since a listener appeared, until it is shown what was kept."""
 
     def __repr__(self) -> str:
         return f"<WireTap {self._label} shown {sorted(self._shows)}, {len(self._kept)} kept>"
@@ -55,9 +61,10 @@ class WireTap:
         """Show the frames of one direction (``in`` or ``out``) from now on, the kept ones first; None: show none."""
         if show is None:
             self._shows.pop(direction, None)
+            self._shown.pop(direction, None)
             return
-        if not self._shows and self._waiting is None:
-            self._waiting = list(self._kept)
+        if self._waiting is None:
+            self._waiting = []
             asyncio.get_running_loop().call_later(SETTLE_S, self._show_kept)
         self._shows[direction] = show
         if self._session is not None:
@@ -67,13 +74,15 @@ class WireTap:
         debug = log.isEnabledFor(logging.DEBUG)
         if debug:
             log.debug("%s %s %s", "<" if direction == "in" else ">", self._label, frame[:_LOGGED].hex(" "))
+        self._number += 1
+        entry = (self._number, direction, frame)
         if self._waiting is not None:
             if len(self._waiting) < 2 * KEPT:
-                self._waiting.append((direction, frame))
-        elif show := self._shows.get(direction):
-            show(frame)
+                self._waiting.append(entry)
+        else:
+            self._show(entry)
         if self._keeps:
-            self._kept.append((direction, frame))
+            self._kept.append(entry)
             self._kept_bytes += len(frame)
         elif not (debug or self._shows or self._waiting is not None) and self._session is not None:
             self._session.tap = None
@@ -86,7 +95,13 @@ class WireTap:
         return len(self._kept) < (KEPT if begins else FIRST) and self._kept_bytes < KEPT_BYTES
 
     def _show_kept(self) -> None:
-        waiting, self._waiting = self._waiting or (), None
-        for direction, frame in waiting:
-            if show := self._shows.get(direction):
-                show(frame)
+        waiting, self._waiting = self._waiting or [], None
+        for entry in sorted([*self._kept, *waiting]):
+            self._show(entry)
+
+    def _show(self, entry: Entry) -> None:
+        number, direction, frame = entry
+        show = self._shows.get(direction)
+        if show is not None and number > self._shown.get(direction, 0):
+            self._shown[direction] = number
+            show(frame)

@@ -90,6 +90,7 @@ class FramePublisher(Declared):
     """Writes frames of any format on a key, and tells when the first listener comes and the last one goes.
 
     kept: last frames that advanced subscribers get when they come late, and which they may ask for if one was lost.
+    blocks: a congested bus holds frames up, in place of dropping them.
     """
 
     def __init__(
@@ -101,12 +102,16 @@ class FramePublisher(Declared):
         *,
         best_effort: bool,
         kept: int,
+        blocks: bool,
     ) -> None:
+        congestion = _BLOCK if blocks else _DROP
         self.key = key
         self.last: bytes | None = None
         self._writer = writer
         reliability = zenoh.Reliability.BEST_EFFORT if best_effort else zenoh.Reliability.RELIABLE
-        plain: Any = session.declare_publisher(key, express=True, reliability=reliability, congestion_control=_DROP)
+        plain: Any = session.declare_publisher(
+            key, express=True, reliability=reliability, congestion_control=congestion
+        )
         matching = plain.declare_matching_listener(threadless(lambda status: listened(status.matching)))
         self._put: Callable[..., object] = plain.put
         publishers = [plain]
@@ -114,7 +119,7 @@ class FramePublisher(Declared):
             advanced = zenoh.ext.declare_advanced_publisher(
                 session,
                 key,
-                congestion_control=_DROP,
+                congestion_control=congestion,
                 cache=zenoh.ext.CacheConfig(kept),
                 publisher_detection=True,
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
@@ -142,7 +147,7 @@ class _StreamPublisher(Declared):
         self._writer = writer
         self._blocks = blocks
         if blocks:
-            options = {**options, "congestion_control": zenoh.CongestionControl.BLOCK}
+            options = {**options, "congestion_control": _BLOCK}
         super().__init__(*self._declare(session, key, options))
 
     def _declare(self, session: zenoh.Session, key: str, options: dict[str, Any]) -> tuple[Any, ...]:
@@ -297,8 +302,8 @@ _PRIORITIES = {
     Priority.DATA_HIGH: zenoh.Priority.DATA_HIGH,
     Priority.REAL_TIME: zenoh.Priority.REAL_TIME,
 }
-_DROP = zenoh.CongestionControl.DROP
+_DROP, _BLOCK = zenoh.CongestionControl.DROP, zenoh.CongestionControl.BLOCK
 _CONGESTIONS = {
-    Congestion.DROP: zenoh.CongestionControl.DROP,
-    Congestion.BLOCK: zenoh.CongestionControl.BLOCK,
+    Congestion.DROP: _DROP,
+    Congestion.BLOCK: _BLOCK,
 }

@@ -18,6 +18,7 @@ from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
+from zbridge.bus.zenoh.connected import watch_connected
 from zbridge.bus.zenoh.declared import Declared, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
@@ -91,6 +92,7 @@ class ZenohBus:
         self._session = session
         self._loop = loop
         self._stream = stream
+        self._lossless = lossless = stream == "block"
         self._shares = beside is not None
         self._inbox = Inbox(loop, metrics)
         self._inboxes: list[Inbox] = beside._inboxes if beside is not None else []
@@ -101,7 +103,6 @@ class ZenohBus:
         self._replies_dropped = metrics.count("bus_replies_dropped")
         self._unanswered = metrics.count("bus_unanswered")
         self._relief: list[Callable[[], None]] = []
-        lossless = stream == "block"
         self._writer = Writer("states", metrics, lossless=lossless, relieved=self._relieve)
         self._streams = Writer("streams", metrics, lossless=lossless, relieved=self._relieve)
         self._publishers = Publishers(session, self._writer, self._streams, lossless=lossless)
@@ -272,7 +273,9 @@ class ZenohBus:
             self._loop.call_soon_threadsafe(listened, matching)
 
         return self._keep(
-            FramePublisher(self._session, key, self._streams, changed, best_effort=best_effort, kept=kept)
+            FramePublisher(
+                self._session, key, self._streams, changed, best_effort=best_effort, kept=kept, blocks=self._lossless
+            )
         )
 
     def watch_listeners(self, key: str, handler: Callable[[bool], None]) -> Handle:
@@ -281,12 +284,7 @@ class ZenohBus:
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
-        loop, info = self._loop, self._session.info
-
-        def changed(_: zenoh.TransportEvent) -> None:
-            loop.call_soon_threadsafe(lambda: handler(bool(info.transports())))
-
-        return self._keep(Declared(info.declare_transport_events_listener(threadless(changed), history=True)))
+        return self._keep(watch_connected(self._session.info, self._loop, handler))
 
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -312,6 +312,10 @@ class Bench:
         return process
 
 
+_SHOWN = 6000
+"""Characters of a log that are shown with a failure: its last ones."""
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
     with contextlib.ExitStack() as stack:
@@ -322,3 +326,14 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 def robot() -> Iterator[Robot]:
     with contextlib.closing(Robot()) as scripted:
         yield scripted
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show with a failure what the processes of its folder have logged."""
+    report = yield
+    folder = getattr(item, "funcargs", {}).get("tmp_path")
+    if report.failed and folder is not None:
+        for log in sorted(folder.rglob("*.log")):
+            report.sections.append((log.name, log.read_text(errors="replace")[-_SHOWN:]))
+    return report

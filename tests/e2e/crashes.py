@@ -115,8 +115,8 @@ def _measure(scene: Scene, stack: contextlib.ExitStack, outcome: Outcome, name: 
     scene.supervisor.reload()
     until(lambda: scene.fleet.last(f"{name}/status").get("state") == "established", LINE_S, "established")
     pid = scene.supervisor.gateway(name)
-    Part(stack, *loss.driver(scene.endpoint, name, DEADMAN_S, RATE_HZ, round(SPEED * SCALE), 0))
-    if not robot.moving(SPEED, LINE_S):
+    driver = Part(stack, *loss.driver(scene.endpoint, name, DEADMAN_S, RATE_HZ, round(SPEED * SCALE), 0))
+    if not robot.begins(SPEED, driver):
         raise RuntimeError("the robot was never driven")
     time.sleep(random.uniform(0.5, 1.5))
     crashed = time.monotonic()

@@ -59,6 +59,8 @@ CUTS_S = (1.0, 2.0, 4.0, 6.0, 8.0, 10.0)
 CAUSES = {"stall": ("neutral", "killed", "silent"), "cut": ("neutral", "killed", "silent", "driving")}
 """What the driver does meanwhile, in rotation; each robot begins with another one."""
 DEADMAN_S = 0.5
+HELD_UP_S = 3.0
+"""A driver that has moved nothing for so long begins again."""
 FIRST, AGAIN = 0.4, 0.8
 """Speed before, and speed of the driving that shows afterwards that the connection survived."""
 TOLERANCE = 0.02
@@ -159,6 +161,15 @@ class MovingRobot:
     def moving(self, speed: float, timeout_s: float) -> bool:
         """Wait until it moves at a speed; tell whether it does."""
         return _waited(lambda: abs(self.speed - speed) <= TOLERANCE, timeout_s)
+
+    def begins(self, speed: float, driver: Part) -> bool:
+        """Wait until a driver has set it in motion. One that was held up met its deadman, and owes a neutral."""
+        deadline = time.monotonic() + LINE_S
+        while not self.moving(speed, HELD_UP_S):
+            if time.monotonic() > deadline:
+                return False
+            driver.say(f"again {round(speed * SCALE)}")
+        return True
 
     def rest(self, since: float, patience_s: float) -> float | None:
         """Wait until it has been at rest for REST_S; give when it came to rest, None if it did not in time."""
@@ -284,7 +295,7 @@ class Sitting:
 
     def _measure(self) -> None:
         outcome, robot = self.outcome, self._robot
-        if not robot.moving(FIRST, LINE_S):
+        if not robot.begins(FIRST, self._driver):
             counted = [line for line in self._counters() if not line.endswith(" 0")]
             self._report()
             raise RuntimeError(f"the robot was never driven; {self._status}; counters {counted}")

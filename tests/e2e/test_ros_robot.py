@@ -98,9 +98,12 @@ def test_strangers_are_counted_and_move_nothing(tmp_path: Path, stack: contextli
     tokens = [stranger.liveliness().declare_token(lying % (number, kinds)) for number in range(30)]
     tokens.append(stranger.liveliness().declare_token("@ros2_lv/0/x/y/z/MP/%/%/liar/%scan/a/b/c"))
     attachments = [None, b"", rng.randbytes(33), struct.pack("<qqB16s", 1, 1, 16, rng.randbytes(16)), bytes(10_000)]
+    lossless = zenoh.CongestionControl.BLOCK
+    scans = stranger.declare_publisher(SCAN_KEY, congestion_control=lossless)
+    commands = stranger.declare_publisher(KEY, congestion_control=lossless)
     for _ in range(2000):
-        stranger.put(SCAN_KEY, rng.randbytes(rng.randrange(200)), attachment=rng.choice(attachments))
-        stranger.put(KEY, rng.randbytes(52), attachment=rng.choice(attachments[:3]))
+        scans.put(rng.randbytes(rng.randrange(200)), attachment=rng.choice(attachments))
+        commands.put(rng.randbytes(52), attachment=rng.choice(attachments[:3]))
     fleet = scene.bench.fleet
 
     def counted() -> int:

@@ -7,7 +7,7 @@ import socket
 
 import pytest
 
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from zbridge.app import prometheus as exporter
 from zbridge.app.prometheus import serve_metrics
 from zbridge.metrics import Metrics

@@ -17,8 +17,9 @@ from typing import Any
 
 from tests.benchmarks.alf_wire import Dialect
 from tests.benchmarks.flow import QUIET_S, RUN_S, SETTLE_S, Route, Run
-from tests.benchmarks.harness import Process, cpu_s, free_port, memory_mb, process, thread_cpu_s
+from tests.benchmarks.harness import Process, cpu_s, memory_mb, process, thread_cpu_s
 from tests.benchmarks.peer import ROBOT
+from tests.ports import free_port
 
 SCANS_HZ = 10.0
 COMMANDS_HZ = 50.0

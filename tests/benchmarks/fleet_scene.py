@@ -15,7 +15,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.benchmarks.harness import ROOT, BenchmarkError, Process, cpu_s, free_port
+from tests.benchmarks.harness import ROOT, BenchmarkError, Process, cpu_s
+from tests.ports import free_port
 from zbridge.client import Fleet, connect
 from zbridge.errors import BusError
 
@@ -83,6 +84,8 @@ class Routers:
         links = [word for endpoint in self.endpoints[:number] for word in ("--connect", endpoint)]
         router = Command("router", "--listen", self.endpoints[number], *links)
         wait_until(lambda: "router at" in router.log() or not router.alive(), 20.0, "a router")
+        if not router.alive():
+            raise BenchmarkError(router.log())
         return router
 
 

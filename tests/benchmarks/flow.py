@@ -17,9 +17,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from tests.benchmarks.harness import Process, cpu_s, free_port, memory_mb, process, thread_cpu_s
+from tests.benchmarks.harness import Process, cpu_s, memory_mb, process, thread_cpu_s
 from tests.benchmarks.peer import ROBOT
 from tests.benchmarks.wire import Kind
+from tests.ports import free_port
 
 RUN_S = 40.0
 """Longest time one run may take."""

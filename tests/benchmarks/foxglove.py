@@ -27,9 +27,10 @@ import zenoh
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from tests.e2e.conftest import Gateway, configuration, device, free_port, until
+from tests.e2e.conftest import Gateway, configuration, device, until
 from tests.e2e.processes import Part
 from tests.e2e.robots import Robot, position
+from tests.ports import free_port
 from tests.views.protobuf import read
 from zbridge.views.pictures import foxglove_schema
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import queue
-import socket
 import subprocess
 import sys
 import tempfile
@@ -111,14 +110,6 @@ def process(module: str, *arguments: object) -> Iterator[Process]:
         yield running
     finally:
         running.end()
-
-
-def free_port() -> int:
-    """Find a loopback port that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def cpu_s(pid: int) -> float:

@@ -32,7 +32,6 @@ from tests.benchmarks.harness import (
     Process,
     Spread,
     cpu_s,
-    free_port,
     memory_mb,
     pairs,
     process,
@@ -40,6 +39,7 @@ from tests.benchmarks.harness import (
 )
 from tests.benchmarks.hq_wire import KINDS, SCANS_HZ, SMALL_HZ, Kind
 from tests.benchmarks.peer import ROBOT
+from tests.ports import free_port
 
 COUNTS = (1, 10, 50, 250)
 CPU_US, LATE_MS, EVEN = 40.0, 25.0, 0.99

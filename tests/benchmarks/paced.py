@@ -30,10 +30,11 @@ from pathlib import Path
 from statistics import median
 from typing import Literal
 
-from tests.benchmarks.harness import Process, cpu_s, free_port, memory_mb, process, thread_cpu_s
+from tests.benchmarks.harness import Process, cpu_s, memory_mb, process, thread_cpu_s
 from tests.benchmarks.paced_peers import PROTOCOLS, Kind
 from tests.benchmarks.peer import ROBOT
 from tests.benchmarks.scene import Drive, Scene, Through, p99, scene
+from tests.ports import free_port
 
 Route = Literal["tcp", "zenoh", "least", "script", "gateway"]
 ROUTES: dict[Kind, tuple[Route, ...]] = {

@@ -20,8 +20,9 @@ from statistics import median, quantiles
 
 from mcap.writer import CompressionType, Writer
 
-from tests.benchmarks.harness import ROOT, Process, free_port
+from tests.benchmarks.harness import ROOT, Process
 from tests.benchmarks.recording_source import POSE_HZ, SCAN_HZ, scans
+from tests.ports import free_port
 from tests.views.recording import files
 from zbridge.views.recording.player import Player
 from zbridge.views.recording.reader import Reader

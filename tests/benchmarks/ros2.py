@@ -24,9 +24,10 @@ import msgpack
 import numpy as np
 import zenoh
 
-from tests.e2e.conftest import configuration, end, free_port, start
+from tests.e2e.conftest import configuration, end, start
 from tests.e2e.processes import Part
 from tests.e2e.robots import Robot
+from tests.ports import free_port
 from tests.views.ros2.judge import Ros
 
 SCAN, TWIST, TF = "sensor_msgs/msg/LaserScan", "geometry_msgs/msg/Twist", "tf2_msgs/msg/TFMessage"

@@ -22,8 +22,9 @@ from statistics import mean, median
 from typing import Any
 
 from tests.benchmarks.drives import ADVERSE
-from tests.benchmarks.harness import WAIT_S, Process, cpu_s, free_port, process, thread_cpu_s
+from tests.benchmarks.harness import WAIT_S, Process, cpu_s, process, thread_cpu_s
 from tests.benchmarks.peer import ROBOT
+from tests.ports import free_port
 
 GREETING_S = 1.2
 """The gateway greets a robot with a stop, for a second."""

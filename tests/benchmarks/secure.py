@@ -26,11 +26,12 @@ from statistics import median
 import zenoh
 
 from tests.access import COLUMNS
-from tests.benchmarks.harness import Process, cpu_s, free_port, process
+from tests.benchmarks.harness import Process, cpu_s, process
 from tests.benchmarks.paced import FULL, Lane, Plan, interval
 from tests.benchmarks.peer import ROBOT
 from tests.certificates import Authority
 from tests.e2e.secure import FAR, SecureBus
+from tests.ports import free_port
 from zbridge.app.roles import Member, Roles, save_roles
 
 RATE_HZ = 1000.0

@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import socket
 import sys
 import threading
 import tomllib
@@ -24,6 +23,8 @@ from types import FrameType
 from typing import Any
 
 import zenoh
+
+from tests.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 4.0
@@ -152,13 +153,6 @@ def _traced_callback(store: Callable[[Any], None], ways: Ways) -> Callable[[Any]
     return traced_store
 
 
-def _free_port() -> int:
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        port: int = sock.getsockname()[1]
-        return port
-
-
 _DRIVER = """
 import sys, time, zbridge
 with zbridge.blocking.connect(endpoints=[sys.argv[1]]) as fleet, fleet["r1"].control(deadman_s=2.0) as drive:
@@ -173,7 +167,7 @@ async def measure(protocol: str) -> Ways:
     from zbridge.app import config
     from zbridge.app.gateway import Gateway
 
-    ways, ports = Ways(), (_free_port(), _free_port(), _free_port())
+    ways, ports = Ways(), (free_port(), free_port(), free_port())
     robot = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "zbridge", "simulate", protocol),
         *[

@@ -22,8 +22,9 @@ from pathlib import Path
 import zenoh
 
 from tests.benchmarks.flow import QUIET_S, RUN_S, SETTLE_S
-from tests.benchmarks.harness import Process, Spread, cpu_s, free_port, pairs, process
+from tests.benchmarks.harness import Process, Spread, cpu_s, pairs, process
 from tests.benchmarks.peer import ROBOT, Sink, drive, open_session, tell
+from tests.ports import free_port
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Reading
 

@@ -8,7 +8,7 @@ import zenoh
 import zenoh.ext
 
 from tests.bus import SOON_S, Seen
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from zbridge.bus import BusSettings, IncomingQuery
 from zbridge.bus.zenoh import ZenohBus, open_zenoh, zenoh_config
 from zbridge.metrics import Metrics

@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from tests.bus import SOON_S, Seen
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from zbridge.bus import BusSettings, Lane, Look
 from zbridge.bus.zenoh import ZenohBus, declared, incoming, open_zenoh, publishers, session, zenoh_config
 from zbridge.errors import BusError, Code, Held, Refused, Unsupported

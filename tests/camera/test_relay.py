@@ -11,6 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from tests.camera.camera_bytes import HEAD, jpeg, part
+from tests.ports import free_port
 from zbridge.camera import relay as relays
 from zbridge.camera.demand import Demand
 from zbridge.camera.latest import Latest
@@ -69,11 +70,6 @@ async def until(condition: Callable[[], object]) -> None:
     """Wait until ``condition()`` is true; the scene bounds it."""
     while not condition():  # noqa: ASYNC110 - of any kind
         await asyncio.sleep(0.01)
-
-
-def free_port() -> int:
-    with contextlib.closing(relays.socket.create_server((HOST, 0))) as listening:
-        return int(listening.getsockname()[1])
 
 
 async def test_a_client_gets_the_head_and_the_newest_picture_as_the_camera_wrote_them() -> None:

@@ -38,12 +38,13 @@ from typing import Any
 import zenoh
 
 from tests.e2e import loss
-from tests.e2e.conftest import Fleet, configuration, device, end, free_port, until
+from tests.e2e.conftest import Fleet, configuration, device, end, until
 from tests.e2e.fragile import ROBOTS, charges
 from tests.e2e.processes import LINE_S, Part
 from tests.e2e.robots import SCALE
 from tests.e2e.stalls import MovingRobot
 from tests.e2e.supervised import Supervised
+from tests.ports import free_port
 
 LIMIT_S = 1.5
 """Most seconds from the crash to rest."""

@@ -18,9 +18,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.e2e.conftest import Bench, device, free_port, listener
+from tests.e2e.conftest import Bench, device, listener
 from tests.e2e.hq_scene import NEUTRAL, ByHand, sessions, soon
 from tests.e2e.processes import Finding, report
+from tests.ports import free_port
 
 CLIENTS = 254
 AT_ONCE = 8

@@ -26,10 +26,11 @@ from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.tcpudp.conformance.parser import Feature
 from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e import mixed
-from tests.e2e.conftest import HOST, Bench, Gateway, device, free_port, listener
+from tests.e2e.conftest import HOST, Bench, Gateway, device, listener
 from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
 from tests.e2e.hq_scene import playing, ports, soon
 from tests.e2e.processes import report
+from tests.ports import free_port
 
 LEASE_S = 1.2
 """Seconds of neutral after which a robot is given back: short, so that the next program may have it soon."""

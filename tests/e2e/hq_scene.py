@@ -9,8 +9,9 @@ import struct
 from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any, TypeVar
 
-from tests.e2e.conftest import HOST, WAIT_S, Bench, free_port
+from tests.e2e.conftest import HOST, WAIT_S, Bench
 from tests.machine import Patience
+from tests.ports import free_port
 
 T = TypeVar("T")
 ANSWER = bytes.fromhex("18000000 00 03 0b000000") + b"1.1,1.2,1.3" + bytes(7)

@@ -22,7 +22,8 @@ from mcap.exceptions import McapError
 from mcap.stream_reader import StreamReader
 
 from tests.benchmarks.recording_source import scans
-from tests.e2e.conftest import HOST, configuration, free_port
+from tests.e2e.conftest import HOST, configuration
+from tests.ports import free_port
 from zbridge.views.recording.reader import Reader
 
 SCAN_HZ = 200.0

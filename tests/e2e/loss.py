@@ -24,10 +24,11 @@ from typing import Any, Generic, TypeVar
 import msgpack
 import zenoh
 
-from tests.e2e.conftest import HOST, Gateway, Lease, configuration, device, end, free_port, until
+from tests.e2e.conftest import HOST, Gateway, Lease, configuration, device, end, until
 from tests.e2e.processes import LINE_S, Finding, Part, Road, frozen, go_apart, module
 from tests.e2e.robots import SCALE, STOP, Frame, Robot
 from tests.machine import Withheld, contended_s
+from tests.ports import free_port
 from tests.proofs import packed
 
 LATE_S = 0.05

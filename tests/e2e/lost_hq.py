@@ -21,9 +21,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from tests.e2e import loss
-from tests.e2e.conftest import HOST, free_port, until
+from tests.e2e.conftest import HOST, until
 from tests.e2e.loss import EVERYWHERE, LATE_S, Result, Scene, Way, measured, query
 from tests.e2e.processes import module, report
+from tests.ports import free_port
 
 KEPT_S = 1.6
 """The longest time for which a listener believes in a controller that is gone and is sent nothing: keep-alive's second,

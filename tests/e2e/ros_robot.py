@@ -24,8 +24,9 @@ from typing import Any
 import zenoh
 
 from gateways.ros2.conformance.strict_robot import HASHES, RELIABLE, StrictRobot, config, gid_of
-from tests.e2e.conftest import HOST, Bench, configuration, device, free_port, until
+from tests.e2e.conftest import HOST, Bench, configuration, device, until
 from tests.e2e.processes import Finding, report
+from tests.ports import free_port
 
 LATE_S = 0.5
 """Seconds within which the robot must be at rest after what the way says, on a machine that is not busy."""

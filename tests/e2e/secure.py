@@ -21,8 +21,9 @@ import zenoh
 
 from tests.access import COLUMNS, LAB, OTHER, REALM, Try, granted_by_the_code, tries
 from tests.certificates import Authority
-from tests.e2e.conftest import HOST, WAIT_S, free_port, until
+from tests.e2e.conftest import HOST, WAIT_S, until
 from tests.machine import Patience
+from tests.ports import free_port
 from zbridge.app.access import Column, Keys, Kind, expressions
 from zbridge.app.roles import Member, Roles, save_roles
 

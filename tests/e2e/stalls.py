@@ -45,10 +45,11 @@ from typing import Any
 import zenoh
 
 from tests.e2e import loss
-from tests.e2e.conftest import Fleet, Gateway, configuration, device, free_port
+from tests.e2e.conftest import Fleet, Gateway, configuration, device
 from tests.e2e.fragile import GOES_ON, ROBOTS
 from tests.e2e.processes import LINE_S, Part, Road, go_apart, module
 from tests.e2e.robots import SCALE
+from tests.ports import free_port
 
 LIMIT_S = 1.5
 """Most seconds from going on to rest."""

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 import zenoh
 
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from zbridge.app.certs import authority
 from zbridge.app.certs.authority import Request
 from zbridge.app.certs.bundle import Packing, bundle

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import zenoh
 
-from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, free_port, until
+from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, until
 from tests.e2e.robots import Robot
+from tests.ports import free_port
 from tests.proofs import packed
 from zbridge.robot.ownership import WATCH_S
 

@@ -16,8 +16,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 
 from tests.certificates import Authority
-from tests.e2e.conftest import HOST, Bench, free_port, until
+from tests.e2e.conftest import HOST, Bench, until
 from tests.e2e.foxglove_viewer import Viewer, viewing
+from tests.ports import free_port
 from tests.views.foxglove.recordings import BEGIN_NS, record
 from tests.views.protobuf import read
 from zbridge.views.pictures import foxglove_schema

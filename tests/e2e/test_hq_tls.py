@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from tests.certificates import Authority
-from tests.e2e.conftest import HOST, Bench, Gateway, device, free_port, until
+from tests.e2e.conftest import HOST, Bench, Gateway, device, until
 from tests.e2e.hq_programs import tcpudp_by_tcp
+from tests.ports import free_port
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 import zenoh
 
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from zbridge.bus import BusSettings, Sample
 from zbridge.bus.zenoh import ZenohBus, open_zenoh
 from zbridge.fleet import topics

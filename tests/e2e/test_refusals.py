@@ -16,9 +16,10 @@ import pytest
 import zenoh
 
 import zbridge
-from tests.e2e.conftest import HOST, WAIT_S, configuration, device, end, free_port, start, until
+from tests.e2e.conftest import HOST, WAIT_S, configuration, device, end, start, until
 from tests.e2e.test_certs import routing
 from tests.machine import Patience
+from tests.ports import free_port
 from zbridge.app import Gateway, load
 from zbridge.app.certs import authority
 from zbridge.app.certs.authority import Request

@@ -12,12 +12,13 @@ import pytest
 from gateways.alf.conformance.fragile_hq import FragileHq as AlfHq
 from gateways.tcpudp.conformance.fragile_hq import FragileHq as TcpHq
 from gateways.wc2ec.conformance.fragile_hq import FragileController
-from tests.e2e.conftest import HOST, Bench, device, free_port, listener, start, until
+from tests.e2e.conftest import HOST, Bench, device, listener, start, until
 from tests.e2e.fragile import Fragile, charges
 from tests.e2e.hq_scene import playing, ports, soon
 from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
+from tests.ports import free_port
 
 
 @pytest.mark.parametrize("protocol", ROBOTS)

@@ -14,8 +14,9 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.e2e.conftest import Gateway, configuration, end, free_port, start, until
+from tests.e2e.conftest import Gateway, configuration, end, start, until
 from tests.e2e.robots import STOP, Robot
+from tests.ports import free_port
 from tests.views.ros2.judge import Heard, Publisher, Ros
 
 SCAN, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"

@@ -14,11 +14,12 @@ import pytest
 import zenoh
 
 from gateways.ros2.conformance.strict_robot import HASHES, config
-from tests.e2e.conftest import HOST, Bench, device, free_port, listener, until
+from tests.e2e.conftest import HOST, Bench, device, listener, until
 from tests.e2e.fragile import charges
 from tests.e2e.hq_judge import DRIVES, LEASE_S, Alf, Ec, Program, Tcp
 from tests.e2e.hq_scene import playing, ports, soon
 from tests.e2e.ros_robot import KEY, WAYS, Scene, measure
+from tests.ports import free_port
 
 SCAN_KEY = f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{HASHES['LaserScan']}"
 

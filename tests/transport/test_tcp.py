@@ -8,7 +8,7 @@ import struct
 
 import pytest
 
-from tests.e2e.conftest import free_port
+from tests.ports import free_port
 from tests.transport.recorder import LOCAL, SOON_S, Recorder, connected, socket_of, udp_socket, until
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address

@@ -18,15 +18,14 @@ from zbridge.metrics import Count
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
-from zbridge.transport.link import STALLED_S, Link
+from zbridge.transport.link import Link
 from zbridge.transport.parcel import Parcel
+from zbridge.transport.reading import Reading
+from zbridge.transport.stalls import Stalls
 
 log = logging.getLogger("zbridge.link")
 
 _ESTABLISHED = State.ESTABLISHED
-
-LOOK_S = 0.05
-"""Seconds between two checks of a stalled link."""
 
 
 _P = ParamSpec("_P")
@@ -87,12 +86,7 @@ class Conversation:
         self.session = session
         self._linked = linked
         self._observed: Link | None = None
-        self.held = False
-        """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
         self._before = before
-        self._on_stall = stalled
-        self.blocked = False
-        """Whether nothing is written because the link is stalled."""
         self.ended: asyncio.Future[None] = loop.create_future()
         self._loop = loop
         self._clock = clock or loop.time
@@ -108,11 +102,9 @@ class Conversation:
         self._refused = refused
         self._may_warn = may_warn
         self._malformed_logged = 0
-        self._share = share
         self._surplus = surplus or Count()
-        self._rests: asyncio.TimerHandle | None = None
-        """Set while nothing is read because the share is used up."""
-        self._paused = False
+        self._stalls = Stalls(self._clock, stalled)
+        self._reading = Reading(loop, self._clock, share)
 
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
@@ -120,9 +112,9 @@ class Conversation:
     @_then_pump
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
-        self._link = self._observed = link
+        self._link = self._observed = self._reading.link = link
         self._linked(link, True)
-        if self.held:
+        if self._reading.held:
             link.hold()
         self.session.peer = link.peer
         self.session.open(self._clock())
@@ -137,19 +129,17 @@ class Conversation:
             self._pump()
         except Exception as error:
             self._fault(error)
-        if self._share is not None:
-            self._rest(self._share, begun)
+        self._reading.worked(begun)
 
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
         begun = self._clock()
-        if self._rests is not None:
+        if self._reading.rests:
             self._surplus.value += 1
             return
         self._hand_on(self.session.receive_datagram(datagram, begun))
-        if self._share is not None:
-            self._rest(self._share, begun)
+        self._reading.worked(begun)
 
     def claims(self, datagram: bytes, port: int) -> bool:
         """Ask the session whether this datagram is from its peer."""
@@ -195,7 +185,7 @@ class Conversation:
         """End: the link is gone."""
         if self._observed is not None:
             self._linked(self._observed, False)
-        self._link = self._observed = None
+        self._link = self._observed = self._reading.link = None
         self.session.lost(reason)
 
     def pump(self) -> None:
@@ -210,7 +200,7 @@ class Conversation:
         self.pump()
 
     def _pump(self) -> None:
-        if self.held:
+        if self._reading.held:
             return
         session, link = self.session, self._link
         outbox = session.outbox
@@ -218,7 +208,9 @@ class Conversation:
             session.drops_source = False
             link.drop_source()
         established = session.state is _ESTABLISHED
-        writing = link is not None and ((not established and session.over) or self._takes(link))  # last words leave
+        writing = link is not None and (
+            (not established and session.over) or self._stalls.takes(link)
+        )  # last words leave
         now = self._clock()
         while writing and link is not None and link.ready and (not established or outbox.due(now)):
             self._before()  # what becomes due while the process is frozen waits for its turn: ``now`` is older
@@ -236,7 +228,7 @@ class Conversation:
             self._end()
         else:
             ready = writing and link is not None and link.ready
-            self._set_timer(self._next(session.deadline(writing=ready), link))
+            self._set_timer(self._stalls.next(session.deadline(writing=ready), link))
 
     @_then_pump
     def close(self, reason: str) -> None:
@@ -267,30 +259,22 @@ class Conversation:
 
     def pause(self) -> None:
         """Read nothing until :meth:`resume`."""
-        self._paused = True
-        if self._link is not None:
-            self._link.pause()
+        self._reading.pause()
 
     def resume(self) -> None:
         """Read again."""
-        self._paused = False
-        if self._link is not None and self._rests is None and not self.held:
-            self._link.resume()
-
-    def _rest(self, share: FairShare, begun: float) -> None:
-        """Read nothing while the share is used up."""
-        now = self._clock()
-        rest_s = share.spent(now - begun, now)
-        if rest_s and self._rests is None and self._link is not None:
-            self._link.pause()
-            self._rests = self._loop.call_later(rest_s, self._rested)
-
-    def _rested(self) -> None:
-        self._rests = None
-        if not self._paused:
-            self.resume()
+        self._reading.resume()
 
     # A restart
+
+    @property
+    def held(self) -> bool:
+        """Whether nothing is read or written, and no timer runs: another process has the connection, or may get it."""
+        return self._reading.held
+
+    @held.setter
+    def held(self, held: bool) -> None:
+        self._reading.held = held
 
     @property
     def link(self) -> Link | None:
@@ -328,6 +312,7 @@ class Conversation:
         """Forget the connection, which another process has now: the peer notices nothing."""
         self.held = True
         self._set_timer(None)
+        self._reading.end()
         link, self._link = self._link, None
         if link is not None:
             link.release()
@@ -336,23 +321,6 @@ class Conversation:
     def _tick(self) -> None:
         self._timer = None
         self.session.expire(self._clock())
-
-    def _takes(self, link: Link) -> bool:
-        """True if the link is not stalled. A stall ends when the last byte is acknowledged."""
-        waited_s = link.unacknowledged_s
-        blocked = waited_s > (0.0 if self.blocked else STALLED_S)
-        if blocked is not self.blocked:
-            self.blocked = blocked
-            self._on_stall(blocked)
-        return not blocked
-
-    def _next(self, deadline: float | None, link: Link | None) -> float | None:
-        """Give the next time to act: the session's deadline, or the next check for a stall."""
-        waited_s = link.unacknowledged_s if link is not None else 0.0
-        if not waited_s and not self.blocked:
-            return deadline
-        look_at = self._clock() + (LOOK_S if self.blocked else max(0.0, STALLED_S - waited_s) + LOOK_S / 10)
-        return look_at if deadline is None else min(deadline, look_at)
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:
@@ -373,9 +341,7 @@ class Conversation:
 
     def _end(self) -> None:
         self._set_timer(None)
-        if self._rests is not None:
-            self._rests.cancel()
-            self._rests = None
+        self._reading.end()
         link, self._link = self._link, None
         if link is not None:
             link.close()

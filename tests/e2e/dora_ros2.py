@@ -3,60 +3,112 @@
     python3 -m venv DIR && DIR/bin/pip install dora-rs==1.1.0 pyarrow rosbags
     python -m tests.e2e.dora_ros2 DIR/bin/python
 
-It receives scan, odometry, frames and, as a late joiner, a map; its Twists drive a fragile robot. Exit code 1 if not.
+A fragile robot of each protocol stands behind a gateway of its own. dora-rs receives what each protocol has of scan,
+odometry, frames and, as a late joiner, a map; its Twists move each robot and its calls stop them. What the robots say
+themselves is looked at: they moved as told, were at rest after each stop and after the end of dora's node, and have
+nothing to complain of. Exit code 1 if not.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
-import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
-import msgpack
+from tests.e2e.ros2_scene import FRAGILE, GRID, FragileInFleet, RosScene
+from tests.e2e.stalls import LIMIT_S, TOLERANCE
 
-from tests.e2e.test_ros2 import Scene, repeated
+SPEEDS = {"tcpudp": 0.5, "alf": 0.5, "wc2ec": 0.65}
+"""What each robot tells of 0.25 m/s, in a curve of 0.5 rad/s those that can: of wheels the speed of the faster one."""
+PATIENCE_S = 90.0
+
+
+class Run:
+    """What one run of dora's node printed, by its first word."""
+
+    def __init__(self) -> None:
+        self.told: dict[str, list[dict[str, Any]]] = {"first": [], "drove": [], "stopped": [], "counts": []}
+        self.ended = 0.0
+
+    def hear(self, line: str) -> None:
+        """Take a line."""
+        print(line, end="", flush=True)
+        if line.startswith("{"):
+            told = json.loads(line)
+            self.told[next(iter(told))].append(told)
+
+
+def run(python: str, scene: RosScene) -> Run:
+    """Let dora's node run."""
+    heard = Run()
+    command = [python, str(Path(__file__).with_name("dora_node.py")), scene.ros_at, str(scene.folder / "types")]
+    node = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    scene.stack.callback(node.kill)
+    alarm = threading.Timer(PATIENCE_S, node.kill)
+    alarm.start()
+    scene.stack.callback(alarm.cancel)
+    assert node.stdout is not None
+    for line in node.stdout:
+        heard.hear(line)
+    node.wait()
+    heard.ended = time.monotonic()
+    return heard
+
+
+def faults_of(robot: FragileInFleet, heard: Run) -> list[str]:
+    """List what a robot did otherwise than it was told, once it is at rest."""
+    with contextlib.suppress(AssertionError):  # then it is late, or never at rest
+        robot.rests(PATIENCE_S / 10)
+    faults, rested = list[str](), []
+    moves = heard.told["drove"]
+    stops = [told for told in heard.told["stopped"] if told["stopped"] == robot.name]
+    ends = [*(stop["until"] for stop in stops), heard.ended]
+    if len(moves) != len(ends):
+        return [f"{robot.name}: {len(moves)} moves and {len(stops)} stops were told of"]
+    for move, end in zip(moves, ends, strict=True):
+        speeds = [speed for at, speed in robot.changes if move["since"] < at < move["until"]]
+        if not speeds or abs(speeds[-1] - SPEEDS[robot.name]) > TOLERANCE:
+            faults.append(f"{robot.name} at {speeds[-3:]} while it was driven by {move['drove']}")
+        rest = next((at for at, speed in robot.changes if at > move["until"] and not speed), None)
+        rested.append(rest - end if rest is not None else None)
+    faults += [f"{robot.name}: {stop['answer']}" for stop in stops if not stop["answer"]["success"]]
+    shown = ", ".join("never" if late_s is None else f"{late_s:+.3f}" for late_s in rested)
+    print(f"{robot.name}: at rest after answered stops and after the node's end: {shown} s")
+    if None in rested or max(late_s for late_s in rested if late_s is not None) > LIMIT_S:
+        faults.append(f"{robot.name} at rest after {shown} s")
+    return faults
+
+
+def complaints_of(robot: FragileInFleet) -> list[str]:
+    """End a robot; list what it complains of."""
+    try:
+        robot.judged()
+    except AssertionError as error:
+        return [f"{robot.name}: {error}"]
+    return []
 
 
 def main() -> int:
     """Start the scene and the judge; say what came."""
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        scene = Scene(stack, folder)
-        ranges = struct.pack("<769f", *range(769))
-        scan = {"angle_min": -2.3, "angle_increment": 0.006, "range_min": 0.02, "range_max": 5.6, "ranges": ranges}
-        grid = {"rows": 1, "columns": 3, "cell": 0.5, "origin": [0.0, 0.0], "cells": bytes([0, 1, 2])}
-        shown = {"scan": scan, "pose": {"x": 1.0, "y": 2.0, "heading": 0.5}, "map": grid}
-
-        def publish() -> None:
-            for name, fields in shown.items():
-                scene.fleet.put(f"fleet/r1/{name}", msgpack.packb({**fields, "stamp_ns": time.time_ns()}))
-
-        stack.enter_context(repeated(publish, 0.1))
-        begun = time.monotonic()
-        command = [sys.argv[1], str(Path(__file__).with_name("dora_node.py")), scene.ros_at, str(folder / "types")]
-        watched: list[str] = []
-        judge = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        stack.callback(judge.kill)
-        alarm = threading.Timer(90.0, judge.kill)
-        alarm.start()
-        stack.callback(alarm.cancel)
-        assert judge.stdout is not None
-        for line in judge.stdout:
-            print(line, end="", flush=True)
-            watched.append(line)
-        told = scene.told("r1: cmd_vel", "")
-        moves = scene.moves(begun)
-        print(f"the robot moved {len(moves)} times, at {sorted(set(moves))}; then: {told}")
-        counts = next((json.loads(line.removeprefix("counts ")) for line in watched if line.startswith("counts")), {})
-        good = bool(counts) and all(counts.values()) and bool(moves) and all(abs(m - 0.5) < 1e-3 for m in moves)
-        print("agreed" if good else "NOT agreed")
-        return 0 if good else 1
+        scene = RosScene(stack, folder)
+        robots = [FragileInFleet(scene, protocol) for protocol in FRAGILE]
+        first = scene.ros.subscribe("/tcpudp/map", GRID, latched=True)
+        first.until(bool)  # from now on nothing is asked for again when somebody comes late
+        heard = run(sys.argv[1], scene)
+        faults = [fault for robot in robots for fault in faults_of(robot, heard)]
+        faults += [fault for robot in robots for fault in complaints_of(robot)]
+        counts = next((told["counts"] for told in heard.told["counts"]), {"anything": 0})
+        faults += [f"nothing came of {name}" for name, count in counts.items() if not count]
+        print("\n".join(faults) if faults else "agreed")
+        return 1 if faults else 0
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,49 +13,24 @@ import msgpack
 import pytest
 import zenoh
 
-from tests.e2e.conftest import Gateway, configuration, end, start, until
+from tests.e2e.conftest import Gateway, configuration, device, start, until
 from tests.e2e.robots import STOP, Robot
+from tests.e2e.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, repeated
 from tests.ports import free_port
-from tests.views.ros2.judge import Heard, Publisher, Ros
+from tests.views.ros2.judge import Publisher, Ros
 
-SCAN, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
-TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
-DIAGNOSED = "diagnostic_msgs/msg/DiagnosticArray"
 
 
-class Scene:
-    """A scripted robot behind a real gateway, the view, ROS's router, and a session on the fleet's bus."""
+class Scene(RosScene):
+    """A scripted robot behind a real gateway, and the view."""
 
     def __init__(self, stack: contextlib.ExitStack, folder: Path) -> None:
         self.robot = Robot()
         stack.callback(self.robot.close)
-        self.fleet_at, self.ros_at = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
-        self.fleet = zenoh.open(configuration("router", self.fleet_at))
-        stack.callback(self.fleet.close)
-        self.ros_router = zenoh.open(configuration("router", self.ros_at))
-        stack.callback(self.ros_router.close)
-        device = f'[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:{self.robot.port}"]\n'
-        Gateway(stack, folder / "r1.toml", self.fleet_at, device)
-        file = folder / "ros2.toml"
-        file.write_text(f'drive = true\nros = ["{self.ros_at}"]\n[robot.r1]\nspeed_full_mps = 0.5\n')
-        log = stack.enter_context((folder / "ros2.log").open("w"))
-        self.view = start("ros2", str(file), "--connect", self.fleet_at, stdout=log)
-        stack.callback(lambda: end(self.view))
-        self.ros = Ros(self.ros_at, "teleop")
-        stack.callback(self.ros.close)
-        self.diagnosed = self.ros.subscribe("/r1/diagnostics", DIAGNOSED)
+        super().__init__(stack, folder, "[robot.r1]\nspeed_full_mps = 0.5\n")
+        Gateway(stack, folder / "r1.toml", self.fleet_at, device(self.robot.port))
         self.told("r1: state", "established")
-
-    def told(self, name: str, text: str) -> str:
-        """Wait until a diagnostic of this name holds a text, in its message or values."""
-
-        def shown(heard: list[Heard]) -> str | None:
-            entries = [entry for entry in heard[-1].message.status if entry.name == name] if heard else []
-            texts = [" ".join([each.message, *(f"{v.key}={v.value}" for v in each.values)]) for each in entries]
-            return next((each for each in texts if text in each), None)
-
-        return shown(self.diagnosed.until(shown)) or ""
 
     def moves(self, since: float = 0.0) -> list[float]:
         """Give the speeds of the frames that moved the robot after a moment, in the order they came."""
@@ -76,35 +50,12 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
 
 
 @contextlib.contextmanager
-def repeated(act: Callable[[], None], every_s: float = 0.05) -> Iterator[None]:
-    """Do something again and again, as a stick does that is pushed."""
-    ended = threading.Event()
-
-    def go_on() -> None:
-        while not ended.wait(every_s):
-            act()
-
-    thread = threading.Thread(target=go_on, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-
-
-@contextlib.contextmanager
 def publishing(scene: Scene, type_name: str = TWIST) -> Iterator[Publisher]:
-    """Have a publisher on cmd_vel that the view knows and that may drive."""
-    publisher = scene.ros.publisher("/r1/cmd_vel", type_name)
-    try:
-        with repeated(publisher.twist):
-            scene.told("r1: cmd_vel", "/teleop=may drive")
+    """Have a publisher on cmd_vel that may drive; at the end the robot is nobody's again."""
+    with scene.publishing("r1", type_name) as publisher:
         yield publisher
-    finally:
-        publisher.close()
-        until(scene.rests, what="rest")
-        scene.told("r1: control", "free" if "stopped" not in scene.told("r1: control", "") else "stopped")
+    until(scene.rests, what="rest")
+    scene.told("r1: control", "free" if "stopped" not in scene.told("r1: control", "") else "stopped")
 
 
 def test_the_graph_shows_a_node_for_the_robot_and_what_it_offers(scene: Scene) -> None:
@@ -209,6 +160,11 @@ def test_a_call_switches_and_a_malformed_one_has_an_error(scene: Scene) -> None:
         errors = [reply.err.payload.to_bytes() for reply in replies if reply.err is not None]
         assert errors, payload
         assert b"malformed" in errors[0]
+
+
+def test_a_request_without_fields_may_be_empty_as_dora_rs_writes_it(scene: Scene) -> None:
+    response, _ = scene.ros.call("/r1/stop", TRIGGER, b"\x00\x01\x00\x00")
+    assert (response.success, response.message) == (True, "")
 
 
 def test_garbage_wrong_types_and_strangers_are_counted_and_move_nothing(scene: Scene) -> None:

@@ -103,11 +103,15 @@ class Ros:
         return Publisher(self, key, type_name, token, self._kept.pop())
 
     def call(self, service: str, type_name: str, request: Any) -> tuple[Any, bytes]:
-        """Call a service; return its response, and what stands beside it. A client of ROS takes the first reply."""
+        """Call a service; return its response, and what stands beside it. A client of ROS takes the first reply.
+
+        request: a message, or its CDR.
+        """
         key, token = self._endpoint("SC", service, type_name, DEFAULT)
         attachment = (1).to_bytes(8, "little") + time.time_ns().to_bytes(8, "little") + b"\x10" + gid(token)
         name = type_name.replace("/srv/", "/msg/")
-        payload = bytes(self.store.serialize_cdr(request, f"{name}_Request"))
+        given = isinstance(request, bytes)
+        payload = request if given else bytes(self.store.serialize_cdr(request, f"{name}_Request"))
         target, none = zenoh.QueryTarget.ALL_COMPLETE, zenoh.ConsolidationMode.NONE
         for reply in self.session.get(
             key, payload=payload, attachment=attachment, target=target, consolidation=none, timeout=SOON_S

@@ -20,6 +20,8 @@ AT_ONCE = 16
 MOST_BYTES = 64
 """Bound of a request."""
 Work = Callable[[Any], Awaitable[None]]
+_WITHOUT_FIELDS = (b"\x00\x01\x00\x00", b"\x00\x00\x00\x00")
+"""CDR of no fields at all, in both byte orders."""
 
 
 class Services:
@@ -63,7 +65,7 @@ class Services:
             attachment = read_attachment(query.attachment)
             if len(query.payload) > MOST_BYTES:
                 raise ProtocolError(f"request of {len(query.payload)} bytes exceeds {MOST_BYTES}")
-            request = self._side.types.decode(f"{type_name}_Request", query.payload)
+            request = self._read(type_name, query.payload)
         except ProtocolError as error:
             self._refused.value += 1
             query.refuse(Malformed(str(error)))
@@ -75,6 +77,12 @@ class Services:
         task = asyncio.get_running_loop().create_task(self._carry_out(type_name, work, request, attachment, query))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    def _read(self, type_name: str, payload: bytes) -> Any:
+        """Read a request; ``None`` of one without fields, for which ROS writes a byte and dora-rs nothing."""
+        if type_name == TRIGGER and payload in _WITHOUT_FIELDS:
+            return None
+        return self._side.types.decode(f"{type_name}_Request", payload)
 
     async def _carry_out(
         self, type_name: str, work: Work, request: Any, attachment: Attachment, query: IncomingQuery

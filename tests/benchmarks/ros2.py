@@ -103,11 +103,6 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) * _TICK_S
 
 
-def memory_mb(pid: int) -> float:
-    """Return the resident memory of a process."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def scan(number: int) -> bytes:
     """Make a scan whose first range is a number."""
     ranges = np.full(POINTS, 2.0, np.float32)
@@ -268,35 +263,6 @@ def costs(scene: Scene, seconds: float) -> None:
     print(f"{ROBOTS} robots at {RATE_HZ:g} Hz, nobody listens: {share:.2%} of a core")
 
 
-def hostile(scene: Scene, seconds: float) -> None:
-    """Flood cmd_vel from strangers, among a thousand foreign nodes; print what comes of it."""
-    stranger = Ros(scene.ros_at, "stranger")
-    key, zid = stranger._names("/r0/cmd_vel", TWIST)[0], stranger.session.zid()
-    nodes = [stranger._token(f"{zid}/{number}/{number}/NN/%/%/n{number}") for number in range(1000)]
-    liars = [stranger.publisher("/r0/cmd_vel", "std_msgs/msg/String") for _ in range(100)]
-    payload = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
-    declared = stranger.session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
-    time.sleep(1.0)
-    before, cpu, at, sent, moved = (
-        memory_mb(scene.view),
-        cpu_s(scene.view),
-        time.monotonic(),
-        0,
-        len(scene.robot.frames),
-    )
-    while time.monotonic() - at < seconds:
-        for number in range(1000):
-            declared.put(payload, attachment=(sent + number).to_bytes(16, "little") + b"\x10" + os.urandom(16))
-        sent += 1000
-    passed, used = time.monotonic() - at, cpu_s(scene.view) - cpu
-    moves = sum(frame.moves for frame in scene.robot.frames[moved:])
-    print(
-        f"strangers: {sent / passed:.0f} samples a second, {len(nodes)} nodes, {len(liars)} of a wrong type: robot "
-        f"moved {moves} times, memory {before:.0f} MB, then {memory_mb(scene.view):.0f}, {used / passed:.0%} of a core"
-    )
-    stranger.close()
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -313,7 +279,6 @@ def main() -> None:
             mine, other = median(view.times), median(bare.times)
             print(f"{name}: p50 {mine:.0f} us, relay {other:.0f} us, ratio {mine / other:.2f}")
         costs(scene, given.seconds)
-        hostile(scene, given.seconds)
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ def test_a_twist_drives_a_fragile_robot_and_its_silence_or_end_stops_it(scene: R
                 robot.moves(FORWARD_MPS / FULL_MPS)
             silent_at = time.monotonic()
             assert robot.rests() > silent_at, "it was still driven"
+            scene.told(f"{protocol}: cmd_vel", "silent for 0.5 s while it drove")
             with repeated(publisher.twist):
                 scene.told(f"{protocol}: cmd_vel", "/teleop=may drive")
             with repeated(lambda: publisher.twist(FORWARD_MPS, TURN_RADPS)):

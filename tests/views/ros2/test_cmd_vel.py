@@ -70,6 +70,8 @@ def test_both_types_are_read_and_the_stamp_says_nothing() -> None:
         (b"\x07\x07\x00\x00" + bytes(48), ProtocolError),
         (HEADER + struct.pack("<6d", math.nan, 0, 0, 0, 0, 0), Malformed),
         (HEADER + struct.pack("<6d", 0, 0, 0, 0, 0, math.inf), Malformed),
+        (HEADER + struct.pack("<6d", 0.25, 0, math.nan, 0, 0, 0), Malformed),
+        (HEADER + struct.pack("<6d", -2e6, 0, 0, 0, 0, 0), Malformed),
     ],
 )
 def test_garbage_and_numbers_without_end_are_errors(payload: bytes, error: type[Exception]) -> None:

@@ -15,20 +15,23 @@ MOST_BYTES: Mapping[str, int] = {TWIST: 64, STAMPED: 512}
 """Bounds of the payloads; a stamped one has the name of a frame."""
 _STILL = 1e-6
 """m/s and rad/s below this are zero."""
+_LARGEST = 1e6
+"""m/s and rad/s above this are no command: most random bytes say so."""
 
 
 def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Drive:
     """Read a Twist or TwistStamped; its stamp says nothing here: clocks of machines are never compared.
 
-    Raises ProtocolError for what is none, Malformed for numbers that are not finite, Unsupported for a turn on the
-    spot of a robot that steers.
+    Raises ProtocolError for what is none, Malformed for numbers that no command has, Unsupported for a turn on the spot
+    of a robot that steers.
     """
     message = types.decode(type_name, payload)
     twist = message.twist if type_name == STAMPED else message
-    forward, left, turn = twist.linear.x, twist.linear.y, twist.angular.z
-    if not (math.isfinite(forward) and math.isfinite(left) and math.isfinite(turn)):
-        raise Malformed("cmd_vel: expected finite numbers")
-    return drive_of(forward, left, turn, body)
+    linear, angular = twist.linear, twist.angular
+    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    if not all(abs(value) <= _LARGEST for value in values):  # false for NaN
+        raise Malformed(f"cmd_vel: expected numbers of {_LARGEST:g} at most")
+    return drive_of(linear.x, linear.y, angular.z, body)
 
 
 def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: Body) -> Drive:

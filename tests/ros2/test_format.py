@@ -147,6 +147,12 @@ def test_an_attachment_is_number_time_length_and_gid() -> None:
     assert read_attachment(data) == Attachment(7, 1_700_000_000_000_000_000, gid)
 
 
+def test_an_attachment_of_an_rmw_zenoh_from_before_the_format_was_changed_is_named() -> None:
+    parts = (b"\x0fsequence_number", bytes(8), b"\x10source_timestamp", bytes(8), b"\x0asource_gid", b"\x10", bytes(16))
+    with pytest.raises(ProtocolError, match=r"old rmw_zenoh: expected 0.2.5 \(jazzy\)"):
+        read_attachment(b"".join(parts))
+
+
 @pytest.mark.parametrize(
     "data",
     [None, b"", bytes(32), bytes(33), bytes(16) + b"\x11" + bytes(16), struct.pack("<qq", -1, 0) + b"\x10" + bytes(16)],

@@ -10,6 +10,8 @@ from zbridge.errors import ProtocolError
 
 _FORMAT = struct.Struct("<qqB16s")
 GID_BYTES = 16
+_NAMED = b"\x0fsequence_number"
+"""How attachments began that rmw_zenoh wrote before its release 0.2.5 (jazzy) and 0.1.2 (humble)."""
 
 
 class Attachment(msgspec.Struct, frozen=True):
@@ -29,6 +31,8 @@ class Attachment(msgspec.Struct, frozen=True):
 
 def read_attachment(data: bytes | None) -> Attachment:
     """Read it; raise ProtocolError if it is missing, has another length, or negative numbers."""
+    if data is not None and data.startswith(_NAMED):
+        raise ProtocolError("attachment of an old rmw_zenoh: expected 0.2.5 (jazzy), 0.1.2 (humble) or later")
     if data is None or len(data) != _FORMAT.size:
         raise ProtocolError(f"attachment of {len(data or b'')} bytes: expected {_FORMAT.size}")
     number, stamp_ns, length, gid = _FORMAT.unpack(data)

@@ -186,6 +186,17 @@ def test_distance_sensors_have_a_topic_each_and_joints_have_one() -> None:
     assert made(pictures, Reading(1.0, "light", 3), "sensor/eye") == {}
 
 
+def test_a_joint_that_is_at_fault_or_gone_is_not_told_of() -> None:
+    pictures = robot()
+    pictures.sensors((Device("wheel", 1, "rotational"), Device("lift", 2, "linear")))
+    assert made(pictures, Reading(math.inf, "rotational", 1, fault=True), "sensor/wheel") == {}
+    made(pictures, Reading(0.5, "rotational", 1), "sensor/wheel")
+    joints = made(pictures, Reading(0.1, "linear", 2), "sensor/lift")["joint_states"]
+    assert (joints.name, joints.position.tolist()) == (["wheel", "lift"], [0.5, 0.1])
+    pictures.sensors((Device("lift", 2, "linear"),))
+    assert made(pictures, Reading(0.2, "linear", 2), "sensor/lift")["joint_states"].name == ["lift"]
+
+
 def test_fixed_frames_and_the_description_know_the_scanner() -> None:
     fixed = {name: cdr(shape) for name, shape in robot().fixed(NOW_NS)}
     frames = {(at.header.frame_id, at.child_frame_id): at.transform for at in fixed["tf_static"].transforms}

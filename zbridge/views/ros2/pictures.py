@@ -120,6 +120,7 @@ class RobotPictures:
                 found[name] = RosTopic(f"range/{name}", "sensor_msgs/msg/Range", SENSOR_DATA, (SENSORS,))
             else:
                 found[JOINTS.name] = JOINTS
+        self._positions = {name: at for name, at in self._positions.items() if name in self._names.values()}
         return list(found.values())
 
     def fixed(self, now_ns: int) -> Made:
@@ -215,7 +216,7 @@ class RobotPictures:
         if kind == "range":
             if f"range/{name}" in wanted:
                 yield f"range/{name}", self._shapes.range_of(name, reading, stamp_ns)
-        elif JOINTS.name in wanted:
+        elif JOINTS.name in wanted and not reading.fault:  # a joint has no number for what nobody knows
             self._positions[name] = reading.value
             yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
 

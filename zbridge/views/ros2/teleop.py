@@ -1,6 +1,8 @@
 """Lets publishers on a robot's cmd_vel drive it, one at a time, through the lease.
 
 Theory of operation. A liveliness watch knows the publishers by their tokens, and :mod:`driving` what each may do.
+Zenoh loses the news of some tokens while many come and go at once: they are asked for again, at most every
+:data:`ASK_S`, where somebody unknown commands or there is no place for another publisher.
 :meth:`Teleop._sort` runs on Zenoh's threads: it drops what no known publisher sent, and what comes faster than
 :data:`RATE_HZ`, before the event loop hears of it. The rest is read (``cmd_vel``), and carried out by ``holder``.
 """
@@ -8,18 +10,19 @@ Theory of operation. A liveliness watch knows the publishers by their tokens, an
 from __future__ import annotations
 
 import asyncio
+import math
 from functools import partial
 
 from zbridge.bus import Bus, Handle, Lane, Look, Sample
 from zbridge.client import Robot
-from zbridge.errors import Malformed, PayloadError, ProtocolError, Unsupported
+from zbridge.errors import BusError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Control, Drive
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.ros2 import KEEP_LAST_10, Endpoint, Kind, Node, endpoints_of, read_attachment, read_token
 from zbridge.views.ros2.cmd_vel import MOST_BYTES, read_twist
 from zbridge.views.ros2.diagnostics import MOST_VALUES, OK, WARN, Entry, cut
-from zbridge.views.ros2.driving import Action, Decision, Driving, Standing
+from zbridge.views.ros2.driving import PUBLISHERS, QUIET_S, Action, Decision, Driving, Standing
 from zbridge.views.ros2.holder import Holder
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import Body
@@ -30,6 +33,8 @@ STRANGERS_HZ = 5.0
 """Commands a second of publishers without a token that are counted as refused one by one."""
 SETTLE_S = 1.0
 """Tokens that come within this time of a connection were there before."""
+ASK_S = 2.0
+"""Least time between two questions for the publishers' tokens."""
 WRONG_TYPES = 16
 """Publishers of a type that is no Twist, or of another version of it, that are shown."""
 _ATTACHED_BYTES = 33
@@ -60,12 +65,17 @@ class Teleop:
         self._known: dict[bytes, bytes] = {}
         """By each gid that such a publisher may send with, the one it is known by."""
         self._strangers = RateLimit(STRANGERS_HZ)
+        self._tokens: dict[str, bytes] = {}
+        """The gids of the publishers that are known, by their tokens."""
+        self._asked_at = -math.inf
+        self._asking: asyncio.Task[None] | None = None
         self._wrong: dict[str, str] = {}
         """By the tokens of publishers of another type, what they are."""
         self._timer: asyncio.TimerHandle | None = None
         self._counts = {name: side.metrics.count(f"ros2_cmd_vel_{name}") for name in _COUNTS}
         self._settled_at = self._loop.time() + SETTLE_S
         self.topic = f"{node.namespace}/cmd_vel"
+        self._publishers = endpoints_of(side.domain, Kind.PUBLISHER, self.topic)
         self._handles = self._declare(node)
 
     def __repr__(self) -> str:
@@ -78,7 +88,7 @@ class Teleop:
             sort = partial(self._sort, MOST_BYTES[type_name])
             handles.append(bus.subscribe(endpoint.key, partial(self._take, type_name), lane=sort))
             handles.append(bus.announce(endpoint.token()))
-        handles.append(bus.watch_alive(endpoints_of(self._side.domain, Kind.PUBLISHER, self.topic), self._on_token))
+        handles.append(bus.watch_alive(self._publishers, self._on_token))
         return handles
 
     async def close(self) -> None:
@@ -87,8 +97,9 @@ class Teleop:
         for handle in handles:
             handle.close()
         self._watch_control(False)
-        if self._timer is not None:
-            self._timer.cancel()
+        for waiting in (self._timer, self._asking):
+            if waiting is not None:
+                waiting.cancel()
         await self._holder.close()
 
     # Who is there
@@ -97,27 +108,33 @@ class Teleop:
         """ROS's router was found again, or lost: then nobody is there."""
         self._settled_at = self._loop.time() + SETTLE_S
         if not up:
-            for gid in list(self._driving.publishers):
-                self._forget(gid)
+            for token in list(self._tokens):
+                self._forget(token)
 
-    def _on_token(self, token: str, alive: bool) -> None:
+    def _on_token(self, token: str, alive: bool, *, late: bool = False) -> None:
+        """Enter a publisher, or forget it. late: it was there before, and we did not know."""
         endpoint = read_token(token)
         if not isinstance(endpoint, Endpoint) or endpoint.kind is not Kind.PUBLISHER:
             self._counts["tokens_unreadable"].value += 1
             return
-        types = self._side.types
-        if endpoint.type_name not in MOST_BYTES or endpoint.type_hash != types.hash(endpoint.type_name):
+        if not self._is_twist(endpoint):
             self._note_wrong(token, endpoint, alive)
             return
         gid, now = endpoint.gid(), self._loop.time()
         if not alive:
-            self._forget(gid)
-        elif self._driving.came(gid, endpoint.node.full_name, now, early=now < self._settled_at):
+            self._forget(token)
+        elif self._driving.came(gid, endpoint.node.full_name, now, early=late or now < self._settled_at):
+            self._tokens[token] = gid
             self._limits.setdefault(gid, RateLimit(RATE_HZ))
             self._known.update(dict.fromkeys(endpoint.gids(), gid))
         else:
             self._counts["publishers_refused"].value += 1
+            self._ask()
         self._watch_control(bool(self._driving.publishers))
+
+    def _is_twist(self, endpoint: Endpoint) -> bool:
+        name = endpoint.type_name
+        return name in MOST_BYTES and endpoint.type_hash == self._side.types.hash(name)
 
     def _note_wrong(self, token: str, endpoint: Endpoint, alive: bool) -> None:
         if not alive:
@@ -127,11 +144,39 @@ class Teleop:
             if len(self._wrong) < WRONG_TYPES:
                 self._wrong[token] = f"{endpoint.node.full_name} publishes {endpoint.type_name} {endpoint.type_hash}"
 
-    def _forget(self, gid: bytes) -> None:
+    def _forget(self, token: str) -> None:
+        gid = self._tokens.pop(token, None)
+        if gid is None:
+            return
         for also in [also for also, known in self._known.items() if known == gid]:
             del self._known[also]
         self._limits.pop(gid, None)
         self._carry_out(self._driving.gone(gid))
+
+    def _ask(self) -> None:
+        """Ask who is there, now and then."""
+        now = self._loop.time()
+        if self._asking is None and now - self._asked_at >= ASK_S and self._handles:
+            self._asked_at = now
+            self._asking = self._loop.create_task(self._look())
+
+    async def _look(self) -> None:
+        """Forget the publishers that have gone, were they not heard lately; enter those that we were not told of."""
+        known, asked_at = set(self._tokens), self._asked_at
+        try:
+            alive = set(await self._side.bus.alive(self._publishers))
+        except BusError:
+            return
+        finally:
+            self._asking = None
+        heard_at = {gid: publisher.heard_at for gid, publisher in self._driving.publishers.items()}
+        for token in known - alive:
+            if heard_at.get(self._tokens.get(token, b""), math.inf) < asked_at - QUIET_S:
+                self._on_token(token, False)
+        for token in alive - self._tokens.keys():
+            endpoint = read_token(token)
+            if isinstance(endpoint, Endpoint) and self._is_twist(endpoint) and len(self._tokens) < PUBLISHERS:
+                self._on_token(token, True, late=True)
 
     def _watch_control(self, wanted: bool) -> None:
         """Look who stops the robot, while there is a publisher."""
@@ -184,6 +229,8 @@ class Teleop:
             self._counts["malformed"].value += 1
             return
         gid = self._known.get(attachment.gid, attachment.gid)
+        if gid not in self._limits:
+            self._ask()
         decision = self._driving.heard(gid, drive.moving, self._loop.time(), wrong)
         if decision.action is Action.SEND:  # the way of nearly all
             self._holder.send(drive)

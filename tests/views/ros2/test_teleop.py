@@ -1,0 +1,89 @@
+"""Publishers whose tokens come or go unheard: they are asked for."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from typing import Any
+
+import pytest
+
+from zbridge.bus.fake import FakeBus
+from zbridge.bus.interface import Sample
+from zbridge.client import Fleet
+from zbridge.metrics import Metrics
+from zbridge.ros2 import KEEP_LAST_10, Attachment, Endpoint, Kind, Node, types_of
+from zbridge.views.ros2.cmd_vel import TWIST
+from zbridge.views.ros2.driving import PUBLISHERS, Standing
+from zbridge.views.ros2.outlets import RosSide
+from zbridge.views.ros2.settings import Body
+from zbridge.views.ros2.teleop import ASK_S, SETTLE_S, Teleop
+
+pytestmark = pytest.mark.jumping
+FORWARD = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
+
+
+class Scene:
+    """The cmd_vel of a robot, and what publishes there."""
+
+    def __init__(self) -> None:
+        self.bus = FakeBus()
+        self.side = RosSide(self.bus, 0, types_of("jazzy"), Metrics())
+        robot = Fleet(FakeBus(), "fleet", None)["r1"]
+        node = self.side.node("/r1", "zbridge")
+        self.teleop = Teleop(self.side, node, robot, Body(), FakeBus(), "fleet/r1/control", "ros2")
+        self.driving: Any = self.teleop._driving
+
+    def endpoint(self, number: int = 1) -> Endpoint:
+        return self.side.endpoint(
+            Node(0, "abc", number, "/", "nav"), Kind.PUBLISHER, "/r1/cmd_vel", TWIST, KEEP_LAST_10
+        )
+
+    def put(self, endpoint: Endpoint) -> None:
+        beside = Attachment(1, 1, endpoint.gid()).encode()
+        self.teleop._take(TWIST, Sample(endpoint.key, FORWARD, beside))
+
+    def unheard(self, *tokens: str) -> None:
+        """Change the publishers that are there, and tell nobody."""
+        there = self.bus._shared.tokens
+        there[:] = [*(token for token in there if "/MP/" not in token), *tokens]
+
+
+async def test_a_publisher_whose_token_came_unheard_is_found_when_it_commands_and_owes() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    endpoint = scene.endpoint()
+    scene.unheard(endpoint.token())
+    scene.put(endpoint)
+    assert scene.driving.publishers == {}
+    await asyncio.sleep(ASK_S / 2)
+    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.OWES]
+    await scene.teleop.close()
+
+
+async def test_publishers_that_went_unheard_make_room_for_others() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    gone = [scene.bus.announce(scene.endpoint().token()) for _ in range(PUBLISHERS)]
+    await asyncio.sleep(ASK_S)
+    endpoint = scene.endpoint()
+    scene.unheard()
+    scene.bus.announce(endpoint.token())
+    assert endpoint.gid() not in scene.driving.publishers, "there is no place"
+    await asyncio.sleep(ASK_S / 2)
+    assert list(scene.driving.publishers) == [endpoint.gid()]
+    assert len(gone) == PUBLISHERS
+    await scene.teleop.close()
+
+
+async def test_a_publisher_that_was_heard_lately_stays_although_its_token_is_not_told() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    known, stranger = scene.endpoint(), scene.endpoint()
+    scene.bus.announce(known.token())
+    scene.put(known)
+    scene.unheard()
+    scene.put(stranger)
+    await asyncio.sleep(0.1)
+    assert list(scene.driving.publishers) == [known.gid()]
+    await scene.teleop.close()

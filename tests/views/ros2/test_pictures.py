@@ -26,12 +26,12 @@ from zbridge.fleet.messages import (
 from zbridge.metrics import Metrics
 from zbridge.ros2 import DISTROS, types_of
 from zbridge.views.ros2.pictures import TOPICS, RobotPictures
-from zbridge.views.ros2.settings import Body, Laser
+from zbridge.views.ros2.settings import Body, Mount
 
 NOW_NS = 1_800_000_000_500_000_000
 STAMP_NS = NOW_NS - 20_000_000
 EVERYTHING = {topic.name for topic in TOPICS} | {"range/front_left", "joint_states"}
-BODY = Body(speed_full_mps=2.0, laser=Laser(0.1, 0.0, 0.3, math.pi / 2))
+BODY = Body(speed_full_mps=2.0, laser=Mount(0.1, 0.0, 0.3, math.pi / 2))
 STORES = {distro: get_typestore(Stores(f"ros2_{distro}")) for distro in DISTROS}
 
 
@@ -208,6 +208,20 @@ def test_fixed_frames_and_the_description_know_the_scanner() -> None:
     assert 'rpy="0 0 1.5708"' in fixed["robot_description"].data
     alone = {name: cdr(shape) for name, shape in robot(body=Body(map_to_odom=False)).fixed(NOW_NS)}
     assert [at.child_frame_id for at in alone["tf_static"].transforms] == ["r1/laser"]
+
+
+def test_sensors_and_the_camera_have_the_frames_of_their_messages_where_it_is_known_where_they_are() -> None:
+    body = Body(sensors={"front left": Mount(0.2, 0.1, 0.05, math.pi / 2), "camera": Mount(z=0.4)})
+    pictures = robot(body=body)
+    fixed = {name: cdr(shape) for name, shape in pictures.fixed(NOW_NS)}
+    frames = {at.child_frame_id: (at.header.frame_id, at.transform) for at in fixed["tf_static"].transforms}
+    pictures.sensors((Device("front left", 1, "distance"),))
+    seen = made(pictures, Reading(0.5, "distance", 1), "sensor/front%20left")["range/front_left"].header.frame_id
+    image = made(pictures, Image("jpeg", b"picture"))["image/compressed"].header.frame_id
+    assert {seen, image} <= set(frames)
+    parent, place = frames[seen]
+    assert (parent, place.translation.x, place.translation.y, place.translation.z) == ("r1/base_link", 0.2, 0.1, 0.05)
+    assert place.rotation.z == pytest.approx(math.sqrt(0.5))
 
 
 def test_diagnostics_tell_state_links_control_and_refusals() -> None:

@@ -125,8 +125,9 @@ class RobotPictures:
 
     def fixed(self, now_ns: int) -> Made:
         """Make what never changes."""
-        laser = self._body.laser
-        pairs = {(self.frames.base, self.frames.laser): (Pose(laser.x, laser.y, laser.yaw), laser.z)}
+        mounts = {self.frames.sensor(name): mount for name, mount in self._body.sensors.items()}
+        mounts[self.frames.laser] = self._body.laser
+        pairs = {(self.frames.base, frame): (Pose(at.x, at.y, at.yaw), at.z) for frame, at in mounts.items()}
         if self._body.map_to_odom:
             pairs[self.frames.map, self.frames.odom] = (Pose(0.0, 0.0, 0.0), 0.0)
         yield "tf_static", self._shapes.transforms(pairs, now_ns)

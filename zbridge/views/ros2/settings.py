@@ -21,8 +21,8 @@ Above = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 Metres = Annotated[float, msgspec.Meta(ge=-1e3, le=1e3)]
 
 
-class Laser(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the scanner is on the robot: metres from the robot's middle on the ground, radians."""
+class Mount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a scanner or another sensor is on the robot: metres from the robot's middle on the ground, radians."""
 
     x: Metres = 0.0
     y: Metres = 0.0
@@ -35,8 +35,9 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     speed_full_mps, turn_full_radps: its speeds at full scale. wheelbase_m: of a robot that steers, between its axles;
     None: it turns on the spot. steer_full_rad: how far its wheels turn at full lock; an ALF vehicle is told 90 degrees
-    then. length_m, width_m, height_m: what RViz shows. map_to_odom: tell ROS that odometry begins at the map's origin;
-    false where a program of ROS's, as slam_toolbox, tells it.
+    then. length_m, width_m, height_m: what RViz shows. sensors: where those of these names are, and the ``camera``; of
+    others no frame is told. map_to_odom: tell ROS that odometry begins at the map's origin; false where a program of
+    ROS's, as slam_toolbox, tells it.
     """
 
     speed_full_mps: Above = 1.0
@@ -46,7 +47,8 @@ class Body(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     length_m: Above = 0.4
     width_m: Above = 0.3
     height_m: Above = 0.2
-    laser: Laser = Laser()
+    laser: Mount = Mount()
+    sensors: dict[str, Mount] = {}
     map_to_odom: bool = True
 
 

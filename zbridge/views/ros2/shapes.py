@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from zbridge.fleet.messages import Battery, Image, Map, Motion, Pose, Reading, Scan, Scanner
-from zbridge.ros2 import Types
+from zbridge.ros2 import Types, ros_name
 
 POSITION_VARIANCE = 0.05**2
 """Of x and y of a pose, m2. No robot of ours tells how good its pose is: an estimate."""
@@ -67,6 +67,10 @@ class Frames(msgspec.Struct, frozen=True):
     def laser(self) -> str:
         """The scanner."""
         return f"{self.prefix}/laser"
+
+    def sensor(self, name: str) -> str:
+        """Name the frame of a sensor."""
+        return f"{self.prefix}/{ros_name(name)}"
 
 
 class Speeds(msgspec.Struct, frozen=True):
@@ -234,7 +238,7 @@ class Shapes:
         value = math.nan if reading.fault else reading.value
         return self._make(
             "sensor_msgs/msg/Range",
-            header=self.header(stamp_ns, f"{self.frames.prefix}/{name}"),
+            header=self.header(stamp_ns, self.frames.sensor(name)),
             radiation_type=1,  # infrared, as far as it says what it is
             field_of_view=_FIELD_OF_VIEW_RAD,
             min_range=_RANGE_MIN_M,

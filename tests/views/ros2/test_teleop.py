@@ -87,3 +87,21 @@ async def test_a_publisher_that_was_heard_lately_stays_although_its_token_is_not
     await asyncio.sleep(0.1)
     assert list(scene.driving.publishers) == [known.gid()]
     await scene.teleop.close()
+
+
+async def test_a_publisher_that_goes_while_the_answer_is_on_its_way_is_not_entered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    endpoint = scene.endpoint()
+
+    async def alive(_: str) -> list[str]:
+        scene.bus._shared.tell(endpoint.token(), False)
+        return [endpoint.token()]
+
+    monkeypatch.setattr(scene.bus, "alive", alive)
+    scene.put(endpoint)
+    await asyncio.sleep(ASK_S / 2)
+    assert scene.driving.publishers == {}
+    await scene.teleop.close()

@@ -69,6 +69,8 @@ class Teleop:
         """The gids of the publishers that are known, by their tokens."""
         self._asked_at = -math.inf
         self._asking: asyncio.Task[None] | None = None
+        self._left: set[str] = set()
+        """Tokens that went while the answer was on its way."""
         self._wrong: dict[str, str] = {}
         """By the tokens of publishers of another type, what they are."""
         self._timer: asyncio.TimerHandle | None = None
@@ -113,6 +115,8 @@ class Teleop:
 
     def _on_token(self, token: str, alive: bool, *, late: bool = False) -> None:
         """Enter a publisher, or forget it. late: it was there before, and we did not know."""
+        if not alive and self._asking is not None:
+            self._left.add(token)
         endpoint = read_token(token)
         if not isinstance(endpoint, Endpoint) or endpoint.kind is not Kind.PUBLISHER:
             self._counts["tokens_unreadable"].value += 1
@@ -158,6 +162,7 @@ class Teleop:
         now = self._loop.time()
         if self._asking is None and now - self._asked_at >= ASK_S and self._handles:
             self._asked_at = now
+            self._left.clear()
             self._asking = self._loop.create_task(self._look())
 
     async def _look(self) -> None:
@@ -173,7 +178,7 @@ class Teleop:
         for token in known - alive:
             if heard_at.get(self._tokens.get(token, b""), math.inf) < asked_at - QUIET_S:
                 self._on_token(token, False)
-        for token in alive - self._tokens.keys():
+        for token in alive - self._tokens.keys() - self._left:
             endpoint = read_token(token)
             if isinstance(endpoint, Endpoint) and self._is_twist(endpoint) and len(self._tokens) < PUBLISHERS:
                 self._on_token(token, True, late=True)

@@ -17,7 +17,7 @@ import zenoh
 
 from tests.e2e.conftest import WAIT_S, Fleet, Gateway, configuration, device, end, start, until
 from tests.e2e.fragile import DISTURBED, ROBOTS, charges
-from tests.e2e.stalls import TOLERANCE, MovingRobot
+from tests.e2e.stalls import HELD_UP_S, TOLERANCE, MovingRobot
 from tests.machine import Withheld
 from tests.ports import free_port
 from tests.views.ros2.judge import Heard, Publisher, Ros, Subscriber
@@ -45,6 +45,8 @@ wheelbase_m = {WHEELBASE_M}
 """
 REST_S = 0.5
 """Seconds that a robot must stay at rest."""
+ATTEMPTS = 4
+"""Attempts to move a robot, each of HELD_UP_S."""
 
 
 class RosScene:
@@ -169,3 +171,21 @@ def repeated(act: Callable[[], None], every_s: float = 0.05) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
+
+
+@contextlib.contextmanager
+def pushed(publisher: Publisher, speed_mps: float, moved: Callable[[], Any], every_s: float = 0.05) -> Iterator[None]:
+    """Push a stick until the robot has moved, and on to the end. One that a busy machine held up owes zeros first."""
+    with contextlib.ExitStack() as stack:
+        for _ in range(ATTEMPTS):
+            with contextlib.ExitStack() as attempt:
+                attempt.enter_context(repeated(lambda: publisher.twist(speed_mps), every_s))
+                with contextlib.suppress(AssertionError):
+                    until(moved, HELD_UP_S, "motion")
+                    stack.enter_context(attempt.pop_all())
+                    break
+            with repeated(publisher.twist):
+                time.sleep(0.5)
+        else:
+            raise AssertionError("the robot does not move")
+        yield

@@ -15,7 +15,7 @@ import zenoh
 
 from tests.e2e.conftest import Gateway, configuration, device, start, until
 from tests.e2e.robots import STOP, Robot
-from tests.e2e.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, repeated
+from tests.e2e.ros2_scene import GRID, SCAN, STAMPED, TWIST, RosScene, pushed, repeated
 from tests.ports import free_port
 from tests.views.ros2.judge import Publisher, Ros
 
@@ -104,8 +104,7 @@ def test_a_scan_comes_while_somebody_listens_and_a_late_joiner_gets_the_map(scen
 def test_a_twist_drives_and_silence_stops(scene: Scene, type_name: str) -> None:
     with publishing(scene, type_name) as publisher:
         begun = time.monotonic()
-        with repeated(lambda: publisher.twist(0.125)):
-            until(lambda: scene.moves(begun), what="motion")
+        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
             scene.told("r1: cmd_vel", "driven by /teleop")
             scene.told("r1: control", "held by ros2.teleop")
         assert scene.moves(begun)[-1] == pytest.approx(0.25), "0.125 m/s of 0.5 m/s"
@@ -117,8 +116,7 @@ def test_of_two_publishers_the_second_is_refused_and_told_by_whom(scene: Scene) 
     other = Ros(scene.ros_at, "nav", namespace="/planner")
     with contextlib.closing(other), publishing(scene) as publisher:
         begun = time.monotonic()
-        with repeated(lambda: publisher.twist(0.125)):
-            until(lambda: scene.moves(begun), what="motion")
+        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
             second = other.publisher("/r1/cmd_vel", TWIST)
             with repeated(lambda: second.twist(-0.5)):
                 scene.told("r1: cmd_vel", "/planner/nav=r1 is driven by /teleop")
@@ -127,8 +125,7 @@ def test_of_two_publishers_the_second_is_refused_and_told_by_whom(scene: Scene) 
 
 def test_a_publisher_that_is_gone_stops_the_robot_although_it_was_just_heard(scene: Scene) -> None:
     begun = time.monotonic()
-    with publishing(scene) as publisher, repeated(lambda: publisher.twist(0.25), 0.2):
-        until(lambda: scene.moves(begun), what="motion")
+    with publishing(scene) as publisher, pushed(publisher, 0.25, lambda: scene.moves(begun), 0.2):
         publisher.hide()
         until(scene.rests, what="rest")
         scene.told("r1: cmd_vel", "nobody drives")
@@ -137,8 +134,7 @@ def test_a_publisher_that_is_gone_stops_the_robot_although_it_was_just_heard(sce
 def test_a_called_stop_stops_and_a_pushed_stick_does_not_move_the_robot_anew(scene: Scene) -> None:
     with publishing(scene) as publisher:
         begun = time.monotonic()
-        with repeated(lambda: publisher.twist(0.25)):
-            until(lambda: scene.moves(begun), what="motion")
+        with pushed(publisher, 0.25, lambda: scene.moves(begun)):
             response, _ = scene.ros.call("/r1/stop", TRIGGER, scene.ros.request(TRIGGER, none=0))
             assert (response.success, response.message) == (True, "")
             stopped = time.monotonic()
@@ -147,8 +143,8 @@ def test_a_called_stop_stops_and_a_pushed_stick_does_not_move_the_robot_anew(sce
             assert not [frame for frame in scene.robot.frames if frame.moves and frame.at > stopped + 0.2]
         with repeated(publisher.twist):
             scene.told("r1: cmd_vel", "/teleop=may drive")
-        with repeated(lambda: publisher.twist(0.25)):
-            until(lambda: scene.moves(stopped), what="motion anew")
+        with pushed(publisher, 0.25, lambda: scene.moves(stopped)):
+            pass
 
 
 def test_a_call_switches_and_a_malformed_one_has_an_error(scene: Scene) -> None:
@@ -203,8 +199,8 @@ def test_garbage_wrong_types_and_strangers_are_counted_and_move_nothing(scene: S
             "0/8/MP/%/%/x/%r1%cmd_vel/a::msg::dds_::B_/c/::,9:,:,:,,",
         ):
             stranger._kept.append(stranger._token(f"{stranger.session.zid()}/{parts}"))
-        with repeated(lambda: publisher.twist(0.125)):
-            until(lambda: scene.moves(begun), what="motion after the flood")
+        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
+            pass
         assert all(speed == pytest.approx(0.25) for speed in scene.moves(begun))
 
 
@@ -226,8 +222,7 @@ def test_no_router_of_ros_is_an_error_that_says_how_to_start_one(scene: Scene) -
 def test_a_restart_of_ros_s_router_stops_the_robot_and_whoever_pushes_on_owes(scene: Scene) -> None:
     with publishing(scene) as publisher:
         begun = time.monotonic()
-        with repeated(lambda: publisher.twist(0.125)):
-            until(lambda: scene.moves(begun), what="motion")
+        with pushed(publisher, 0.125, lambda: scene.moves(begun)):
             scene.ros_router.close()
             until(scene.rests, what="rest")
             stopped = time.monotonic()
@@ -236,6 +231,6 @@ def test_a_restart_of_ros_s_router_stops_the_robot_and_whoever_pushes_on_owes(sc
             assert scene.moves(stopped + 0.2) == []
         with repeated(publisher.twist):
             scene.told("r1: cmd_vel", "/teleop=may drive")
-        with repeated(lambda: publisher.twist(0.125)):
-            until(lambda: scene.moves(stopped), what="motion anew")
+        with pushed(publisher, 0.125, lambda: scene.moves(stopped)):
+            pass
     scene.ros_router.close()

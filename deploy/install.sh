@@ -163,5 +163,6 @@ install_files
 up zbridge.service "there is a robot in $etc/robots" "$etc/robots/*.toml"
 [ -z "$recorder" ] || up zbridge-recorder.service "the recorder's bundle is in $etc/recorder" "$etc/recorder/key.pem"
 if booted && systemctl is-active --quiet zbridge.service; then
+    sleep 3 # a supervisor loads what has not changed for 2 s
     say "what runs keeps the version that it was started with: systemctl reload zbridge, then zbridge restart --all"
 fi

@@ -62,11 +62,12 @@ zbridge certs init >/dev/null
 issue hub --role router --host 127.0.0.1 --host router
 issue r1 --role gateway --robot r1
 issue wall --role viewer
+issue ann --role operator
 issue box --role recorder
 zbridge certs bundle hub -o config/router >/dev/null
 zbridge certs bundle box -o config/recorder --at /etc/zbridge/recorder >/dev/null
 zbridge certs bundle r1 -o config/bus/r1 --at /etc/zbridge/bus/r1 --connect tls/127.0.0.1:7447 >/dev/null
-zbridge certs bundle wall -o wall --connect tls/127.0.0.1:7447 >/dev/null
+for name in wall ann; do zbridge certs bundle $name -o $name --connect tls/127.0.0.1:7447 >/dev/null; done
 { zbridge init tcpudp --name r1 | sed '/^\[bus\]/,/^stream/d'; cat config/bus/r1/bus.toml; printf '[metrics]\nlisten = "127.0.0.1:9100"\n'; } >config/robots/r1.toml
 chown -R 10001:10001 config
 unshare --net --mount --propagation private bash "$root/deploy/try/composed.sh" "$work"

@@ -12,7 +12,7 @@ python() { /opt/zbridge/bin/python "$@"; }
 established() { python "$root/deploy/try/established.py" "$work/wall" "$@"; }
 install() { bash "$root/deploy/install.sh" "$@" >"$work/install.log" 2>&1 || { cat "$work/install.log"; fail "install.sh $*"; }; }
 over() {
-    [ "$1" -eq 0 ] || { journalctl --unit 'zbridge*' --lines 60 --no-pager; tail -n 5 "$work"/*.account; }
+    [ "$1" -eq 0 ] || { journalctl --unit 'zbridge*' --no-pager | grep --invert-match 'viewer.wall' | tail -n 40; tail -n 5 "$work"/*.account; }
     kill "${robots[@]}" 2>/dev/null || true
 }
 declare -A robots=()
@@ -48,8 +48,8 @@ echo "-- the end"
 install --uninstall
 ! systemctl list-unit-files 'zbridge*' | grep -q '^zbridge' || fail "units are left"
 [ -f /etc/zbridge/bus/r1/key.pem ] && [ -n "$(find /var/lib/private/zbridge-recorder -name '*.mcap')" ] || fail "the configuration or the recordings are gone"
-robot r1 11001
 install --wheels wheels --router --recorder
+robot r1 11001
 established r1 r2 || fail "not as before"
 ok "uninstalled, installed again: all runs as before"
 install --uninstall --purge

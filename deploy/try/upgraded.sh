@@ -13,7 +13,6 @@ cp later-0.1.1/*.whl wheels/
 install --wheels wheels --router
 grep --quiet "installed zbridge==0.1.1" install.log || fail "0.1.1 is not installed"
 ! runs 0.1.1 && one_connection r1 || fail "install.sh disturbs what runs"
-sleep 3 # installers write file after file: zbridge takes an installation as done after 2 s
 systemctl reload zbridge
 within 60 taken_over || fail "the supervisor goes on with the code of before"
 driven 30 zbridge restart --all --tls boss
@@ -25,16 +24,14 @@ ok "upgraded under way (install.sh, systemctl reload, zbridge restart --all): $r
 cp -a /opt/zbridge before # who asks for the restart is elsewhere: his version is not broken
 since=$(now)
 install --wheels later-0.1.2/zbridge-0.1.2-py3-none-any.whl --extras "" --router
-sleep 3
 systemctl reload zbridge
 within 60 said zbridge "$since" "the code of before goes on\|goes on with the code of before" || fail "nothing is said of a broken version"
-! before/bin/python -m zbridge restart --all --tls boss >restart.log 2>&1 || fail "a broken version takes over"
+before/bin/python -m zbridge restart --all --tls boss >restart.log 2>&1 || { cat restart.log; fail "no restart with the code of before"; }
 established r1 r2 && one_connection r1 && runs 0.1.1 || fail "a broken version disturbs r1"
 [ "$(of MainPID zbridge)" = "$main" ] && is NRestarts zbridge "$starts" || fail "the unit was restarted"
-ok "a broken version: refused ($(head -n 1 restart.log)); all goes on"
+ok "a broken version is installed: systemctl reload logs it, gateways are restarted with the code of before, r1's connection is the same"
 
 install --wheels wheels --router
-sleep 3
 systemctl reload zbridge
 zbridge restart --all --tls boss >restart.log 2>&1 || { cat restart.log; fail "no restart after the repair"; }
 established r1 r2 && one_connection r1 && runs 0.1.1 || fail "the repair disturbs r1"

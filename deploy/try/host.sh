@@ -51,8 +51,18 @@ listing | comm -13 "$work/before" - | grep -v -e '^./var/log' -e '^./etc/.*-$' -
 ok "--uninstall keeps the configuration, --purge leaves nothing; a second time does no harm"
 
 echo "-- a booted host, with a network of its own"
-ungroup() { # systemd-nspawn leaves its control groups behind, and does not start where it finds half of them
-    find /sys/fs/cgroup -depth -type d \( -path '/sys/fs/cgroup/*/payload*' -o -path '/sys/fs/cgroup/*/supervisor*' \) -exec rmdir {} \; 2>/dev/null || true
+ungroup() { # systemd-nspawn leaves the control groups behind that it made in that of its caller, and does not start where it finds half of them
+    local controllers path group
+    while IFS=: read -r _ controllers path; do
+        case $controllers in
+            '') set -- "/sys/fs/cgroup$path" "/sys/fs/cgroup/unified$path" ;;
+            name=systemd) set -- "/sys/fs/cgroup/systemd$path" ;;
+            *) continue ;;
+        esac
+        for group in "${@/%//payload}" "${@/%//supervisor}"; do
+            [ ! -d "$group" ] || find "$group" -depth -type d -exec rmdir {} \; 2>/dev/null || true
+        done
+    done </proc/self/cgroup
 }
 ungroup
 systemd-nspawn --quiet --boot --directory="$host" --register=no --keep-unit --private-network --console=pipe </dev/null >"$work/console" 2>&1 &

@@ -16,7 +16,7 @@ for unit in "$root"/deploy/systemd/*.service; do
     ok "$(basename "$unit"): exposure $(grep -o "[0-9]\.[0-9]" <<<"$level"), 3.0 at most"
 done
 if command -v shellcheck >/dev/null; then
-    shellcheck -x "$root"/deploy/*.sh "$root"/deploy/try/*.sh || fail shellcheck
+    shellcheck -x "$root"/deploy/{,try/,container/}*.sh || fail shellcheck
     ok "shellcheck has nothing to say"
 else
     echo "not tried: shellcheck is missing"

@@ -9,7 +9,7 @@ import pytest
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 SCRIPT = DEPLOY / "install.sh"
-SCRIPTS = sorted((*DEPLOY.glob("*.sh"), *DEPLOY.glob("try/*.sh")))
+SCRIPTS = sorted((*DEPLOY.glob("*.sh"), *DEPLOY.glob("*/*.sh")))
 PARTS = [path for path in SCRIPTS if path.parent.name == "try" and os.access(path, os.X_OK)]
 
 

@@ -44,6 +44,8 @@ done
 if ! outside | diff "$work/outside" -; then
     failed=$((failed + 1))
     echo "FAILED: the machine is not as it was"
+else
+    echo "ok: the machine's devices and control groups are as they were"
 fi
 echo "$passed passed, $failed failed, $absent cannot run here"
 [ "$failed" -eq 0 ]

@@ -41,6 +41,11 @@ robot r1 11001
 established r1 r2 || fail "no start after a hang"
 ok "the supervisor hangs (SIGSTOP): $rest, found by the watchdog (15 s); systemd starts the unit anew"
 
+driven 45 kill -STOP "$(of MainPID zbridge)" "$(gateway r1)"
+robot r1 11001
+established r1 r2 || fail "no start after a hang of both"
+ok "supervisor and gateway hang: $rest; systemd starts the unit anew"
+
 systemctl restart zbridge-router
 established r1 r2 || fail "the router's restart"
 one_connection r1 || fail "the robot's connection is lost"

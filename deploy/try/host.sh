@@ -64,23 +64,34 @@ ungroup() { # systemd-nspawn leaves the control groups behind that it made in th
         done
     done </proc/self/cgroup
 }
-ungroup
-systemd-nspawn --quiet --boot --directory="$host" --register=no --keep-unit --private-network --console=pipe </dev/null >"$work/console" 2>&1 &
-nspawn=$!
+nspawn='' init=''
 over() {
-    kill $nspawn 2>/dev/null || true
-    wait $nspawn 2>/dev/null || true
+    [ -z "$nspawn" ] || kill "$nspawn" 2>/dev/null || true
+    [ -z "$nspawn" ] || wait "$nspawn" 2>/dev/null || true
     ungroup
 }
 trap over EXIT
 inside() { nsenter --target "$init" --mount --pid --uts --ipc --net --cgroup "${clean[@]}" "$@"; }
-state='' init=''
-for _ in $(seq 120); do
-    init=$(pgrep --parent $nspawn --exact systemd | head -n 1 || true)
-    [ -z "$init" ] || state=$(inside systemctl is-system-running 2>/dev/null || true)
-    case $state in running | degraded) break ;; esac
-    kill -0 $nspawn 2>/dev/null || break
-    sleep 0.5
-done
-case $state in running | degraded) ;; *) tail -n 5 "$work/console"; echo "systemd does not boot in a container here"; exit 77 ;; esac
-inside bash /root/try/deploy/try/inside.sh /root/try
+boot() {
+    local state=''
+    ungroup
+    systemd-nspawn --quiet --boot --directory="$host" --register=no --keep-unit --private-network --console=pipe </dev/null >"$work/console" 2>&1 &
+    nspawn=$!
+    for _ in $(seq 120); do
+        init=$(pgrep --parent "$nspawn" --exact systemd | head -n 1 || true)
+        [ -z "$init" ] || state=$(inside systemctl is-system-running 2>/dev/null || true)
+        case $state in running | degraded) return 0 ;; esac
+        kill -0 "$nspawn" 2>/dev/null || break
+        sleep 0.5
+    done
+    tail -n 5 "$work/console"
+    return 1
+}
+boot || { echo "systemd does not boot in a container here"; exit 77; }
+inside bash /root/try/deploy/try/inside.sh /root/try started failing upgraded observed
+inside systemctl reboot || true
+code=0
+wait "$nspawn" || code=$?
+[ $code -eq 133 ] || fail "systemd-nspawn ended with $code, not with 133, which says that the host wants to be booted again"
+boot || fail "the host does not boot again"
+inside bash /root/try/deploy/try/inside.sh /root/try booted removed

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs on the host that deploy/try/host.sh booted: a router with certificates, robots, and what happens to them. Usage: inside.sh FOLDER
+# Runs on the host that deploy/try/host.sh booted: a router with certificates, robots, and what happens to them. Usage: inside.sh FOLDER PART...
 # shellcheck source-path=SCRIPTDIR disable=SC2015
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 cd "$work"
@@ -36,24 +36,8 @@ driven() { # LIMIT_S COMMAND...: r1 is driven while the command runs, and must c
     rest=$(python "$root/deploy/try/driven.py" "$work/ann" r1 "$work/r1.account" "$@" 2>"$work/driven.log") || { cat "$work/driven.log"; fail "$rest"; }
 }
 gateway() { pgrep --exact "zb $1" | head -n 1; }
-# shellcheck disable=SC1090
-run() { echo "-- $1"; source "$root/deploy/try/$1.sh" "$work"; }
-
-run started
-run failing
-run upgraded
-run observed
-
-echo "-- the end"
-install --uninstall
-! systemctl list-unit-files 'zbridge*' | grep -q '^zbridge' || fail "units are left"
-[ -f /etc/zbridge/bus/r1/key.pem ] && [ -n "$(find /var/lib/private/zbridge-recorder -name '*.mcap')" ] || fail "the configuration or the recordings are gone"
-install --wheels wheels --router --recorder
-robot r1 11001
-established r1 r2 || fail "not as before"
-ok "uninstalled, installed again: all runs as before"
-install --uninstall --purge
-! systemctl list-unit-files 'zbridge*' | grep -q '^zbridge' || fail "units are left"
-! getent passwd zbridge >/dev/null || fail "the user is left"
-! ls -d /opt/zbridge /etc/zbridge /var/lib/zbridge /var/lib/private/zbridge-recorder 2>/dev/null || fail "folders are left"
-ok "uninstalled with --purge: nothing is left"
+for part in "${@:2}"; do
+    echo "-- $part"
+    # shellcheck disable=SC1090
+    source "$root/deploy/try/$part.sh" "$work"
+done

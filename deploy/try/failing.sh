@@ -18,7 +18,7 @@ established r1 r2 || fail "r1 is not established"
 since=$(now) began=$SECONDS
 driven 10 systemctl stop zbridge
 [ $((SECONDS - began)) -lt 25 ] || fail "the stop takes $((SECONDS - began)) s"
-said zbridge "$since" "r1 robot: gateway stopped" || fail "the gateways are not stopped in order"
+within 20 said zbridge "$since" "r1 robot: gateway stopped" || fail "the gateways are not stopped in order"
 is Result zbridge success || fail "the stop is called a failure"
 robot r1 11001
 systemctl start zbridge
@@ -27,7 +27,7 @@ ok "the unit is stopped, and started: $rest"
 
 since=$(now)
 driven 10 kill -KILL "$(of MainPID zbridge)"
-said zbridge "$since" "r1 robot: gateway stopped" || fail "a dead supervisor's gateways go on"
+within 20 said zbridge "$since" "r1 robot: gateway stopped" || fail "a dead supervisor's gateways go on"
 robot r1 11001
 established r1 r2 || fail "no start after a crash"
 is NRestarts zbridge 1 || fail "systemd has not started it anew"
@@ -35,8 +35,8 @@ ok "the supervisor is killed: $rest; systemd starts the unit anew"
 
 since=$(now)
 driven 40 kill -STOP "$(of MainPID zbridge)"
-said zbridge "$since" "Watchdog timeout" || fail "a hung supervisor is not found"
-said zbridge "$since" "r1 robot: gateway stopped" || fail "a hung supervisor's gateways are not stopped in order"
+within 40 said zbridge "$since" "Watchdog timeout" || fail "a hung supervisor is not found"
+within 20 said zbridge "$since" "r1 robot: gateway stopped" || fail "a hung supervisor's gateways are not stopped in order"
 robot r1 11001
 established r1 r2 || fail "no start after a hang"
 ok "the supervisor hangs (SIGSTOP): $rest, found by the watchdog (15 s); systemd starts the unit anew"

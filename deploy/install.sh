@@ -9,9 +9,9 @@ usage: install.sh [--wheels PATH] [--extras LIST] [--router] [--recorder] [--ser
        install.sh --uninstall [--purge]
 
 --wheels PATH   a folder with zbridge's wheel and all that it needs, or the wheel in such a folder: nothing is downloaded.
-                Make it on a machine with a network: pip wheel -w wheels '.[certs,serial]'
+                Make it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder
                 Without it: installs the checkout that this script is in, and downloads the rest.
---extras LIST   extras of zbridge, separated by commas; "certs,serial" by default, "" for none
+--extras LIST   extras of zbridge, separated by commas; "certs,serial" by default, with --recorder foxglove too; "" for none
 --router        also run the router of the bus      (/etc/zbridge/router.toml, /etc/zbridge/router)
 --recorder      also record all robots              (/etc/zbridge/recorder.env, /etc/zbridge/recorder)
 --serial        let gateways open serial lines
@@ -27,7 +27,7 @@ units=/etc/systemd/system
 all_units=(zbridge.service zbridge@.service zbridge-router.service zbridge-recorder.service)
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
-wheels='' extras=certs,serial router='' recorder='' serial='' start=yes uninstall='' purge=''
+wheels='' extras=default router='' recorder='' serial='' start=yes uninstall='' purge=''
 
 say() { printf '%s\n' "zbridge: $*"; }
 die() { printf '%s\n' "zbridge: $*" >&2; exit "${2:-1}"; }
@@ -49,6 +49,7 @@ while [ $# -gt 0 ]; do
     shift
 done
 [ -z "$purge" ] || [ -n "$uninstall" ] || wrong "--purge: expected --uninstall with it"
+[ "$extras" != default ] || extras=certs,serial${recorder:+,foxglove}
 [ "$(id -u)" -eq 0 ] || die "must be run as root"
 
 # systemd may be absent (a chroot, an image that is being built): then units are enabled for the next boot.
@@ -162,5 +163,6 @@ install_files
 up zbridge.service "there is a robot in $etc/robots" "$etc/robots/*.toml"
 [ -z "$recorder" ] || up zbridge-recorder.service "the recorder's bundle is in $etc/recorder" "$etc/recorder/key.pem"
 if booted && systemctl is-active --quiet zbridge.service; then
+    sleep 3 # a supervisor loads what has not changed for 2 s
     say "what runs keeps the version that it was started with: systemctl reload zbridge, then zbridge restart --all"
 fi

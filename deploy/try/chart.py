@@ -1,6 +1,7 @@
 """Renders the chart with Helm's library and checks what comes out.
 
-Usage: chart.py HELM-FOLDER OUTPUT; chart.py --same A B tells whether two files hold the same objects.
+Usage: chart.py HELM-FOLDER OUTPUT, a folder that is made; chart.py --same A B tells whether two files hold the same
+objects.
 """
 
 import subprocess
@@ -63,15 +64,28 @@ def check_pods(items: list[Object]) -> None:
             assert "livenessProbe" in container or item["metadata"]["name"] == "zb-recorder", identity(item)
 
 
+def zbridge(*words: str | Path) -> None:
+    """Run a command of zbridge; show what it says if it fails."""
+    done = subprocess.run([sys.executable, "-m", "zbridge", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def check_files(items: list[Object], output: Path) -> int:
-    """Let zbridge check the robots' files; how many there were."""
+    """Let zbridge check the robots' files, each with a certificate of its robot; how many there were."""
+    zbridge("certs", "init", output / "certs")
+    issue = ("certs", "issue", "--dir", output / "certs")
+    zbridge(*issue, "hub", "--role", "router", "--host", "zb-router")
     count = 0
     for item in items:
         for name, text in item.get("data", {}).items() if item["kind"] == "ConfigMap" else ():
-            (output / name).write_text(text)
-            if name != "router.toml":
-                subprocess.run([sys.executable, "-m", "zbridge", "check", output / name], check=True)
-                count += 1
+            if name == "router.toml":
+                continue
+            robot, bundle = name.removesuffix(".toml"), output / name.removesuffix(".toml")
+            zbridge(*issue, robot, "--role", "gateway", "--robot", robot)
+            zbridge("certs", "bundle", "--dir", output / "certs", robot, "-o", bundle)
+            (output / name).write_text(text.replace("/etc/zbridge/bus/", f"{bundle}/"))
+            zbridge("check", output / name)
+            count += 1
     return count
 
 
@@ -91,7 +105,7 @@ def main(folder: Path, output: Path) -> None:
             f"ok: Helm {helm.helm_sdk_version()}: {len(items)} objects as Kubernetes {', '.join(KUBERNETES)} have them"
         )
     (output / "all.yaml").write_text(text)
-    print(f"ok: {check_files(items, output)} robots' files")
+    print(f"ok: {check_files(items, output)} robots' files, by zbridge check")
     for what, values in WRONG.items():
         try:
             render(folder, values)

@@ -1,6 +1,8 @@
-# shellcheck shell=bash disable=SC2154
-# What the parts of deploy/try.sh share. root, work: from deploy/try.sh.
+# shellcheck shell=bash disable=SC2034
+# What the parts of deploy/try.sh share. Each part takes one argument, the folder in which it may do what it likes.
 set -euo pipefail
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
+work=$(realpath "${1:?expected the folder of this try}")
 
 need() { # TOOL PACKAGE: end the part where a tool is missing
     command -v "$1" >/dev/null || { echo "$1 is missing: install the package $2"; exit 77; }
@@ -13,14 +15,30 @@ as_root() {
 ok() { echo "ok: $*"; }
 fail() { echo "FAILED: $*"; exit 1; }
 
+within() { # SECONDS COMMAND...: wait for a condition
+    local end=$((SECONDS + $1))
+    shift
+    until "$@" >/dev/null 2>&1; do [ $SECONDS -lt $end ] || return 1; sleep 0.2; done
+}
+
+page() { # URL: the status, the type and the text of a page
+    python3 -c 'import sys, urllib.error, urllib.request
+try: found = urllib.request.urlopen(sys.argv[1], timeout=5)
+except urllib.error.HTTPError as error: found = error
+print(found.status, found.headers["Content-Type"], found.read().decode(), sep="\n")' "$1"
+}
+
+answers() { # URL TEXT: whether a page has a line that begins with a text
+    page "$1" | grep "^$2" >/dev/null
+}
+
 tools() { # PACKAGE...: Python packages of the checks, in an environment of their own
     [ -x "$work/tools/bin/python" ] || python3 -m venv "$work/tools"
     "$work/tools/bin/pip" install --quiet --disable-pip-version-check "$@" 2>"$work/pip.log" || { tail -n 2 "$work/pip.log"; echo "not to be had: $*"; exit 77; }
 }
 
-wheels() { # zbridge and all that it needs, as a host without a network is given it
-    [ -d "$work/wheels" ] || python3 -m pip wheel --quiet --disable-pip-version-check -w "$work/wheels" "${root}[certs,serial]" 2>"$work/pip.log" \
-        || { tail -n 2 "$work/pip.log"; fail "no wheels"; }
+wheel() { # FOLDER PIP-ARGUMENTS...
+    python3 -m pip wheel --quiet --disable-pip-version-check -w "$@" 2>"$work/pip.log" || { tail -n 2 "$work/pip.log"; fail "no wheels"; }
 }
 
 debian() { # FOLDER-OR-TAR PACKAGES: a Debian 12; ZBRIDGE_TRY_CACHE keeps it for the next time

@@ -1,42 +1,39 @@
-"""Waits until robots are established, as a viewer sees it over mutual TLS."""
+"""Waits until robots are established, as a viewer sees it over mutual TLS.
 
-import argparse
+Usage: established.py BUNDLE ROBOT...
+"""
+
 import asyncio
 import sys
 
 import zbridge
-from zbridge.bus import Tls
 from zbridge.errors import ZbridgeError
 
-WITHIN_S = 30.0
-ENDPOINT = "tls/127.0.0.1:7447"
+WITHIN_S = 40.0
 
 
-async def all_established(folder: str, names: list[str]) -> bool:
+async def all_established(bundle: str, names: list[str]) -> bool:
     """Connect anew, for the router may just have been restarted; whether all robots are established now."""
-    tls = Tls(f"{folder}/ca.pem", f"{folder}/wall/certificate.pem", f"{folder}/wall/key.pem")
-    async with zbridge.connect(endpoints=[ENDPOINT], tls=tls) as fleet:
+    async with zbridge.connect(tls=bundle) as fleet:
         found = await fleet.robots()
     return all((status := found.get(name)) is not None and status.state == "established" for name in names)
 
 
-async def main(folder: str, names: list[str]) -> int:
+async def main(bundle: str, *names: str) -> int:
     """Ask until all robots are established, or the time is over."""
+    told = ""
     try:
         async with asyncio.timeout(WITHIN_S):
             while True:
                 try:
-                    if await all_established(folder, names):
+                    if await all_established(bundle, list(names)):
                         return 0
                 except ZbridgeError as error:
-                    print(error, file=sys.stderr)
+                    told = str(error)
                 await asyncio.sleep(0.5)
     except TimeoutError:
+        print(f"not established: {' '.join(names)} {told}", file=sys.stderr)
         return 1
 
 
-parser = argparse.ArgumentParser()
-parser.add_argument("--folder", default="/root/certs")
-parser.add_argument("robots", nargs="+")
-given = parser.parse_args()
-sys.exit(asyncio.run(main(given.folder, given.robots)))
+sys.exit(asyncio.run(main(*sys.argv[1:])))

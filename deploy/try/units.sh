@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The units as systemd reads them, their exposure, and the scripts as shellcheck reads them.
+# The units as systemd reads them, their exposure, and the scripts as shellcheck reads them. Usage: units.sh FOLDER
 # shellcheck source-path=SCRIPTDIR
 source "$(dirname "${BASH_SOURCE[0]}")/common.sh"
 need systemd-analyze systemd
@@ -16,8 +16,8 @@ for unit in "$root"/deploy/systemd/*.service; do
     ok "$(basename "$unit"): exposure $(grep -o "[0-9]\.[0-9]" <<<"$level"), 3.0 at most"
 done
 if command -v shellcheck >/dev/null; then
-    shellcheck -x "$root"/deploy/*.sh "$root"/deploy/try/*.sh || fail shellcheck
+    shellcheck -x "$root"/deploy/{,try/,container/}*.sh || fail shellcheck
     ok "shellcheck has nothing to say"
 else
-    echo "shellcheck is missing: scripts are not checked"
+    echo "not tried: shellcheck is missing"
 fi

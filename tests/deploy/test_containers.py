@@ -2,10 +2,14 @@
 
 import importlib.util
 import json
+import os
 import re
 import socket
+import subprocess
 import threading
+import time
 import tomllib
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,7 @@ COMPOSE = yaml.safe_load((DEPLOY / "container" / "compose.yaml").read_text())
 CHART = DEPLOY / "helm" / "zbridge"
 SCHEMA = json.loads((CHART / "values.schema.json").read_text())
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+START = DEPLOY / "container" / "start.sh"
 CONTAINERFILE = (DEPLOY / "container" / "Containerfile").read_text()
 
 every_service = pytest.mark.parametrize("name", ["router", "gateways", "recorder"])
@@ -77,6 +82,62 @@ class Healthz(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Write nothing."""
+
+
+SUPERVISOR = """#!/bin/sh
+trap 'touch "$1.reloaded"' HUP
+trap 'exit 7' TERM
+(while kill -0 $$ 2>/dev/null; do sleep 0.05; done; sleep 0.3; echo stopped >"$1") &
+touch "$1.ready"
+while :; do sleep 0.05; done
+"""
+"""Has a child that stops its robot a moment after its parent has ended."""
+
+
+def own_processes(command: str, *arguments: str) -> subprocess.Popen[str]:
+    """Run a command as the first process of a namespace, as a container does."""
+    namespace = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+    return subprocess.Popen([*namespace, command, *arguments], stdin=subprocess.DEVNULL, text=True)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a namespace of processes needs root")
+@pytest.mark.parametrize(("signal", "reloads", "code"), [("KILL", False, 137), ("TERM", True, 7)])
+def test_gateways_have_time_for_their_stop_when_the_supervisor_of_a_container_ends(
+    tmp_path: Path, signal: str, reloads: bool, code: int
+) -> None:
+    (supervisor := tmp_path / "zbridge").write_text(SUPERVISOR)
+    supervisor.chmod(0o755)
+    (start := tmp_path / "start.sh").write_text(START.read_text().replace("/opt/zbridge/bin/zbridge", str(supervisor)))
+    start.chmod(0o755)
+    stopped = tmp_path / "stopped"
+    with own_processes(str(start), str(stopped)) as namespace:
+        first = only_child(namespace.pid)
+        until((tmp_path / "stopped.ready").exists)
+        if reloads:
+            until(lambda: bool(kill("HUP", first)) or (tmp_path / "stopped.reloaded").exists())
+        kill(signal, only_child(first) if signal == "KILL" else first)
+        assert namespace.wait(20) == code
+    assert stopped.read_text() == "stopped\n"
+
+
+def kill(signal: str, pid: int) -> int:
+    """Send a signal by its name; return the exit code."""
+    return subprocess.run(("kill", f"-{signal}", str(pid))).returncode
+
+
+def only_child(pid: int) -> int:
+    """Wait for the child of a process."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    until(lambda: bool(children.read_text().split()))
+    return int(children.read_text().split()[0])
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition, for 20 s at most."""
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_the_composition_has_router_gateways_and_recorder() -> None:

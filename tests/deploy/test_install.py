@@ -9,7 +9,8 @@ import pytest
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 SCRIPT = DEPLOY / "install.sh"
-SCRIPTS = sorted((*DEPLOY.glob("*.sh"), *DEPLOY.glob("try/*.sh")))
+SCRIPTS = sorted((*DEPLOY.glob("*.sh"), *DEPLOY.glob("*/*.sh")))
+PARTS = [path for path in SCRIPTS if path.parent.name == "try" and os.access(path, os.X_OK)]
 
 
 def install(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -58,3 +59,10 @@ def test_what_is_installed_without_a_word_stays_what_it_is() -> None:
 def test_bash_reads_a_script(script: Path) -> None:
     done = subprocess.run(("bash", "-n", str(script)), capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("script", PARTS, ids=lambda script: script.name)
+def test_a_part_of_the_try_does_nothing_without_a_folder_of_its_own(script: Path) -> None:
+    done = subprocess.run(("bash", str(script)), capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0
+    assert re.search(r"(expected|usage).* (the folder|FOLDER)", done.stderr)

@@ -1,0 +1,52 @@
+"""A robot as fragile as deployed ones, which tells what it was commanded: one connection a start, no fault forgiven.
+
+Usage: robot.py PORT ACCOUNT. Each line of the account is a time (monotonic seconds) and the commanded speed, or a word
+and what happened: ``event: second connection ...``, ``violation: ...``.
+"""
+
+import asyncio
+import math
+import struct
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+
+
+class Telling(FragileRobot):
+    """Tells each change of what it was commanded."""
+
+    def __init__(self, account: Path) -> None:
+        self._account, self._known = account.open("w", buffering=1), 0.0
+        super().__init__(version="1.3", udp=False, seed=1, client_id=2, note=lambda text: self.tell("violation:", text))
+        steer = self.machine.steer
+
+        def obey(body: bytes) -> None:
+            steer(body)
+            values = struct.unpack(f"<{len(body) // 4}f", body)
+            speed = math.hypot(*values[:2]) * values[2] if len(values) == 3 else sum(map(abs, values))
+            if speed != self._known:
+                self._known = speed
+                self.tell(f"{time.monotonic():.3f}", f"{speed:.3g}")
+
+        self.machine.steer = obey  # type: ignore[method-assign]
+
+    def tell(self, *words: Any) -> None:
+        """Write one line."""
+        print(*words, file=self._account)
+
+    def _event(self, text: str) -> None:
+        super()._event(text)
+        self.tell("event:", text)
+
+
+async def main(port: str, account: str) -> None:
+    """Be a robot until killed, or dead."""
+    robot = Telling(Path(account))
+    await robot.serve("127.0.0.1", int(port), lambda _: robot.tell("event:", "listening"))
+    robot.tell("event:", "ended", robot.death)
+
+
+asyncio.run(main(*sys.argv[1:]))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from rosbags.typesys import Stores, get_typestore
 
 from zbridge.fleet.messages import (
@@ -32,6 +33,8 @@ NOW_NS = 1_800_000_000_500_000_000
 STAMP_NS = NOW_NS - 20_000_000
 EVERYTHING = {topic.name for topic in TOPICS} | {"range/front_left", "joint_states"}
 BODY = Body(speed_full_mps=2.0, laser=Laser(0.1, 0.0, 0.3, math.pi / 2))
+BOTH = (np.array([1.0, 2.0], np.float32), np.array([1.0, 2.0], "<f4").tobytes())
+"""The ranges of a scan as an array, and as the bytes of a payload."""
 STORES = {distro: get_typestore(Stores(f"ros2_{distro}")) for distro in DISTROS}
 
 
@@ -40,7 +43,9 @@ def robot(distro: str = "jazzy", body: Body = BODY) -> RobotPictures:
 
 
 def cdr(made: Any, distro: str = "jazzy") -> Any:
-    """Give what rosbags reads of a message that we wrote."""
+    """Give what rosbags reads of a message that we wrote; scans alone are bytes already."""
+    if isinstance(made, bytes):
+        return STORES[distro].deserialize_cdr(made, "sensor_msgs/msg/LaserScan")
     return STORES[distro].deserialize_cdr(types_of(distro).encode(made), made.__msgtype__)
 
 
@@ -77,13 +82,41 @@ def test_a_scan_that_runs_clockwise_is_turned_round() -> None:
     assert laser.ranges.tolist() == [3.0, 2.0, 1.0]
 
 
+@pytest.mark.parametrize("name", ["r", "r1", "r12", "r123", "a_robot_with_a_long_name"])
+def test_a_scan_is_the_bytes_that_rosbags_writes(name: str) -> None:
+    pictures = RobotPictures(name, types_of("jazzy"), BODY, Metrics())
+    for number in range(2):  # the second one knows its period
+        fields = {"stamp_ns": STAMP_NS + number * 100_000_000}
+        ((_, written),) = pictures.make("scan", replace(scan([1.0, math.nan, 3.0]), **fields), NOW_NS, {"scan"})
+    read = cdr(written)
+    assert (read.header.frame_id, read.scan_time) == (f"{name}/laser", pytest.approx(0.1))
+    assert written == bytes(STORES["jazzy"].serialize_cdr(read, "sensor_msgs/msg/LaserScan"))
+
+
+def test_ranges_may_be_the_bytes_that_came() -> None:
+    arrays, plain = (made(robot(), replace(scan([1.0, 2.0]), ranges=ranges))["scan"] for ranges in BOTH)
+    assert arrays.ranges.tolist() == plain.ranges.tolist() == [1.0, 2.0]
+    turned = replace(scan([], angle_min=1.0, angle_increment=-0.5), ranges=BOTH[1])
+    assert made(robot(), turned)["scan"].ranges.tolist() == [2.0, 1.0]
+
+
 def test_rays_that_would_take_longer_than_the_scan_have_no_time() -> None:
     pictures = robot()
     list(pictures.make("scanner", Scanner(-1, 1, 0.5, 0.1, 0.02, 5.6, 5), NOW_NS, EVERYTHING))
     assert made(pictures, scan([1.0] * 769))["scan"].time_increment == 0.0
 
 
-@pytest.mark.parametrize("wrong", [scan([]), scan([1.0], angle_increment=0.0), scan([1.0], range_max=math.inf)])
+WRONG = (
+    scan([]),
+    scan([1.0], angle_increment=0.0),
+    scan([1.0], range_max=math.inf),
+    scan([1.0], angle_min=math.nan),
+    scan([1.0], range_max=1e39),
+    replace(scan([]), ranges=b"abc"),
+)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_a_scan_without_sense_is_counted_and_left_out(wrong: Scan) -> None:
     metrics = Metrics()
     pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)

@@ -7,6 +7,7 @@ message has no sense as a ROS message: numbers that are not finite, a scan or ma
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 from typing import Any
 
@@ -29,6 +30,8 @@ UNMEASURED = 1e6
 _NO_ESTIMATE = -1.0
 """In the first place of an Imu's covariance: this part is not given."""
 _SECOND_NS = 1_000_000_000
+_CDR, _NO_INTENSITIES = b"\0\1\0\0", bytes(4)
+"""What a message of CDR begins with, and the number of intensities of a scan."""
 _CELLS = np.array([-1, 0, 100] + [-1] * 253, np.int8)
 """Occupancy by the fleet's cell: unknown, free, occupied."""
 _LONGEST_SCAN_S = 1.0
@@ -92,6 +95,10 @@ class Shapes:
     def __init__(self, types: Types, frames: Frames) -> None:
         self._make = types.message
         self.frames = frames
+        laser = frames.laser.encode() + b"\0"
+        self._scan = struct.Struct(f"<4siII{len(laser)}s{-len(laser) % 4}x7fI")
+        """What is before the ranges of a LaserScan."""
+        self._scan_frame = (len(laser), laser)
 
     def __repr__(self) -> str:
         return f"<Shapes of {self.frames.prefix}>"
@@ -105,28 +112,30 @@ class Shapes:
         seconds, nanoseconds = divmod(stamp_ns, _SECOND_NS)
         return self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
 
-    def laser_scan(self, scan: Scan, scanner: Scanner | None, stamp_ns: int, period_s: float) -> Any | None:
-        """Make a LaserScan: as many ranges as its angles say, counter-clockwise. period_s: between two scans, or 0."""
-        ranges = np.asarray(scan.ranges, np.float32)
-        first, step = scan.angle_min, scan.angle_increment
-        given = (first, step, scan.range_min, scan.range_max)
-        if not len(ranges) or not step or not all(map(math.isfinite, given)):
+    def laser_scan(self, scan: Scan, scanner: Scanner | None, stamp_ns: int, period_s: float) -> bytes | None:
+        """Write a LaserScan as CDR: as many ranges as its angles say, counter-clockwise.
+
+        period_s: between two scans, or 0. The one large message that comes often is written without rosbags, which
+        takes several times as long; its definition is the same in all distributions.
+        """
+        ranges = scan.ranges if isinstance(scan.ranges, bytes) else scan.ranges.astype("<f4").tobytes()
+        count, first, step = len(ranges) // 4, scan.angle_min, scan.angle_increment
+        whole = count and not len(ranges) % 4 and step
+        if not whole or not math.isfinite(first + step + scan.range_min + scan.range_max):
             return None
-        last = first + step * (len(ranges) - 1)
+        last = first + step * (count - 1)
         if step < 0:
-            first, last, step, ranges = last, first, -step, np.ascontiguousarray(ranges[::-1])
-        return self._make(
-            "sensor_msgs/msg/LaserScan",
-            header=self.header(stamp_ns, self.frames.laser),
-            angle_min=first,
-            angle_max=last,
-            angle_increment=step,
-            time_increment=_between_s(scan, scanner, period_s),
-            scan_time=period_s,
-            range_min=max(0.0, scan.range_min),
-            range_max=scan.range_max,
-            ranges=ranges,
-        )
+            first, last, step, ranges = last, first, -step, np.frombuffer(ranges, "<f4")[::-1].tobytes()
+        between_s = _between_s(count, scan, scanner, period_s)
+        seconds, nanoseconds = divmod(stamp_ns, _SECOND_NS)
+        limits = max(0.0, scan.range_min), scan.range_max
+        try:
+            before = self._scan.pack(
+                _CDR, seconds, nanoseconds, *self._scan_frame, first, last, step, between_s, period_s, *limits, count
+            )
+        except (struct.error, OverflowError):  # larger than a float32
+            return None
+        return b"".join((before, ranges, _NO_INTENSITIES))
 
     def pose_stamped(self, pose: Pose, stamp_ns: int) -> Any | None:
         """Make a PoseStamped in the robot's map."""
@@ -296,11 +305,11 @@ class Shapes:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def _between_s(scan: Scan, scanner: Scanner | None, period_s: float) -> float:
+def _between_s(count: int, scan: Scan, scanner: Scanner | None, period_s: float) -> float:
     """Return the seconds between two rays; 0 where they are unknown, or would take longer than a whole scan does."""
     between_s = scanner.time_increment_s if scanner is not None and scan.angle_increment > 0 else 0.0
     longest_s = period_s or _LONGEST_SCAN_S
-    return between_s if 0.0 < between_s * (len(scan.ranges) - 1) <= longest_s else 0.0
+    return between_s if 0.0 < between_s * (count - 1) <= longest_s else 0.0
 
 
 def _told(value: float | None) -> float:

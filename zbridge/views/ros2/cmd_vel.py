@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 
 from zbridge.errors import Malformed, Unsupported
@@ -13,6 +14,9 @@ from zbridge.views.ros2.settings import Body
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 MOST_BYTES: Mapping[str, int] = {TWIST: 64, STAMPED: 512}
 """Bounds of the payloads; a stamped one has the name of a frame."""
+_LITTLE_ENDIAN = b"\0\1"
+_TWIST = struct.Struct("<4xdd24xd")
+"""Of a Twist in CDR: linear.x, linear.y and angular.z."""
 _STILL = 1e-6
 """m/s and rad/s below this are zero."""
 
@@ -23,9 +27,12 @@ def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Driv
     Raises ProtocolError for what is none, Malformed for numbers that are not finite, Unsupported for a turn on the
     spot of a robot that steers.
     """
-    message = types.decode(type_name, payload)
-    twist = message.twist if type_name == STAMPED else message
-    forward, left, turn = twist.linear.x, twist.linear.y, twist.angular.z
+    if type_name == TWIST and len(payload) == _TWIST.size and payload.startswith(_LITTLE_ENDIAN):  # nearly all
+        forward, left, turn = _TWIST.unpack(payload)
+    else:
+        message = types.decode(type_name, payload)
+        twist = message.twist if type_name == STAMPED else message
+        forward, left, turn = twist.linear.x, twist.linear.y, twist.angular.z
     if not (math.isfinite(forward) and math.isfinite(left) and math.isfinite(turn)):
         raise Malformed("cmd_vel: expected finite numbers")
     return drive_of(forward, left, turn, body)

@@ -32,6 +32,7 @@ from zbridge.views.ros2.settings import Body, Laser
 NOW_NS = 1_800_000_000_500_000_000
 STAMP_NS = NOW_NS - 20_000_000
 EVERYTHING = {topic.name for topic in TOPICS} | {"range/front_left", "joint_states"}
+TYPES = {topic.name: topic.type_name for topic in TOPICS}
 BODY = Body(speed_full_mps=2.0, laser=Laser(0.1, 0.0, 0.3, math.pi / 2))
 BOTH = (np.array([1.0, 2.0], np.float32), np.array([1.0, 2.0], "<f4").tobytes())
 """The ranges of a scan as an array, and as the bytes of a payload."""
@@ -42,15 +43,15 @@ def robot(distro: str = "jazzy", body: Body = BODY) -> RobotPictures:
     return RobotPictures("r1", types_of(distro), body, Metrics())
 
 
-def cdr(made: Any, distro: str = "jazzy") -> Any:
-    """Give what rosbags reads of a message that we wrote; scans alone are bytes already."""
+def cdr(made: Any, distro: str = "jazzy", name: str = "scan") -> Any:
+    """Give what rosbags reads of a message that we wrote, of the topic of this name if it is bytes already."""
     if isinstance(made, bytes):
-        return STORES[distro].deserialize_cdr(made, "sensor_msgs/msg/LaserScan")
+        return STORES[distro].deserialize_cdr(made, TYPES[name])
     return STORES[distro].deserialize_cdr(types_of(distro).encode(made), made.__msgtype__)
 
 
 def made(pictures: RobotPictures, message: Any, path: str = "", now_ns: int = NOW_NS) -> dict[str, Any]:
-    return {name: cdr(shape) for name, shape in pictures.make(path, message, now_ns, EVERYTHING)}
+    return {name: cdr(shape, name=name) for name, shape in pictures.make(path, message, now_ns, EVERYTHING)}
 
 
 def stamp(header: Any) -> int:
@@ -262,7 +263,7 @@ def test_stamps_from_the_far_future_become_now_and_are_counted(given: int, shown
     metrics = Metrics()
     pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)
     (pose,) = (made for name, made in pictures.make("pose", Pose(0, 0, 0, stamp_ns=given), NOW_NS, {"pose"}))
-    assert stamp(cdr(pose).header) == shown
+    assert stamp(cdr(pose, name="pose").header) == shown
     assert metrics.total("ros2_stamps_clamped") == (given != shown)
 
 
@@ -281,7 +282,7 @@ def test_every_message_is_written_for_every_distro(distro: str) -> None:
         ("image", Image("jpeg", b"picture")),
     ]
     shown = {
-        name: cdr(made, distro)
+        name: cdr(made, distro, name)
         for path, message in messages
         for name, made in pictures.make(path, message, NOW_NS, EVERYTHING)
     }

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
 import pytest
@@ -70,6 +71,15 @@ async def scene() -> AsyncIterator[Scene]:
     await scene.node.close()
 
 
+@pytest.fixture
+def switching() -> Iterator[None]:
+    """Let Python switch between threads as often as it can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
 async def test_streams_are_read_where_they_come_in_and_states_on_the_event_loop(scene: Scene) -> None:
     for name in ("scan", "odom", "imu", "battery_state", "map"):
         scene.listen(name)
@@ -87,7 +97,7 @@ async def test_nothing_is_read_that_nobody_listens_to(scene: Scene) -> None:
     assert read == {"fleet/r1/devices"}
 
 
-async def test_a_stream_of_another_thread_is_put_in_order_while_listeners_come_and_go(scene: Scene) -> None:
+async def test_a_stream_of_another_thread_is_put_in_order_while_listeners_come_and_go(scene: Scene, switching) -> None:
     scene.listen("scan")
     scene.listen("pose")
     over = threading.Event()
@@ -111,6 +121,24 @@ async def test_a_stream_of_another_thread_is_put_in_order_while_listeners_come_a
         assert scene.numbers(name) == list(range(1, COUNT + 1))
     for name in ("tf", "odom"):
         assert scene.numbers(name) == sorted(set(scene.numbers(name)))
+
+
+async def test_who_listens_does_not_change_while_a_message_is_made(scene: Scene, monkeypatch) -> None:
+    scene.listen("scan")
+    other = threading.Thread(target=scene.listen, args=("tf",))
+    made = scene.node._pictures.make
+
+    def make(*given: Any) -> Any:
+        other.start()
+        other.join(0.05)
+        assert "tf" not in scene.node._listened
+        return made(*given)
+
+    monkeypatch.setattr(scene.node._pictures, "make", make)
+    scene.put("scan", SCAN)
+    other.join()
+    assert "tf" in scene.node._listened
+    assert scene.numbers("scan") == [1]
 
 
 @pytest.mark.parametrize("payload", [b"\xc1", b"", encode(Pose(0.0, 0.0, 0.0))])

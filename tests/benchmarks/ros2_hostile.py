@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from tests.benchmarks.ros2 import cpu_s
+from tests.benchmarks.harness import cpu_s
 from tests.e2e import ros_robot
 from tests.e2e.processes import Part
 from tests.e2e.ros2_scene import FRAGILE, SCAN, TWIST, FragileInFleet, RosScene, repeated

@@ -337,8 +337,8 @@ PAIRS: list[tuple[type, type]] = [
     (Driver, blocking.Driver),
     (zbridge.client.StateFeed, blocking.StateFeed),
 ]
-INSIDE = {"acquire", "look", "release", "statuses"}
-"""What the driver's own context uses, and the look at how robots are."""
+INSIDE = {"now", "acquire", "look", "release", "statuses"}
+"""What the driver's own context and callbacks use, and the look at how robots are."""
 
 
 @pytest.mark.parametrize(("awaited", "blocks"), PAIRS, ids=[pair[0].__name__ for pair in PAIRS])

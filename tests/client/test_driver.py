@@ -39,6 +39,12 @@ REFUSED = "no legs"
 SEEN_S = 0.06
 """Within this a refusal shows on ``control``."""
 
+
+async def now(drive: Driver) -> None:
+    """Send a drive as a callback does."""
+    assert drive.now(Drive(forward=0.5))
+
+
 COMMANDS: dict[str, Callable[[Driver], Any]] = {
     "drive": lambda drive: drive(forward=0.5),
     "motor/arm": lambda drive: drive.motor("arm", 1.0),
@@ -46,6 +52,7 @@ COMMANDS: dict[str, Callable[[Driver], Any]] = {
     "raw/tcpudp": lambda drive: drive.raw("tcpudp", 7, b"abc"),
     "neutral": lambda drive: drive(),
     "during": lambda drive: drive.during(1.0, forward=0.5),
+    "now": now,
 }
 
 

@@ -138,6 +138,7 @@ def test_ranges_travel_as_little_endian_floats(ranges: Any, sent: str) -> None:
     assert msgpack.unpackb(encode(m.Scan(**{**SCAN, "ranges": ranges}))) == fields
     again = decode(m.Scan, msgpack.packb(fields)).ranges
     np.testing.assert_array_equal(again, ranges)
+    assert decode(m.Scan, msgpack.packb(fields), arrays=False).ranges == fields["ranges"]
     assert (again.dtype, again.flags.writeable) == (np.float32, False)
 
 

@@ -63,6 +63,7 @@ async def open_bus(
     robot: str | None = None,
     timestamps: bool = False,
     explain: bool = True,
+    threads: bool = True,
 ) -> Bus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``).
 
@@ -70,6 +71,8 @@ async def open_bus(
     again soon helps nobody. wait_for_peers: return only when the peers that scouting finds at once are connected.
     bounds: Zenoh drops what comes in on these keys and is larger; nobody can count it. realm, robot: on a secure bus,
     those in which the router must know our name. timestamps: Zenoh stamps what is put here, as kept frames need.
+    threads: each subscription has a thread, which spares Zenoh's where samples come by tens of thousands a second;
+    False spares each sample a way between threads.
     """
     from zbridge.bus.zenoh import open_zenoh
 
@@ -83,6 +86,7 @@ async def open_bus(
         robot=robot,
         timestamps=timestamps,
         explain=explain,
+        threads=threads,
     )
 
 

@@ -130,6 +130,7 @@ class FakeBus:
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
         kept: bool = False,
+        direct: bool = False,
     ) -> Handle:
         entry = (key_expr, handler)
         self._shared.subscribers.append(entry)

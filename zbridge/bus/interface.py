@@ -159,7 +159,7 @@ payload.
 
 
 class Bus(Protocol):
-    """What gateways and commands use of Zenoh. Handlers are called on the event loop's thread."""
+    """What gateways and commands use of Zenoh. Handlers are called on the event loop's thread, if not ``direct``."""
 
     @property
     def zid(self) -> str:
@@ -194,10 +194,13 @@ class Bus(Protocol):
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
         kept: bool = False,
+        direct: bool = False,
     ) -> Handle:
         """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
 
         kept: the frames that publishers have kept come too, those of publishers that appear later as well.
+        direct: the handler is called on one of Zenoh's threads, for streams without lane and history: it must be quick,
+        and may put frames on another bus.
 
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """

@@ -76,8 +76,8 @@ class Writer:
     def put_at_once(self, call: Call, size: int) -> bool:
         """Make a lossy call now if it is small, nothing waits and the bus is not full; else queue it as :meth:`put`.
 
-        To be called on one thread only. The call blocks at most as long as Zenoh waits for room, and then not again for
-        :data:`WARY_S`.
+        The calls of one key are to come from one thread, or their order is lost. A call blocks at most as long as Zenoh
+        waits for room, and then not again for :data:`WARY_S`.
         """
         if self._lossless or self._backlog or size > AT_ONCE or self._stopping or time.monotonic() < self._wary_until:
             return self.put(call, size)

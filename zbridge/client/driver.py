@@ -101,23 +101,40 @@ class Driver:
         """Send a legacy message that no fleet message can hold."""
         await self._send(topics.CMD_RAW(protocol), Raw(id=message_id, body=body))
 
+    def now(self, drive: Drive) -> bool:
+        """Send a drive without waiting, for programs that are called back; raise as a call does.
+
+        False: nothing was sent, for another command is on its way, which it must not overtake.
+        """
+        if self._lock.locked():
+            return False
+        refusal = self._put(topics.CMD_DRIVE, drive)
+        if refusal is not None:
+            raise refusal
+        return True
+
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
         async with self._lock:
-            if self.loss is not None:
-                loss = self.loss  # raise a new one each time: the traceback of a raised exception grows
-                raise LeaseLost(str(loss), loss.code, holder=loss.holder)
-            refusal, self._refusal = self._refusal, None
-            if refusal is not None and getattr(message, "moving", True):
-                raise refusal
-            publisher = self._publishers.get(topic.path)
-            if publisher is None:
-                publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
-            payload = payloads.encode(message)
-            publisher.put(payload, self._client.prove(publisher.key, payload))
+            refusal = self._put(topic, message)
             if topic is not topics.CMD_DRIVE:  # a thread writes it: the next command must not overtake it
                 await self._bus.flush()
-            if refusal is not None:  # neutral is sent before the refusal is raised
+            if refusal is not None:
                 raise refusal
+
+    def _put(self, topic: Topic, message: FleetMessage) -> Refused | None:
+        """Put a command; return the refusal of an earlier one that is to be raised now that neutral was sent."""
+        if self.loss is not None:
+            loss = self.loss  # raise a new one each time: the traceback of a raised exception grows
+            raise LeaseLost(str(loss), loss.code, holder=loss.holder)
+        refusal, self._refusal = self._refusal, None
+        if refusal is not None and getattr(message, "moving", True):
+            raise refusal
+        publisher = self._publishers.get(topic.path)
+        if publisher is None:
+            publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
+        payload = payloads.encode(message)
+        publisher.put(payload, self._client.prove(publisher.key, payload))
+        return refusal
 
     # The lease
 

@@ -41,15 +41,18 @@ encode = msgspec.msgpack.Encoder(enc_hook=_array_bytes).encode
 """``encode(message)``: the payload of a message, a MessagePack map."""
 
 
-def decode(message: type[F], payload: bytes) -> F:
+def decode(message: type[F], payload: bytes, *, arrays: bool = True) -> F:
     """Decode a payload as ``message``; raise PayloadError with the field and what was expected.
 
     An empty payload is an empty map. Unknown fields are ignored; missing optional fields take their default.
-    ``ranges`` becomes a read-only float32[n], ``cells`` a read-only uint8[rows, columns].
+    ``ranges`` becomes a read-only float32[n], ``cells`` a read-only uint8[rows, columns]; without ``arrays`` both stay
+    bytes, of any length.
     """
     try:
         decoded: F = _decoder(message).decode(payload or _EMPTY)
-        if isinstance(decoded, Map):
+        if not arrays:
+            pass
+        elif isinstance(decoded, Map):
             decoded = _with_cells(decoded)
         elif isinstance(decoded, Scan):
             decoded = _with_ranges(decoded)

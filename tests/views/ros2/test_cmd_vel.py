@@ -56,9 +56,17 @@ def test_what_a_robot_that_steers_cannot_do_is_refused(given, why) -> None:
 def test_both_types_are_read_and_the_stamp_says_nothing() -> None:
     six = struct.pack("<6d", 0.25, 0, 0, 0, 0, 1.0)
     stamped = struct.pack("<iII", 2**31 - 1, 0, 5) + b"base\x00" + bytes(7) + six
-    for type_name, payload in ((TWIST, HEADER + six), (STAMPED, HEADER + stamped)):
+    big_endian = bytes(4) + struct.pack(">6d", 0.25, 0, 0, 0, 0, 1.0)
+    for type_name, payload in ((TWIST, HEADER + six), (TWIST, big_endian), (STAMPED, HEADER + stamped)):
         drive = read_twist(types_of("jazzy"), type_name, payload, TURNS)
         assert (drive.forward, drive.turn) == (0.5, 0.5)
+
+
+def test_of_a_twist_forward_left_and_turn_are_read_and_nothing_else() -> None:
+    payload = HEADER + struct.pack("<6d", 0.1, 0.2, 9.0, 9.0, 9.0, 0.5)
+    for read in (payload, HEADER[:2] + b"\0\1" + payload[4:]):  # options say nothing
+        drive = read_twist(types_of("jazzy"), TWIST, read, TURNS)
+        assert (drive.forward, drive.left, drive.turn) == pytest.approx((0.2, 0.4, 0.25))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from rosbags.typesys import Stores, get_typestore
 
 from zbridge.fleet.messages import (
@@ -31,7 +32,10 @@ from zbridge.views.ros2.settings import Body, Mount
 NOW_NS = 1_800_000_000_500_000_000
 STAMP_NS = NOW_NS - 20_000_000
 EVERYTHING = {topic.name for topic in TOPICS} | {"range/front_left", "joint_states"}
+TYPES = {topic.name: topic.type_name for topic in TOPICS}
 BODY = Body(speed_full_mps=2.0, laser=Mount(0.1, 0.0, 0.3, math.pi / 2))
+BOTH = (np.array([1.0, 2.0], np.float32), np.array([1.0, 2.0], "<f4").tobytes())
+"""The ranges of a scan as an array, and as the bytes of a payload."""
 STORES = {distro: get_typestore(Stores(f"ros2_{distro}")) for distro in DISTROS}
 
 
@@ -39,13 +43,15 @@ def robot(distro: str = "jazzy", body: Body = BODY) -> RobotPictures:
     return RobotPictures("r1", types_of(distro), body, Metrics())
 
 
-def cdr(made: Any, distro: str = "jazzy") -> Any:
-    """Give what rosbags reads of a message that we wrote."""
+def cdr(made: Any, distro: str = "jazzy", name: str = "scan") -> Any:
+    """Give what rosbags reads of a message that we wrote, of the topic of this name if it is bytes already."""
+    if isinstance(made, bytes):
+        return STORES[distro].deserialize_cdr(made, TYPES[name])
     return STORES[distro].deserialize_cdr(types_of(distro).encode(made), made.__msgtype__)
 
 
 def made(pictures: RobotPictures, message: Any, path: str = "", now_ns: int = NOW_NS) -> dict[str, Any]:
-    return {name: cdr(shape) for name, shape in pictures.make(path, message, now_ns, EVERYTHING)}
+    return {name: cdr(shape, name=name) for name, shape in pictures.make(path, message, now_ns, EVERYTHING)}
 
 
 def stamp(header: Any) -> int:
@@ -77,13 +83,41 @@ def test_a_scan_that_runs_clockwise_is_turned_round() -> None:
     assert laser.ranges.tolist() == [3.0, 2.0, 1.0]
 
 
+@pytest.mark.parametrize("name", ["r", "r1", "r12", "r123", "a_robot_with_a_long_name"])
+def test_a_scan_is_the_bytes_that_rosbags_writes(name: str) -> None:
+    pictures = RobotPictures(name, types_of("jazzy"), BODY, Metrics())
+    for number in range(2):  # the second one knows its period
+        fields = {"stamp_ns": STAMP_NS + number * 100_000_000}
+        ((_, written),) = pictures.make("scan", replace(scan([1.0, math.nan, 3.0]), **fields), NOW_NS, {"scan"})
+    read = cdr(written)
+    assert (read.header.frame_id, read.scan_time) == (f"{name}/laser", pytest.approx(0.1))
+    assert written == bytes(STORES["jazzy"].serialize_cdr(read, "sensor_msgs/msg/LaserScan"))
+
+
+def test_ranges_may_be_the_bytes_that_came() -> None:
+    arrays, plain = (made(robot(), replace(scan([1.0, 2.0]), ranges=ranges))["scan"] for ranges in BOTH)
+    assert arrays.ranges.tolist() == plain.ranges.tolist() == [1.0, 2.0]
+    turned = replace(scan([], angle_min=1.0, angle_increment=-0.5), ranges=BOTH[1])
+    assert made(robot(), turned)["scan"].ranges.tolist() == [2.0, 1.0]
+
+
 def test_rays_that_would_take_longer_than_the_scan_have_no_time() -> None:
     pictures = robot()
     list(pictures.make("scanner", Scanner(-1, 1, 0.5, 0.1, 0.02, 5.6, 5), NOW_NS, EVERYTHING))
     assert made(pictures, scan([1.0] * 769))["scan"].time_increment == 0.0
 
 
-@pytest.mark.parametrize("wrong", [scan([]), scan([1.0], angle_increment=0.0), scan([1.0], range_max=math.inf)])
+WRONG = (
+    scan([]),
+    scan([1.0], angle_increment=0.0),
+    scan([1.0], range_max=math.inf),
+    scan([1.0], angle_min=math.nan),
+    scan([1.0], range_max=1e39),
+    replace(scan([]), ranges=b"abc"),
+)
+
+
+@pytest.mark.parametrize("wrong", WRONG)
 def test_a_scan_without_sense_is_counted_and_left_out(wrong: Scan) -> None:
     metrics = Metrics()
     pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)
@@ -254,7 +288,7 @@ def test_stamps_from_the_far_future_become_now_and_are_counted(given: int, shown
     metrics = Metrics()
     pictures = RobotPictures("r1", types_of("jazzy"), BODY, metrics)
     (pose,) = (made for name, made in pictures.make("pose", Pose(0, 0, 0, stamp_ns=given), NOW_NS, {"pose"}))
-    assert stamp(cdr(pose).header) == shown
+    assert stamp(cdr(pose, name="pose").header) == shown
     assert metrics.total("ros2_stamps_clamped") == (given != shown)
 
 
@@ -273,7 +307,7 @@ def test_every_message_is_written_for_every_distro(distro: str) -> None:
         ("image", Image("jpeg", b"picture")),
     ]
     shown = {
-        name: cdr(made, distro)
+        name: cdr(made, distro, name)
         for path, message in messages
         for name, made in pictures.make(path, message, NOW_NS, EVERYTHING)
     }

@@ -1,11 +1,12 @@
 """What comes in from Zenoh: samples, queries, changes of liveliness, and replies to our own queries.
 
 The functions that ``*_callback`` return run on Zenoh's threads. They choose a lane, copy what the event loop needs and
-put it into the inbox.
+put it into the inbox, or call a handler that wants to be called there.
 """
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from zbridge.bus.inbox import Source
+from zbridge.bus.inbox import Inbox, Source
 from zbridge.bus.interface import Answer, Lane, Look, Sample, Sort
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.publishers import reply_and_drop
@@ -23,6 +24,8 @@ from zbridge.fleet.messages import Denied
 from zbridge.fleet.topics import is_concrete
 from zbridge.metrics import Count
 from zbridge.protocol.rate_limit import RateLimit
+
+log = logging.getLogger("zbridge.bus")
 
 QUERIES_HZ = 500.0
 """Queries a second that one queryable answers."""
@@ -42,6 +45,28 @@ def lane_callback(lane: Lane, source: Source) -> Callable[[Any], None]:
     return store
 
 
+def loop_callback(inbox: Inbox, handler: Callable[[Sample], None], lane: Lane | Sort) -> Callable[[zenoh.Sample], None]:
+    """Make the callback of samples whose handler is called on the event loop's thread."""
+    if isinstance(lane, Lane):
+        return lane_callback(lane, inbox.source(handler, read_sample))
+    return sorted_callback(lane, inbox.source(handler))
+
+
+def direct_callback(key_expr: str, handler: Callable[[Sample], None]) -> Callable[[zenoh.Sample], None]:
+    """Make the callback of samples whose handler is called at once, on Zenoh's thread."""
+    own_key = key_expr if is_concrete(key_expr) else None
+
+    def call(raw: zenoh.Sample) -> None:
+        attachment = raw.attachment
+        shown = attachment.to_bytes() if attachment is not None else None
+        try:
+            handler(Sample(own_key or str(raw.key_expr), raw.payload.to_bytes(), shown))
+        except Exception:
+            log.exception("a handler failed")
+
+    return call
+
+
 def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None]:
     """Make the callback of samples that are sorted before the event loop hears of them."""
 
@@ -59,7 +84,7 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
     return store
 
 
-def subscribe_with_kept(session: zenoh.Session, key_expr: str, store: Callable[[zenoh.Sample], None]) -> Any:
+def subscribe_with_kept(session: zenoh.Session, key_expr: str, store: Any) -> Any:
     """Subscribe to a key and to what advanced publishers have kept of it, now and whenever one appears."""
     history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
     return zenoh.ext.declare_advanced_subscriber(session, key_expr, store, history=history)

@@ -19,17 +19,17 @@ from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
 from zbridge.bus.zenoh.connected import watch_connected
-from zbridge.bus.zenoh.declared import Declared, threadless
+from zbridge.bus.zenoh.declared import Declared, prompt, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
     ZenohQuery,
+    direct_callback,
     lane_callback,
+    loop_callback,
     query_callback,
     rate_limited,
     read_change,
     read_reply,
-    read_sample,
-    sorted_callback,
     subscribe_with_kept,
 )
 from zbridge.bus.zenoh.opening import in_short, open_or_say_why, zenoh_config
@@ -59,13 +59,14 @@ async def open_zenoh(
     robot: str | None = None,
     timestamps: bool = False,
     explain: bool = True,
+    threads: bool = True,
 ) -> ZenohBus:
     """Open a Zenoh session; raise BusError where that is not possible (a client: no router within ``within_s``)."""
     config = zenoh_config(
         settings, wait_for_peers=wait_for_peers, bounds=bounds, within_s=within_s, timestamps=timestamps
     )
     session = await open_or_say_why(config, settings, explain=explain)
-    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream)
+    bus = ZenohBus(session, asyncio.get_running_loop(), metrics, stream=settings.stream, threads=threads)
     certificate = own_certificate(settings.tls)
     if certificate is not None and realm is not None:
         try:
@@ -86,10 +87,12 @@ class ZenohBus:
         metrics: Metrics,
         *,
         stream: str = "drop",
+        threads: bool = True,
         beside: ZenohBus | None = None,
     ) -> None:
         """Begin. beside: a bus whose session this one shares and does not end."""
         self._session = session
+        self._threads = threads
         self._loop = loop
         self._stream = stream
         self._lossless = lossless = stream == "block"
@@ -127,7 +130,7 @@ class ZenohBus:
 
         Its ``close`` takes back what was declared on it, and leaves the session to the others.
         """
-        return ZenohBus(self._session, self._loop, metrics, stream=self._stream, beside=self)
+        return ZenohBus(self._session, self._loop, metrics, stream=self._stream, threads=self._threads, beside=self)
 
     def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
         """Declare that ``key`` will be written. last: what another process published last, for keys that keep it."""
@@ -145,21 +148,21 @@ class ZenohBus:
         lane: Lane | Sort = Lane.OTHER,
         history: bool = False,
         kept: bool = False,
+        direct: bool = False,
     ) -> Handle:
         """Subscribe; samples come by a fixed lane or as a Sort chooses. history: ask for last values too.
 
         kept: the frames that publishers have kept come too, those of publishers that appear later as well.
+        direct: the handler is called on one of Zenoh's threads, for streams without lane and history: it must be quick,
+        and may put frames on another bus.
 
         Of the samples that a Sort sends by the lane STOP only one waits at a time: those that follow are the same stop.
         """
         if history:
             return self._keep(LateJoin(self, key_expr, handler))
-        if isinstance(lane, Lane):
-            source = self._inbox.source(handler, read_sample)
-            store = lane_callback(lane, source)
-        else:
-            source = self._inbox.source(handler)
-            store = sorted_callback(lane, source)
+        store: Any = direct_callback(key_expr, handler) if direct else loop_callback(self._inbox, handler, lane)
+        if direct or not self._threads:
+            store = prompt(store)
         if kept:
             return self._keep(Declared(subscribe_with_kept(self._session, key_expr, store)))
         return self._keep(Declared(self._session.declare_subscriber(key_expr, store)))

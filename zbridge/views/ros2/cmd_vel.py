@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 
 from zbridge.errors import Malformed, Unsupported
@@ -13,6 +14,9 @@ from zbridge.views.ros2.settings import Body
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 MOST_BYTES: Mapping[str, int] = {TWIST: 64, STAMPED: 512}
 """Bounds of the payloads; a stamped one has the name of a frame."""
+_LITTLE_ENDIAN = b"\0\1"
+_TWIST = struct.Struct("<4x6d")
+"""A Twist in CDR: linear x, y, z, and angular x, y, z."""
 _STILL = 1e-6
 """m/s and rad/s below this are zero."""
 _LARGEST = 1e6
@@ -25,13 +29,16 @@ def read_twist(types: Types, type_name: str, payload: bytes, body: Body) -> Driv
     Raises ProtocolError for what is none, Malformed for numbers that no command has, Unsupported for a turn on the spot
     of a robot that steers.
     """
-    message = types.decode(type_name, payload)
-    twist = message.twist if type_name == STAMPED else message
-    linear, angular = twist.linear, twist.angular
-    values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+    if type_name == TWIST and len(payload) == _TWIST.size and payload.startswith(_LITTLE_ENDIAN):  # nearly all
+        values = _TWIST.unpack(payload)
+    else:
+        message = types.decode(type_name, payload)
+        twist = message.twist if type_name == STAMPED else message
+        linear, angular = twist.linear, twist.angular
+        values = (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
     if not all(abs(value) <= _LARGEST for value in values):  # false for NaN
         raise Malformed(f"cmd_vel: expected numbers of {_LARGEST:g} at most")
-    return drive_of(linear.x, linear.y, angular.z, body)
+    return drive_of(values[0], values[1], values[5], body)
 
 
 def drive_of(forward_mps: float, left_mps: float, turn_radps: float, body: Body) -> Drive:

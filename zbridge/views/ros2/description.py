@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from zbridge.views.ros2.frames import Frames
 from zbridge.views.ros2.settings import Body
-from zbridge.views.ros2.shapes import Frames
 
 _LASER_M = 0.05
 """Radius and height of what is drawn for a scanner."""

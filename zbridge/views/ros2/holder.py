@@ -30,6 +30,10 @@ class Holder:
         self._came = asyncio.Event()
         self._drive: Drive | None = None
         self._drive_at = 0.0
+        self._driver: Driver | None = None
+        """While the lease is held."""
+        self._failed: ZbridgeError | None = None
+        """Why the last command was not sent."""
         self._task: asyncio.Task[None] | None = None
         self._earlier: set[asyncio.Task[None]] = set()
         """Tasks that release their lease."""
@@ -44,14 +48,20 @@ class Holder:
         self.send(drive)
 
     def send(self, drive: Drive) -> None:
-        """Carry out a command, soon; the newest wins."""
+        """Carry out a command, at once while the lease is held; the newest of those that wait for it wins."""
+        if self._driver is not None and self._drive is None:
+            try:
+                if self._driver.now(drive):
+                    return
+            except ZbridgeError as error:
+                self._failed = error
         self._drive, self._drive_at = drive, self._clock()
         self._came.set()
 
     def release(self) -> None:
         """Give the robot back; it is stopped if it moves."""
         task, self._task = self._task, None
-        self._drive = None
+        self._drive = self._driver = self._failed = None
         if task is not None and not task.done():
             self._earlier.add(task)
             task.add_done_callback(self._earlier.discard)
@@ -79,17 +89,22 @@ class Holder:
             self._on_lost(why)
 
     async def _drive_on(self, driver: Driver) -> None:
+        self._driver = driver
         lost = asyncio.get_running_loop().create_task(driver.lost.wait())
         lost.add_done_callback(lambda _: self._came.set())
         try:
-            while driver.loss is None:
-                await self._came.wait()
-                self._came.clear()
+            while driver.loss is None and self._failed is None:
                 drive, self._drive = self._drive, None
                 if drive is not None and self._clock() - self._drive_at < STALE_S:
                     await driver(drive.forward, drive.left, drive.turn)
-            raise driver.loss
+                await self._came.wait()
+                self._came.clear()
+            error = self._failed or driver.loss
+            assert error is not None
+            raise error
         finally:
+            if self._driver is driver:
+                self._driver = None
             lost.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await lost

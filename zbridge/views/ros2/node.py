@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -14,7 +15,7 @@ from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices
-from zbridge.fleet.topics import KeySpace
+from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.ros2 import Kind
 from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
@@ -42,6 +43,8 @@ class RobotNode:
         self._side = side
         self._bus = bus
         self._keys = keys
+        self._lock = threading.Lock()
+        """Streams come on Zenoh's threads, all else on the event loop's: of the pictures, and of who listens."""
         self._pictures = RobotPictures(keys.robot, side.types, body, side.metrics)
         self._malformed = side.metrics.count("ros2_malformed")
         self.node = side.node(f"/{self._pictures.frames.prefix}", NODE)
@@ -58,7 +61,7 @@ class RobotNode:
         self._services = Services(side, self.node, robot, drive=drive, on_stop=self._on_stop)
         self._declare(TOPICS)
         for name, message in self._pictures.fixed(time.time_ns()):
-            self._publish(name, message, self._outlets[name])
+            self._publish(message, self._outlets[name])
         self._handles.append(bus.subscribe(keys.key(topics.DEVICES.path), self._on_devices, history=True))
 
     def __repr__(self) -> str:
@@ -96,10 +99,11 @@ class RobotNode:
     # On demand
 
     def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
-        listened = self._listened.setdefault(name, set())
-        (listened.add if anybody else listened.discard)(outlet)
-        if not listened:
-            del self._listened[name]
+        with self._lock:
+            listened = self._listened.setdefault(name, set())
+            (listened.add if anybody else listened.discard)(outlet)
+            if not listened:
+                del self._listened[name]
         self._subscribe()
         if name == "diagnostics" and anybody and self._timer is None:
             self._diagnose()
@@ -111,25 +115,31 @@ class RobotNode:
             self._subscribed.pop(path).close()
         for path in needed - self._subscribed.keys():
             topic = topics.find(path)
-            handler = partial(self._take, path)
+            handler = partial(self._take, path, topic) if topic is not None else self._take_any
             history = topic is not None and topic.qos.keeps_last
-            self._subscribed[path] = self._bus.subscribe(self._keys.key(path), handler, history=history)
+            key = self._keys.key(path)
+            self._subscribed[path] = self._bus.subscribe(key, handler, history=history, direct=not history)
 
-    def _take(self, path: str, sample: Sample) -> None:
-        if path.endswith("*"):
-            path = self._keys.path(sample.key)
+    def _take_any(self, sample: Sample) -> None:
+        path = self._keys.path(sample.key)
         topic = topics.find(path)
-        if topic is None:
-            return
+        if topic is not None:
+            self._take(path, topic, sample)
+
+    def _take(self, path: str, topic: Topic, sample: Sample) -> None:
         try:
-            message = payloads.decode(topic.message, sample.payload)
+            message = payloads.decode(topic.message, sample.payload, arrays=topic is not topics.SCAN)
         except PayloadError:
             self._malformed.value += 1
             return
-        for name, made in self._pictures.make(path, message, time.time_ns(), self._listened):
-            self._publish(name, made, self._listened.get(name, ()))
+        with self._lock:
+            listened = self._listened
+            pictures = self._pictures.make(path, message, time.time_ns(), listened)
+            due = [(made, outlet) for name, made in pictures for outlet in listened.get(name, ())]
+        for made, outlet in due:
+            outlet.put(made)
 
-    def _publish(self, name: str, message: Any, outlets: Iterable[Outlet]) -> None:
+    def _publish(self, message: Any, outlets: Iterable[Outlet]) -> None:
         for outlet in outlets:
             outlet.put(message)
 
@@ -139,7 +149,9 @@ class RobotNode:
         except PayloadError:
             self._malformed.value += 1
             return
-        self._declare(self._pictures.sensors(devices.devices))
+        with self._lock:
+            sensors = self._pictures.sensors(devices.devices)
+        self._declare(sensors)
 
     def _diagnose(self) -> None:
         """Tell once a second, while somebody listens."""
@@ -147,7 +159,9 @@ class RobotNode:
         outlets = self._listened.get("diagnostics")
         if outlets:
             more = [self.teleop.diagnostics()] if self.teleop is not None else []
-            self._publish("diagnostics", self._pictures.diagnostics(more, time.time_ns()), outlets)
+            with self._lock:
+                told = self._pictures.diagnostics(more, time.time_ns())
+            self._publish(told, outlets)
             self._timer = asyncio.get_running_loop().call_later(DIAGNOSED_S, self._diagnose)
 
     def _on_stop(self) -> None:

@@ -52,16 +52,12 @@ class Outlet:
         return f"<Outlet {self._publisher.key}>"
 
     def put(self, message: Any) -> None:
-        """Publish a message; one that ROS's types cannot hold is counted and left out."""
+        """Publish a message, or one that is CDR already; what ROS's types cannot hold is counted and left out."""
         try:
-            payload = self._side.types.encode(message)
+            payload = message if isinstance(message, bytes) else self._side.types.encode(message)
         except EncodeError:
             self._side.not_encoded.value += 1
             return
-        self.put_payload(payload)
-
-    def put_payload(self, payload: bytes) -> None:
-        """Publish a message that is CDR already."""
         attachment = Attachment(next(self._numbers), time.time_ns(), self._gid).encode()
         self._publisher.put(payload, attachment)
         self._side.sent.value += 1

@@ -26,9 +26,10 @@ from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, LATCHED, SENSOR_DATA, QoS, Types, ros_name
 from zbridge.views.ros2.description import urdf
 from zbridge.views.ros2.diagnostics import Entry, entries_of
+from zbridge.views.ros2.frames import Frames
 from zbridge.views.ros2.reckoning import Reckoning
 from zbridge.views.ros2.settings import Body
-from zbridge.views.ros2.shapes import Frames, Shapes, speeds_of
+from zbridge.views.ros2.shapes import Shapes, speeds_of
 from zbridge.views.ros2.stamps import Stamps
 
 SENSORS = "sensor/*"

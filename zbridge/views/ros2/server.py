@@ -28,10 +28,10 @@ HIDDEN_AFTER_S = 2.0
 async def serve(plan: Plan, bus: BusSettings, metrics: Metrics, on_ready: Callable[[View], None]) -> None:
     """Show robots until cancelled; raise BusError or ConfigError. on_ready: called when robots are looked for."""
     types = types_of(plan.distro)
-    fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm)
+    fleet = await open_bus(bus, metrics, wait_for_peers=True, realm=plan.realm, threads=False)
     try:
         try:
-            ros = await open_bus(plan.ros, metrics, timestamps=True)
+            ros = await open_bus(plan.ros, metrics, timestamps=True, threads=False)
         except BusError as error:
             where = ", ".join(plan.ros.connect)
             raise BusError(f"{error}: no ROS router at {where}: `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error

@@ -44,9 +44,12 @@ def test_a_robot_is_recorded_with_its_commands_refusals_marks_and_frames(bench: 
     bench.fleet.put("r1/@cmd/drive", forward=0.5)
     bench.fleet.hold(who="op1")
     until(lambda: bench.fleet.last("r1/control").get("holder") == "op1", what="the holder")
-    bench.fleet.put("r1/@cmd/drive", forward=0.5)
-    until(lambda: bench.fleet.last("r1/pose"), what="pose")
     until(lambda: bench.fleet.refusal(code="no_lease"), what="refusal")
+    before = until(lambda: bench.fleet.last("r1/pose"), what="pose")
+    bench.fleet.put("r1/@cmd/drive", forward=0.5)
+    until(
+        lambda: bench.fleet.last("r1/pose")["x"] != before["x"], what="motion: the recorder has heard the command, too"
+    )
     said = end(process)
     assert process.returncode == 0, said
     assert "nothing lost" in said

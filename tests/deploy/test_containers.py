@@ -1,5 +1,6 @@
 """The container file, the composition and the chart, as far as they can be read without their tools (deploy/try.sh)."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -9,7 +10,7 @@ import subprocess
 import threading
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -94,10 +95,15 @@ while :; do sleep 0.05; done
 """Has a child that stops its robot a moment after its parent has ended."""
 
 
-def own_processes(command: str, *arguments: str) -> subprocess.Popen[str]:
-    """Run a command as the first process of a namespace, as a container does."""
-    namespace = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
-    return subprocess.Popen([*namespace, command, *arguments], stdin=subprocess.DEVNULL, text=True)
+@contextlib.contextmanager
+def own_processes(command: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a command as the first process of a namespace, as a container does: no signal is ignored."""
+    namespace = ("env", "--default-signal", "unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+    with subprocess.Popen([*namespace, command, *arguments], stdin=subprocess.DEVNULL, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a namespace of processes needs root")

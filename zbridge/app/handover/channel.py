@@ -29,6 +29,7 @@ SEND_S = 5.0
 _GROUP = 200
 """Descriptors that are sent at a time; Linux takes 253."""
 _HEADER = 4
+_ENDED = "the other side has ended"
 
 
 class Channel:
@@ -75,6 +76,8 @@ class Channel:
         except OSError as error:
             with contextlib.suppress(EndError):
                 self._receive(Failed, LAST_WORD_S)  # it may have said why it ends
+            if isinstance(error, ConnectionError):
+                raise EndError(_ENDED) from error
             raise HandoverError(f"the other side takes nothing: {error}") from error
 
     def _receive(self, kind: type[M], timeout_s: float | None) -> M:
@@ -87,7 +90,7 @@ class Channel:
         except TimeoutError as error:
             raise HandoverError(f"the other side says nothing for {timeout_s:g} s") from error
         except OSError as error:  # reset: it ended with a message of ours unread
-            raise EndError("the other side has ended") from error
+            raise EndError(_ENDED) from error
         except msgspec.MsgspecError as error:
             raise HandoverError(f"the other side cannot be understood: {error}") from error
         if isinstance(message, Failed):
@@ -101,7 +104,7 @@ class Channel:
         while len(data) < size:
             more = self._socket.recv(min(size - len(data), 2**20))
             if not more:
-                raise EndError("the other side has ended")
+                raise EndError(_ENDED)
             data += more
         return bytes(data)
 

@@ -100,3 +100,17 @@ async def test_a_lease_that_is_lost_is_told_once_and_nothing_is_sent_by_it(scene
     await asyncio.sleep(0.5)
     assert len(scene.driven) == driven
     assert len(scene.lost) == 1
+
+
+async def test_a_bus_that_breaks_under_a_command_ends_the_lease(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    await scene.held()
+
+    def broken(_: Drive) -> bool:
+        raise OSError("no bus")
+
+    monkeypatch.setattr(scene.holder._driver, "now", broken)
+    scene.holder.send(SECOND)
+    await asyncio.sleep(0.5)
+    assert len(scene.lost) == 1
+    assert "no bus" in scene.lost[0]
+    assert scene.world.gateway.control.holder is None

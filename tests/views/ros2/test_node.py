@@ -12,7 +12,7 @@ import pytest
 
 from zbridge.bus import Handle, Sample
 from zbridge.bus.fake import FakeBus
-from zbridge.fleet.messages import Pose, Scan, Scanner
+from zbridge.fleet.messages import Device, Devices, Pose, Scan, Scanner
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
@@ -146,3 +146,31 @@ async def test_what_is_no_message_of_its_key_is_counted_and_left_out(scene: Scen
     scene.listen("scan")
     scene.put("scan", payload)
     assert (scene.numbers("scan"), scene.metrics.total("ros2_malformed")) == ([], 1)
+
+
+def devices(*names: str) -> Sample:
+    """Make what a robot says of its distance sensors."""
+    told = tuple(Device(name=name, number=number, kind="distance") for number, name in enumerate(names))
+    return Sample("fleet/r1/devices", encode(Devices(devices=told)))
+
+
+async def test_a_robot_whose_sensors_get_other_names_has_topics_of_those_it_has_now(scene: Scene) -> None:
+    scene.node._on_devices(devices("a", "b"))
+    before = len(scene.ros._shared.tokens)
+    scene.listen("range/a")
+    for number in range(20):
+        scene.node._on_devices(devices(f"a{number}", f"b{number}"))
+    assert len(scene.ros._shared.tokens) == before
+    assert {name for name in scene.node._outlets if name.startswith("range/")} == {"range/a19", "range/b19"}
+    assert "range/a" not in scene.node._listened
+
+
+async def test_what_is_told_after_the_end_declares_nothing(scene: Scene) -> None:
+    outlets = {name: scene.node._outlets[name][0] for name in ("scan", "diagnostics")}
+    await scene.node.close()
+    for name, outlet in outlets.items():
+        scene.node._on_listened(name, outlet, True)
+    scene.node._on_devices(devices("ghost"))
+    assert scene.fleet._shared.subscribers == []
+    assert scene.ros._shared.tokens == []
+    assert scene.node._timer is None

@@ -227,6 +227,9 @@ def test_a_joint_that_is_at_fault_or_gone_is_not_told_of() -> None:
     made(pictures, Reading(0.5, "rotational", 1), "sensor/wheel")
     joints = made(pictures, Reading(0.1, "linear", 2), "sensor/lift")["joint_states"]
     assert (joints.name, joints.position.tolist()) == (["wheel", "lift"], [0.5, 0.1])
+    made(pictures, Reading(9.0, "rotational", 1, fault=True), "sensor/wheel")
+    assert made(pictures, Reading(0.1, "linear", 2), "sensor/lift")["joint_states"].name == ["lift"]
+    made(pictures, Reading(0.5, "rotational", 1), "sensor/wheel")
     pictures.sensors((Device("lift", 2, "linear"),))
     assert made(pictures, Reading(0.2, "linear", 2), "sensor/lift")["joint_states"].name == ["lift"]
 

@@ -105,3 +105,44 @@ async def test_a_publisher_that_goes_while_the_answer_is_on_its_way_is_not_enter
     await asyncio.sleep(ASK_S / 2)
     assert scene.driving.publishers == {}
     await scene.teleop.close()
+
+
+@pytest.mark.parametrize("asked", [False, True])
+async def test_a_stick_that_was_held_while_ros_s_router_was_away_owes_whatever_was_asked_meanwhile(
+    monkeypatch: pytest.MonkeyPatch, asked: bool
+) -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    stick, answered = scene.endpoint(), scene.bus.alive
+    scene.bus.announce(stick.token())
+
+    async def alive(key_expr: str) -> list[str]:
+        there = await answered(key_expr)
+        await asyncio.sleep(0.2)
+        return there
+
+    monkeypatch.setattr(scene.bus, "alive", alive)
+    scene.put(stick)
+    if asked:
+        scene.put(scene.endpoint())
+    await asyncio.sleep(0.1)
+    scene.teleop.connected(False)
+    await asyncio.sleep(2.0)
+    assert scene.driving.publishers == {}
+    scene.teleop.connected(True)
+    scene.teleop._on_token(stick.token(), True)
+    scene.put(stick)
+    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.OWES]
+    await scene.teleop.close()
+
+
+async def test_a_twist_that_waited_until_the_end_takes_no_robot() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    stick = scene.endpoint()
+    scene.bus.announce(stick.token())
+    closing = asyncio.ensure_future(scene.teleop.close())
+    await asyncio.sleep(0)
+    scene.put(stick)
+    await closing
+    assert scene.driving.holder is None

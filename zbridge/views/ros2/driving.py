@@ -30,6 +30,9 @@ REMEMBERED = 256
 """Publishers that are gone, and owe if they come back: they were cut off, and did not begin anew."""
 
 
+_EARLY = "it was there before"
+
+
 class Standing(Enum):
     """What a publisher may do."""
 
@@ -112,12 +115,15 @@ class Driving:
 
     def came(self, gid: bytes, name: str, now: float, *, early: bool) -> bool:
         """A publisher's token came; False where there is no place. early: the publisher was there before us."""
-        if gid in self.publishers:
+        known = self.publishers.get(gid)
+        if known is not None:
+            if early and known.standing is Standing.FREE:
+                known.standing, known.why = Standing.OWES, _EARLY
             return True
         if len(self.publishers) >= PUBLISHERS:
             return False
         back = gid in self._gone
-        why = "it was cut off, and is back" if back else "it was there before" if early else ""
+        why = "it was cut off, and is back" if back else _EARLY if early else ""
         self._gone.pop(gid, None)
         self.publishers[gid] = publisher = Publisher(name, Standing.OWES if why else Standing.FREE, why)
         publisher.heard_at = now  # it may have spoken until now: its silence begins here

@@ -32,7 +32,7 @@ class Holder:
         self._drive_at = 0.0
         self._driver: Driver | None = None
         """While the lease is held."""
-        self._failed: ZbridgeError | None = None
+        self._failed: Exception | None = None
         """Why the last command was not sent."""
         self._task: asyncio.Task[None] | None = None
         self._earlier: set[asyncio.Task[None]] = set()
@@ -53,7 +53,7 @@ class Holder:
             try:
                 if self._driver.now(drive):
                     return
-            except ZbridgeError as error:
+            except Exception as error:  # the task that holds the lease tells it
                 self._failed = error
         self._drive, self._drive_at = drive, self._clock()
         self._came.set()

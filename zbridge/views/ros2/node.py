@@ -28,6 +28,8 @@ NODE = "zbridge"
 """The name of each robot's node, in the robot's namespace."""
 DIAGNOSED_S = 1.0
 """Seconds between two diagnostics."""
+_FIXED = frozenset(topic.name for topic in TOPICS)
+"""The topics that every robot has; the others are those of its sensors."""
 
 
 class RobotNode:
@@ -54,6 +56,7 @@ class RobotNode:
         self._subscribed: dict[str, Handle] = {}
         self._paths: dict[str, tuple[str, ...]] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
         self._handles: list[Handle] = [side.bus.announce(self.node.token())]
         robot = Fleet(bus, keys.realm, own)[keys.robot]
         control_key = keys.key(topics.CONTROL.path)
@@ -69,6 +72,7 @@ class RobotNode:
 
     async def close(self) -> None:
         """Give the robot back, and take everything back that was declared; idempotent."""
+        self._closed = True
         if self._timer is not None:
             self._timer.cancel()
         outlets = [outlet for of_topic in self._outlets.values() for outlet in of_topic]
@@ -99,6 +103,8 @@ class RobotNode:
     # On demand
 
     def _on_listened(self, name: str, outlet: Outlet, anybody: bool) -> None:
+        if self._closed or outlet not in self._outlets.get(name, ()):  # it was told of before it was closed
+            return
         with self._lock:
             listened = self._listened.setdefault(name, set())
             (listened.add if anybody else listened.discard)(outlet)
@@ -149,13 +155,28 @@ class RobotNode:
         except PayloadError:
             self._malformed.value += 1
             return
+        if self._closed:
+            return
         with self._lock:
             sensors = self._pictures.sensors(devices.devices)
+        self._drop_sensors({topic.name for topic in sensors})
         self._declare(sensors)
+
+    def _drop_sensors(self, kept: set[str]) -> None:
+        """Take back the topics of sensors that the robot has no more."""
+        for name in self._outlets.keys() - kept - _FIXED:
+            for outlet in self._outlets.pop(name):
+                outlet.close()
+            with self._lock:
+                self._listened.pop(name, None)
+            del self._paths[name]
+        self._subscribe()
 
     def _diagnose(self) -> None:
         """Tell once a second, while somebody listens."""
         self._timer = None
+        if self._closed:
+            return
         outlets = self._listened.get("diagnostics")
         if outlets:
             more = [self.teleop.diagnostics()] if self.teleop is not None else []

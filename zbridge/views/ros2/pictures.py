@@ -218,7 +218,9 @@ class RobotPictures:
         if kind == "range":
             if f"range/{name}" in wanted:
                 yield f"range/{name}", self._shapes.range_of(name, reading, stamp_ns)
-        elif JOINTS.name in wanted and not reading.fault:  # a joint has no number for what nobody knows
+        elif reading.fault:  # a joint has no number for what nobody knows
+            self._positions.pop(name, None)
+        elif JOINTS.name in wanted:
             self._positions[name] = reading.value
             yield JOINTS.name, self._shapes.joint_states(self._positions, stamp_ns)
 

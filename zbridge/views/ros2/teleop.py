@@ -110,6 +110,9 @@ class Teleop:
         """ROS's router was found again, or lost: then nobody is there."""
         self._settled_at = self._loop.time() + SETTLE_S
         if not up:
+            if self._asking is not None:  # its answer may be from before
+                self._asking.cancel()
+                self._asking = None
             for token in list(self._tokens):
                 self._forget(token)
 
@@ -173,7 +176,8 @@ class Teleop:
         except BusError:
             return
         finally:
-            self._asking = None
+            if self._asking is asyncio.current_task():
+                self._asking = None
         heard_at = {gid: publisher.heard_at for gid, publisher in self._driving.publishers.items()}
         for token in known - alive:
             if heard_at.get(self._tokens.get(token, b""), math.inf) < asked_at - QUIET_S:
@@ -224,6 +228,8 @@ class Teleop:
         return Lane.COMMAND if gid == self._driving.holder else Lane.OTHER
 
     def _take(self, type_name: str, sample: Sample) -> None:
+        if not self._handles:  # it waited to be taken until nothing may be driven any more
+            return
         drive, wrong = Drive(), ""
         try:
             attachment = read_attachment(sample.attachment)

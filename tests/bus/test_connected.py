@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from zbridge.bus.zenoh.connected import LOOK_AGAIN_S, watch_connected
+from zbridge.bus.zenoh.connected import LOOK_AGAIN_S, ConnectedWatch
 
 pytestmark = pytest.mark.jumping
 
@@ -50,10 +50,36 @@ async def test_the_last_word_is_what_is_true(
     events: list[tuple[zenoh.SampleKind, str]], list_then: str, list_later: str, told: list[bool]
 ) -> None:
     info, heard = Info(), list[bool]()
-    watch_connected(info, asyncio.get_running_loop(), heard.append)
+    ConnectedWatch(info, asyncio.get_running_loop(), heard.append)
     info.zids = [*list_then]
     for kind, zid in events:
         info.event(kind, zid)
     info.zids = [*list_later]
-    await asyncio.sleep(2 * LOOK_AGAIN_S)
+    await asyncio.sleep(2 * max(LOOK_AGAIN_S))
     assert heard == told
+
+
+async def test_a_list_that_is_late_is_looked_at_again() -> None:
+    info, heard = Info(), list[bool]()
+    ConnectedWatch(info, asyncio.get_running_loop(), heard.append)
+    info.zids = ["a", "b"]
+    for kind, zid in ((MADE, "a"), (MADE, "b"), (GONE, "a"), (GONE, "b")):
+        info.event(kind, zid)
+    await asyncio.sleep(1.5)
+    info.zids = []
+    await asyncio.sleep(1.0)
+    assert heard == [True, False]
+    info.event(MADE, "c")
+    await asyncio.sleep(0)
+    assert heard == [True, False, True]
+
+
+async def test_who_closed_the_watch_hears_no_more() -> None:
+    info, heard = Info(), list[bool]()
+    watch = ConnectedWatch(info, asyncio.get_running_loop(), heard.append)
+    info.event(MADE, "a")
+    await asyncio.sleep(0)
+    info.event(GONE, "a")
+    watch.close()
+    await asyncio.sleep(2 * max(LOOK_AGAIN_S))
+    assert heard == [True]

@@ -18,7 +18,7 @@ from zbridge.bus.tls.membership import require_member
 from zbridge.bus.writer import Writer
 from zbridge.bus.zenoh.alive import AliveWatches, Changed
 from zbridge.bus.zenoh.answers import Answers
-from zbridge.bus.zenoh.connected import watch_connected
+from zbridge.bus.zenoh.connected import ConnectedWatch
 from zbridge.bus.zenoh.declared import Declared, prompt, threadless
 from zbridge.bus.zenoh.incoming import (
     Replies,
@@ -287,7 +287,7 @@ class ZenohBus:
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Handle:
         """Call ``handler`` when the first connection to the bus is made (True) and the last one is lost (False)."""
-        return self._keep(watch_connected(self._session.info, self._loop, handler))
+        return self._keep(ConnectedWatch(self._session.info, self._loop, handler))
 
     async def close(self) -> bool:
         """Leave the bus within :data:`LEAVE_S`; False where that hangs, as with a router that has stalled."""

@@ -11,7 +11,7 @@ usage: install.sh [--wheels PATH] [--extras LIST] [--router] [--recorder] [--ser
 --wheels PATH   a folder with zbridge's wheel and all that it needs, or the wheel in such a folder: nothing is downloaded.
                 Make it on a machine with a network: pip wheel -w wheels '.[certs,serial]', with foxglove for --recorder
                 Without it: installs the checkout that this script is in, and downloads the rest.
---extras LIST   extras of zbridge, separated by commas; "certs,serial" by default, with --recorder foxglove too; "" for none
+--extras LIST   extras of zbridge, separated by commas; "certs,serial" by default, with a recorder foxglove too; "" for none
 --router        also run the router of the bus      (/etc/zbridge/router.toml, /etc/zbridge/router)
 --recorder      also record all robots              (/etc/zbridge/recorder.env, /etc/zbridge/recorder)
 --serial        let gateways open serial lines
@@ -49,7 +49,10 @@ while [ $# -gt 0 ]; do
     shift
 done
 [ -z "$purge" ] || [ -n "$uninstall" ] || wrong "--purge: expected --uninstall with it"
-[ "$extras" != default ] || extras=certs,serial${recorder:+,foxglove}
+if [ "$extras" = default ]; then
+    extras=certs,serial
+    if [ -n "$recorder" ] || [ -L "$units/multi-user.target.wants/zbridge-recorder.service" ]; then extras+=,foxglove; fi
+fi
 [ "$(id -u)" -eq 0 ] || die "must be run as root"
 
 # systemd may be absent (a chroot, an image that is being built): then units are enabled for the next boot.

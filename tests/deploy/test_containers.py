@@ -95,11 +95,20 @@ while :; do sleep 0.05; done
 """Has a child that stops its robot a moment after its parent has ended."""
 
 
+def started(folder: Path, zbridge: str) -> Path:
+    """Return the start of a container in which this script is zbridge."""
+    (program := folder / "zbridge").write_text(zbridge)
+    (start := folder / "start.sh").write_text(START.read_text().replace("/opt/zbridge/bin/zbridge", str(program)))
+    for script in (program, start):
+        script.chmod(0o755)
+    return start
+
+
 @contextlib.contextmanager
-def own_processes(command: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+def own_processes(command: str, *arguments: str, stdin: int = subprocess.DEVNULL) -> Iterator[subprocess.Popen[str]]:
     """Run a command as the first process of a namespace, as a container does: no signal is ignored."""
     namespace = ("env", "--default-signal", "unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
-    with subprocess.Popen([*namespace, command, *arguments], stdin=subprocess.DEVNULL, text=True) as process:
+    with subprocess.Popen([*namespace, command, *arguments], stdin=stdin, text=True) as process:
         try:
             yield process
         finally:
@@ -111,10 +120,7 @@ def own_processes(command: str, *arguments: str) -> Iterator[subprocess.Popen[st
 def test_gateways_have_time_for_their_stop_when_the_supervisor_of_a_container_ends(
     tmp_path: Path, signal: str, reloads: bool, code: int
 ) -> None:
-    (supervisor := tmp_path / "zbridge").write_text(SUPERVISOR)
-    supervisor.chmod(0o755)
-    (start := tmp_path / "start.sh").write_text(START.read_text().replace("/opt/zbridge/bin/zbridge", str(supervisor)))
-    start.chmod(0o755)
+    start = started(tmp_path, SUPERVISOR)
     stopped = tmp_path / "stopped"
     with own_processes(str(start), str(stopped)) as namespace:
         first = only_child(namespace.pid)
@@ -123,6 +129,32 @@ def test_gateways_have_time_for_their_stop_when_the_supervisor_of_a_container_en
             until(lambda: bool(kill("HUP", first)) or (tmp_path / "stopped.reloaded").exists())
         kill(signal, only_child(first) if signal == "KILL" else first)
         assert namespace.wait(20) == code
+    assert stopped.read_text() == "stopped\n"
+
+
+RESTARTED = """#!/bin/sh
+exec 3<&0
+(trap 'echo stopped >"$1"; exit 0' TERM; read word; echo "$word" >"$1.word"; while :; do sleep 0.05; done) <&3 &
+exit 0
+"""
+"""Hands its robot to a process that goes on without it."""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a namespace of processes needs root")
+def test_a_container_lives_as_long_as_the_gateway_that_a_restart_began_and_tells_it_to_end(tmp_path: Path) -> None:
+    start = started(tmp_path, RESTARTED)
+    start.write_text(start.read_text().replace("left=50", "left=5"))
+    stopped, word = tmp_path / "stopped", tmp_path / "stopped.word"
+    with own_processes(str(start), str(stopped), stdin=subprocess.PIPE) as namespace:
+        first = only_child(namespace.pid)
+        assert namespace.stdin is not None
+        namespace.stdin.write("hello\n")
+        namespace.stdin.flush()
+        until(lambda: word.exists() and word.read_text() == "hello\n")
+        time.sleep(1.5)  # longer than a dead supervisor's gateways are given
+        assert namespace.poll() is None
+        kill("TERM", first)
+        assert namespace.wait(20) == 0
     assert stopped.read_text() == "stopped\n"
 
 

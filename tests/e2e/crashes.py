@@ -39,7 +39,7 @@ import zenoh
 
 from tests.e2e import loss
 from tests.e2e.conftest import Fleet, configuration, device, end, until
-from tests.e2e.fragile import ROBOTS, charges
+from tests.e2e.fragile import DISTURBED, ROBOTS, charges
 from tests.e2e.processes import LINE_S, Part
 from tests.e2e.robots import SCALE
 from tests.e2e.stalls import MovingRobot
@@ -69,6 +69,8 @@ class Outcome:
     kept: bool = False
     """Whether the robot saw one connection all the time: the next process went on with it."""
     faults: list[str] = field(default_factory=list)
+    disturbed: bool = False
+    """Whether the robot was never driven, and was late itself: it lost packets that it read as one."""
 
     @property
     def good(self) -> bool:
@@ -118,6 +120,9 @@ def _measure(scene: Scene, stack: contextlib.ExitStack, outcome: Outcome, name: 
     pid = scene.supervisor.gateway(name)
     driver = Part(stack, *loss.driver(scene.endpoint, name, DEADMAN_S, RATE_HZ, round(SPEED * SCALE), 0))
     if not robot.begins(SPEED, driver):
+        robot.part.say("end")
+        until(lambda: robot.report, 5, "the robot's report")
+        outcome.disturbed = bool(robot.report["piled"])
         raise RuntimeError("the robot was never driven")
     time.sleep(random.uniform(0.5, 1.5))
     crashed = time.monotonic()
@@ -161,7 +166,10 @@ def measure(
                 case = next(waiting, None)
             if case is None:
                 return
-            outcome = repeat(scene, *case)
+            for _ in range(DISTURBED):
+                outcome = repeat(scene, *case)
+                if not outcome.disturbed:
+                    break
             with taking:
                 outcomes.append(outcome)
                 took(outcome)

@@ -12,7 +12,7 @@ import pytest
 
 from zbridge.bus import Handle, Sample
 from zbridge.bus.fake import FakeBus
-from zbridge.fleet.messages import Device, Devices, Pose, Scan, Scanner
+from zbridge.fleet.messages import Device, Devices, Pose, Reading, Scan, Scanner
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
@@ -174,3 +174,12 @@ async def test_what_is_told_after_the_end_declares_nothing(scene: Scene) -> None
     assert scene.fleet._shared.subscribers == []
     assert scene.ros._shared.tokens == []
     assert scene.node._timer is None
+
+
+async def test_readings_of_all_sensors_come_by_one_subscription_each_to_its_topic(scene: Scene) -> None:
+    scene.node._on_devices(devices("a", "b"))
+    for name in ("range/a", "range/b"):
+        scene.listen(name)
+    ((_, take),) = [(key, take) for key, take in scene.fleet._shared.subscribers if key == "fleet/r1/sensor/*"]
+    take(Sample("fleet/r1/sensor/b", encode(Reading(1.0, "distance", 1))))
+    assert (scene.numbers("range/a"), scene.numbers("range/b")) == ([], [1])

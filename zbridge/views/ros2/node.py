@@ -15,7 +15,7 @@ from zbridge.errors import PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Devices
-from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.fleet.topics import KeySpace, Topic, is_concrete
 from zbridge.ros2 import Kind
 from zbridge.views.ros2.holder import NAME
 from zbridge.views.ros2.outlets import Outlet, RosSide
@@ -120,7 +120,7 @@ class RobotNode:
         for path in self._subscribed.keys() - needed:
             self._subscribed.pop(path).close()
         for path in needed - self._subscribed.keys():
-            topic = topics.find(path)
+            topic = topics.find(path) if is_concrete(path) else None
             handler = partial(self._take, path, topic) if topic is not None else self._take_any
             history = topic is not None and topic.qos.keeps_last
             key = self._keys.key(path)

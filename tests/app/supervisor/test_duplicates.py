@@ -1,8 +1,10 @@
 """The stop over duplicates of real sockets, and the end that a peer sees."""
 
+import asyncio
 import contextlib
 import os
 import socket
+import threading
 from collections.abc import Iterator
 
 import pytest
@@ -112,3 +114,28 @@ def test_what_is_no_link_and_links_beyond_the_bound_are_closed(tmp_path: object)
         assert len(kept) == LINKS
         kept.close()
     assert len(os.listdir("/proc/self/fd")) == before
+
+
+async def test_a_robot_that_is_held_up_in_its_sending_reads_its_stop_before_the_end() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as ours:
+        robot, _ = server.accept()
+        ours.setblocking(False)
+        read: list[bytes] = []
+
+        def talk() -> None:
+            with robot, contextlib.suppress(OSError):
+                robot.sendall(bytes(8_000_000))  # more than both sides keep
+                while data := robot.recv(100):
+                    read.append(data)
+
+        thread = threading.Thread(target=talk)
+        thread.start()
+        await asyncio.sleep(0.2)
+        kept = Duplicates()
+        kept.opened(1, "robot", [os.dup(ours.fileno())], drives=True)
+        kept.stands({1: Boundary()})
+        ours.close()
+        assert await kept.stop(LastStop(frames=(StopFrame(b"stop"),)), 1)
+        await kept.leave()
+        thread.join(5)
+    assert b"".join(read) == b"stop"

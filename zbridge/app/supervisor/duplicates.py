@@ -7,6 +7,7 @@ closes its own on purpose: until then the robot sees no end of the connection.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import socket
@@ -23,8 +24,12 @@ TIMES = 4
 """So often a stop is written: deployed robots lose what they read together with something else."""
 PERIOD_S = 0.12
 """Seconds between two stops."""
+LEAVE_S = 0.5
+"""Longest time for which a connection is read empty before it is closed."""
 LINKS = 16
 """Most links of one process."""
+_READS, _READ_BYTES = 32, 65_536
+"""How much is read away at a time."""
 
 
 class Duplicate:
@@ -65,6 +70,13 @@ class Duplicate:
         """Close the duplicates; idempotent."""
         close_all([number for number in (self._stream, self._datagrams) if number is not None])
         self._stream = self._datagrams = None
+
+    def read_away(self) -> None:
+        """Read what waits, and forget it."""
+        if self._stream is not None and stat.S_ISSOCK(os.fstat(self._stream).st_mode):
+            with _borrowed(self._stream) as stream, contextlib.suppress(OSError):
+                for _ in range(_READS):
+                    stream.recv(_READ_BYTES, socket.MSG_DONTWAIT)
 
     async def stop(self, last: LastStop, times: int) -> bool:
         """Write the stop so often; False where the link takes nothing.
@@ -164,6 +176,19 @@ class Duplicates:
         """Close all duplicates; idempotent."""
         while self._links:
             self._links.popitem()[1].close()
+
+    async def leave(self) -> None:
+        """Close all, but first let the robot read its stop: the kernel would reset what is closed with bytes unread.
+
+        A robot whose own sending is held up goes on when that is read.
+        """
+        loop = asyncio.get_running_loop()
+        ends_at = loop.time() + LEAVE_S
+        while self._links and loop.time() < ends_at:
+            for duplicate in self._links.values():
+                duplicate.read_away()
+            await asyncio.sleep(LEAVE_S / 25)
+        self.close()
 
     async def stop(self, last: LastStop, times: int = TIMES) -> bool | None:
         """Write the robot's stop so often; whether its link took it, None where there is no link or no stop."""

@@ -187,6 +187,8 @@ class Runner:
                 if successor is None and not self._ending and not process.told_to_end:
                     self.process = await self._inherited(process, stopped)
                 await stopped
+                if self.process is None:
+                    await process.duplicates.leave()
             process.close()
             if self.process is not None and successor is None:
                 self.restarts += 1

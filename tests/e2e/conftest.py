@@ -147,6 +147,24 @@ class Fleet:
         return next((entry for entry in entries if wanted.items() <= entry.items()), None)
 
 
+@contextlib.contextmanager
+def repeated(act: Callable[[], None], every_s: float = 0.05) -> Iterator[None]:
+    """Do something again and again, as a stick does that is pushed."""
+    ended = threading.Event()
+
+    def go_on() -> None:
+        while not ended.wait(every_s):
+            act()
+
+    thread = threading.Thread(target=go_on, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 # Processes
 
 

@@ -7,7 +7,6 @@ ones of every protocol, each a process of its own that tells what it obeys (:mod
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import zenoh
 
-from tests.e2e.conftest import WAIT_S, Fleet, Gateway, configuration, device, end, start, until
+from tests.e2e.conftest import WAIT_S, Fleet, Gateway, configuration, device, end, repeated, start, until
 from tests.e2e.fragile import DISTURBED, ROBOTS, charges
 from tests.e2e.stalls import HELD_UP_S, TOLERANCE, MovingRobot
 from tests.machine import Withheld
@@ -153,24 +152,6 @@ class FragileInFleet:
         assert charges(report["violations"], late_s) == []
         assert not report["moving"], "it moves at the end"
         return report
-
-
-@contextlib.contextmanager
-def repeated(act: Callable[[], None], every_s: float = 0.05) -> Iterator[None]:
-    """Do something again and again, as a stick does that is pushed."""
-    ended = threading.Event()
-
-    def go_on() -> None:
-        while not ended.wait(every_s):
-            act()
-
-    thread = threading.Thread(target=go_on, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 @contextlib.contextmanager

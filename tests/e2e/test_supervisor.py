@@ -7,14 +7,13 @@ import os
 import re
 import signal
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.conftest import Bench, device, end, start, until
+from tests.e2e.conftest import Bench, device, end, repeated, start, until
 from tests.e2e.crashes import measure
 from tests.e2e.robots import MOVE, STOP, Robot
 from tests.e2e.supervised import Supervised
@@ -48,22 +47,16 @@ class Host:
     @contextlib.contextmanager
     def driven(self) -> Iterator[None]:
         """Drive all robots, again and again, until the block ends."""
-        over, names = threading.Event(), [f"r{number}" for number in range(len(self.robots))]
+        names = [f"r{number}" for number in range(len(self.robots))]
         for name in names:
             self.bench.fleet.hold(name)
 
         def drive() -> None:
-            while not over.wait(0.05):
-                for name in names:
-                    self.bench.fleet.put(f"{name}/@cmd/drive", forward=0.5)
+            for name in names:
+                self.bench.fleet.put(f"{name}/@cmd/drive", forward=0.5)
 
-        thread = threading.Thread(target=drive)
-        thread.start()
-        try:
+        with repeated(drive):
             yield
-        finally:
-            over.set()
-            thread.join()
 
     def write(self, number: int, more: str = "", name: str = "") -> Path:
         """Write the file of a robot."""

@@ -21,6 +21,8 @@ LIMITS = Limits(frame_bytes=100, handshake_s=5.0, gap_s=0.01)
 def frame_end(data: bytes, start: int) -> int:
     if data[start] == 255:
         raise ProtocolError("length 255")
+    if data[start] == 254:
+        return start  # a fault of the protocol's own
     return start + 1 + data[start]
 
 
@@ -53,8 +55,8 @@ class Toy(Session[bytes]):
         return False
 
 
-BROKEN = {"!": b"\xff", "#": b"\x64"}
-"""What cannot begin a frame, and a header of a frame that is too long."""
+BROKEN = {"!": b"\xff", "#": b"\x64", "@": b"\xfe"}
+"""What cannot begin a frame, a header of a frame that is too long, and one for which the framing does not advance."""
 
 
 def play(session: Any, script: str, **verbs: Callable[[str, float], Any]) -> None:
@@ -118,6 +120,10 @@ SCRIPTS = {
     ),
     "a frame that is too long does so too": (
         OPEN + "hear a # = a; is closed (broken stream: frame of 101 bytes exceeds 100)"
+    ),
+    "framing that does not advance ends it too, and names the protocol's function": (
+        OPEN + "hear a @ b = a; is closed (broken stream: tests.protocol.test_session.frame_end returned a frame of "
+        "0 bytes, expected 1 or more)"
     ),
     "a closing session writes what waits, ignores what comes, and then is closed": (
         OPEN

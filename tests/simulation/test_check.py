@@ -59,6 +59,7 @@ def claims(value: object) -> str:
     return "; ".join(value) or "sound" if isinstance(value, dict) else ""
 
 
+toy_end = TOY.codecs[0].frame_end
 broken = partial(msgspec.structs.replace, TOY)
 """The toy with other parts."""
 
@@ -109,6 +110,10 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
         (with_codec(messages=(object,)), {ROUND_TRIP: ""}),
         (with_codec(frame_end=lambda data, start: start + 1000), {CUTS: "is cut to []"}),
         (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:"}),
+        (
+            with_codec(frame_end=lambda data, start: start if data[start] == 0 else toy_end(data, start)),
+            {NOISE: "tests.simulation.test_check.<lambda> returned a frame of 0 bytes, expected 1 or more"},
+        ),
         (
             with_codec(
                 frame_end=lambda data, start: len(data),

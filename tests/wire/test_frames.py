@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import ProtocolError
-from zbridge.wire.frames import FrameBuffer
+from zbridge.wire.frames import FrameBuffer, FramingFault
 
 LIMIT = 50
 
@@ -75,3 +75,16 @@ def test_a_long_frame_in_small_reads_is_looked_at_only_when_it_may_be_whole() ->
         assert list(buffer.feed(bytes([byte]))) == []
     assert len(next(buffer.feed(b"x"))) == 257
     assert looks == 3
+
+
+@pytest.mark.parametrize("read", [b"\x01", b"\x01\x02ab"])
+@pytest.mark.parametrize("end", [0, -1])
+@pytest.mark.parametrize("first", [b"", b"\x07"])
+def test_a_framing_function_that_does_not_advance_is_an_error_with_its_name(first: bytes, read: bytes, end: int) -> None:
+    def stuck(data: bytes, start: int) -> int:
+        return start + (2 if data == b"\x07" else end)
+
+    buffer = FrameBuffer(stuck, LIMIT)
+    assert list(buffer.feed(first)) == []
+    with pytest.raises(FramingFault, match=rf"tests\.wire\.test_frames\..*stuck returned a frame of {end} bytes"):
+        list(buffer.feed(read))

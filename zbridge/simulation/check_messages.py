@@ -16,7 +16,7 @@ from zbridge.protocol.plugin import Protocol
 from zbridge.simulation.check_report import Finding
 from zbridge.wire import Whole
 from zbridge.wire.fields import CountedArray, Filling
-from zbridge.wire.frames import FrameBuffer
+from zbridge.wire.frames import FrameBuffer, FramingFault
 
 MOST_BYTES = 2**20
 RANDOM_CASES = 500
@@ -144,6 +144,8 @@ def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
         try:
             for frame in FrameBuffer(codec.frame_end, MOST_BYTES).feed(stream):
                 _read(codec, frame)
+        except FramingFault as fault:
+            problems.setdefault(str(fault), f"{stream!r}: {fault}")
         except ProtocolError:
             pass
         except Exception as error:

@@ -18,6 +18,10 @@ _JOINED = 1024
 """Least bytes that are joined to an incomplete frame while its end is unknown."""
 
 
+class FramingFault(ProtocolError):
+    """A protocol's framing function returned an offset that is not behind the frame's start."""
+
+
 class FrameBuffer:
     """Keeps the incomplete frame between reads: at most ``limit`` bytes."""
 
@@ -44,6 +48,7 @@ class FrameBuffer:
         """Yield every frame that ``data`` completes; raise ProtocolError at a broken or too large frame.
 
         The frames before it are yielded first. After an error the buffer must not be used any more.
+        Raises FramingFault, a ProtocolError, where the framing function does not advance.
         """
         start = 0
         while self._rest:
@@ -78,4 +83,12 @@ class FrameBuffer:
         end = self._frame_end(data, start)
         if end - start > self._limit:
             raise ProtocolError(f"frame of {end - start} bytes exceeds {self._limit}")
+        if end <= start:
+            raise FramingFault(f"{_name(self._frame_end)} returned a frame of {end - start} bytes, expected 1 or more")
         return end
+
+
+def _name(function: FrameEnd) -> str:
+    """Return a function's name with that of its module, which is the protocol's."""
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    return f"{module}.{name}" if module and name else repr(function)

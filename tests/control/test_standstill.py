@@ -14,6 +14,7 @@ pytestmark = pytest.mark.jumping
 STOP = bytes.fromhex("02000000 02 0d")
 """Packet 13 to client id 2 (tcpudp.md, "Framing"): length 2, id, packet id."""
 MODE_NONE = bytes.fromhex("06000000 02 0a 01000000")
+MODE_MANUAL = bytes.fromhex("06000000 02 0a 02000000")
 FORWARD = {"forward": 1.0}
 NO_JOYSTICK = bytes.fromhex("0f000000 01 02 02 03000000 312e31 0000000000")
 """serverSettings of a 1.1 robot that announces nothing."""
@@ -46,10 +47,11 @@ async def play(rig: Rig, course: str) -> None:
 
 
 def kind(frame: bytes) -> str:
-    return "move" if frame[5] == 11 else {STOP: "stop", MODE_NONE: "mode none"}.get(frame, frame.hex())
+    names = {STOP: "stop", MODE_NONE: "mode none", MODE_MANUAL: "mode manual"}
+    return "move" if frame[5] == 11 else names.get(frame, frame.hex())
 
 
-PAIR = {"mode none", "stop"}
+PAIR, MANUAL_PAIR = {"mode none", "stop"}, {"mode manual", "stop"}
 COURSES = {
     # what happens, then what happens while the robot is watched; what it is sent meanwhile, at least and at most
     "nobody drives": ("wait 0.5", "wait 60", {"stop"}, 59, 61),
@@ -57,7 +59,7 @@ COURSES = {
     "somebody sent neutral, and holds the lease": ("drive 1; neutral; wait 3", "wait 20", {"stop"}, 19, 21),
     "the deadman came, and the lease is held": ("drive 1; wait 8", "wait 20", {"stop"}, 19, 21),
     "a robot drives itself": ("mode autonomous; wait 0.2", "wait 10", set(), 0, 0),
-    "it drives itself no more": ("mode autonomous; wait 0.2; mode manual; wait 0.2", "wait 10", {"stop"}, 9, 11),
+    "it drives itself no more": ("mode autonomous; wait 0.2; mode manual; wait 0.2", "wait 10", MANUAL_PAIR, 18, 22),
     "a stop after mode 3 is the pair": ("mode autonomous; wait 0.5; neutral; wait 3", "wait 5", PAIR, 9, 11),
     "somebody only chats": ("raw 40; wait 0.2", "wait 10", {"stop"}, 9, 11),
     "a stop drops raw packets that wait": ("raw 21; " * 30 + "stop", "wait 5", {"stop"}, 9, 100),
@@ -81,14 +83,40 @@ async def test_a_robot_is_sent_stops_while_nobody_drives_it(before, watched, kin
         assert rig.control["state"] == ("stopped" if "stop" in before.split("; ") else "held")
 
 
-async def test_idle_stops_come_a_second_apart_and_can_be_turned_off() -> None:
-    async with established(idle_stop_s=1.0) as rig:
+SETTINGS = {
+    version: bytes.fromhex(f"{7 + len(listed) + len(flags):02x}000000 01 02 02 {len(listed):02x}000000")
+    + listed
+    + flags
+    for version, listed, flags in (
+        ("1.1", b"1.1", bytes.fromhex("0001010101")),
+        ("1.2", b"1.2", bytes.fromhex("000101010101")),
+        ("1.3", b"1.1,1.2,1.3", bytes.fromhex("00010101010101 e8030000 0a000000")),
+    )
+}
+"""serverSettings with Joystick of robots of three versions (tcpudp.md, "Settings and version negotiation")."""
+
+
+@pytest.mark.parametrize(("version", "apart_s"), [("1.1", 0.25), ("1.2", 0.25), ("1.3", 1.0)])
+async def test_idle_stops_come_evenly_and_can_be_turned_off(version: str, apart_s: float) -> None:
+    async with serving(idle_stop_s=1.0) as rig:
+        await rig.establish(SETTINGS[version])
         await play(rig, "wait 60")
         times = rig.link.times[-50:]
-        assert all(0.9 <= later - sooner <= 1.1 for sooner, later in itertools.pairwise(times))
-    async with established(idle_stop_s=0.0) as rig:
+        assert all(later - sooner == pytest.approx(apart_s, rel=0.1) for sooner, later in itertools.pairwise(times))
+        assert {kind(frame) for frame in rig.link.written[-50:]} == {"stop"}
+    async with serving(idle_stop_s=0.0) as rig:
+        await rig.establish(SETTINGS[version])
+        await play(rig, "wait 60")
+        rig.forget_written()
         await play(rig, "wait 60")
         assert rig.written() == []
+
+
+async def test_idle_stops_are_as_frequent_as_configured_where_that_is_more() -> None:
+    async with serving(idle_stop_s=0.125) as rig:
+        await rig.establish(SETTINGS["1.1"])
+        await play(rig, "wait 10")
+        assert rig.link.times[-1] - rig.link.times[-9] == pytest.approx(1.0, rel=0.1)
 
 
 async def test_before_the_robot_is_established_and_after_it_is_lost_nothing_is_sent() -> None:

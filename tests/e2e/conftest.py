@@ -64,14 +64,14 @@ class Lease:
 
     def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
         self._session, self._key = session, f"fleet/{robot}/@rpc/control/"
-        self.answer = self._ask(f"{how}/{wishes['who']}", packed(wishes))
+        self.answer = self.ask(f"{how}/{wishes['who']}", packed(wishes))
         assert self.answer.get("ok"), self.answer
         self.lost = False
         self.held = Holder.of(self.answer, robot)
         self._closed = threading.Event()
         threading.Thread(target=self._renew, daemon=True).start()
 
-    def _ask(self, name: str, payload: bytes) -> dict[str, Any]:
+    def ask(self, name: str, payload: bytes) -> dict[str, Any]:
         try:
             answers = ask(self._session, self._key + name, payload)
         except ValueError:  # Zenoh's own words: who should have answered has just left the bus
@@ -81,7 +81,7 @@ class Lease:
     def _renew(self) -> None:
         with contextlib.suppress(zenoh.ZError):  # the session was closed
             while not self._closed.wait(self.answer["expires_in_s"] / 3):
-                if not self._ask("renew", self.held.question("renew")).get("ok"):
+                if not self.ask("renew", self.held.question("renew")).get("ok"):
                     self.lost = True
                     return
 
@@ -114,6 +114,12 @@ class Fleet:
         if robot in self._leases:
             self._leases.pop(robot).close()
         self._leases[robot] = Lease(self.session, robot, how, {"who": who, **wishes})
+
+    def release(self, robot: str = "r1") -> None:
+        """Give a robot back."""
+        lease = self._leases.pop(robot)
+        lease.close()
+        assert lease.ask("release", lease.held.question("release")).get("ok")
 
     def get_within(self, key: str, timeout_s: float) -> list[Any]:
         """Plain get that may take its time."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 import tempfile
 import time
 from collections.abc import Callable
@@ -130,6 +131,31 @@ def test_a_robot_that_its_own_program_drives_is_at_rest_when_it_is_stopped() -> 
         assert charges(report["violations"]) == []
 
     played(story, "tcpudp-1.4")
+
+
+@pytest.mark.parametrize("name", ["tcpudp-1.3", "tcpudp-1.2"])
+def test_a_robot_that_stalls_while_its_mode_is_changed_does_not_drive_itself_afterwards(name: str) -> None:
+    """It drops what piled up, the other mode included; only the mode in the idle stops ends its mode 3."""
+
+    def story(fleet: Fleet, robot: Fragile) -> None:
+        fleet.hold()
+        fleet.put("r1/@cmd/mode", mode="autonomous")
+        time.sleep(0.5)
+        robot.signal(signal.SIGSTOP)
+        time.sleep(0.5)
+        fleet.put("r1/@cmd/mode", mode="manual")
+        time.sleep(0.4)  # to robots of 1.2 it is sent again meanwhile
+        fleet.release()
+        time.sleep(1.6)
+        robot.signal(signal.SIGCONT)
+        time.sleep(1.5 + 1.0)  # two packets of a pair and the one that 1.2 ignores
+        report = robot.ended()
+        assert not report["moving"], report["received"][-4:]
+        assert (10, "03000000") in [(packet_id, body) for _, _, packet_id, body in report["received"]]
+        assert report["piled"], "nothing was lost: the robot did not stall"
+        assert charges(report["violations"]) == []
+
+    played(story, name)
 
 
 def test_a_sensor_of_the_document_measures_only_while_somebody_listens(bench: Bench) -> None:

@@ -80,7 +80,9 @@ def test_a_long_frame_in_small_reads_is_looked_at_only_when_it_may_be_whole() ->
 @pytest.mark.parametrize("read", [b"\x01", b"\x01\x02ab"])
 @pytest.mark.parametrize("end", [0, -1])
 @pytest.mark.parametrize("first", [b"", b"\x07"])
-def test_a_framing_function_that_does_not_advance_is_an_error_with_its_name(first: bytes, read: bytes, end: int) -> None:
+def test_a_framing_function_that_does_not_advance_is_an_error_with_its_name(
+    first: bytes, read: bytes, end: int
+) -> None:
     def stuck(data: bytes, start: int) -> int:
         return start + (2 if data == b"\x07" else end)
 

@@ -1,4 +1,4 @@
-"""Keeps a robot at rest while nobody drives: repeats its stop quickly for a second, then every ``idle_stop_s``.
+"""Keeps a robot stopped while nobody drives: repeats its stop quickly for a second, then every ``idle_stop_s``.
 
 A stalled robot program or link may have lost all of the first stops (design, "Who may drive").
 """
@@ -10,6 +10,7 @@ import math
 
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
+from zbridge.control.settings import LEAST_IDLE_STOP_S
 from zbridge.errors import Refused
 from zbridge.protocol.session import State
 
@@ -24,7 +25,8 @@ class Standstill:
     """Sends stops to one robot.
 
     authority: tells whether somebody drives the robot now, or told it to move by itself.
-    idle_stop_s: seconds between two stops while nobody drives; 0: only when motion ends.
+    idle_stop_s: seconds between two stops while nobody drives, fewer where the protocol says so; 0: only when motion
+    ends.
     """
 
     def __init__(self, context: RobotContext, authority: Authority, idle_stop_s: float = IDLE_STOP_S) -> None:
@@ -50,7 +52,7 @@ class Standstill:
     def begin(self) -> None:
         """Send stops from now on whenever nobody drives."""
         if self._idle_stop_s:
-            self._timer = self._loop.call_later(self._idle_stop_s, self._on_time)
+            self._timer = self._loop.call_later(self._period_s(), self._on_time)
 
     def close(self) -> None:
         """Send nothing more."""
@@ -66,6 +68,14 @@ class Standstill:
         now = self._clock()
         self._send(now, now + STOP_REPEAT_S)
         self._repeated_until = now + STOP_REPEAT_S
+
+    def _period_s(self) -> float:
+        """Return the seconds between two stops while nobody drives."""
+        try:
+            return max(LEAST_IDLE_STOP_S, min(self._idle_stop_s, self._robot.idle_stop_s))
+        except Exception as error:
+            self._faults.note("idle_stop_s", error)
+            return self._idle_stop_s
 
     def _send(self, now: float, until: float) -> None:
         try:

@@ -39,16 +39,19 @@ LIMIT = 64
 
 
 class _Group:
-    """The frames of one slot: sent one after the other, then again every ``period_s`` until ``until``."""
+    """The frames of one slot: sent ``spacing_s`` apart, then again every ``period_s`` until ``until``."""
 
-    __slots__ = ("due", "frames", "period_s", "position", "until")
+    __slots__ = ("due", "frames", "period_s", "position", "spacing_s", "until")
 
-    def __init__(self, frames: tuple[bytes, ...], due: float, period_s: float, until: float) -> None:
+    def __init__(
+        self, frames: tuple[bytes, ...], due: float, period_s: float, until: float, spacing_s: float = 0.0
+    ) -> None:
         self.frames = frames
         self.position = 0
         self.due = due
         self.period_s = period_s
         self.until = until
+        self.spacing_s = spacing_s
 
     def step(self, now: float) -> bytes:
         """Give the next frame of the group."""
@@ -57,6 +60,8 @@ class _Group:
         if self.position == len(self.frames):
             self.position = 0
             self.due = now + self.period_s
+        elif self.spacing_s:
+            self.due = now + self.spacing_s
         return frame
 
     @property
@@ -135,16 +140,18 @@ class Outbox(Kept):
         *,
         period_s: float = math.inf,
         until: float = math.inf,
+        spacing_s: float = 0.0,
         urgent: bool = False,
     ) -> None:
         """Put a group of frames into ``slot``, in place of the one there.
 
         The group is due at ``now``, then every ``period_s`` until ``until``; without a period it is sent once.
+        ``spacing_s``: between two of its frames, where it is not urgent; else the gap of the outbox.
         ``urgent``: queue it before all slots, to leave whole; the slot holds its repetitions, none if ``until`` is not
         after ``now``.
         """
         old = self._slots.get(slot)
-        new = self._slots[slot] = _Group(frames, now, period_s, until)
+        new = self._slots[slot] = _Group(frames, now, period_s, until, spacing_s)
         if urgent:
             if not self._hurries(frames):
                 self._urgent.extend(frames)
@@ -240,14 +247,14 @@ class Outbox(Kept):
 
 def _write_slots(slots: dict[str, _Group]) -> list[Any]:
     return [
-        [slot, FRAMES.write(group.frames), group.position, group.due, group.period_s, group.until]
+        [slot, FRAMES.write(group.frames), group.position, group.due, group.period_s, group.until, group.spacing_s]
         for slot, group in slots.items()
     ]
 
 
 def _read_slots(raw: list[Any]) -> dict[str, _Group]:
     slots = {}
-    for slot, frames, position, due, period_s, until in raw:
-        group = slots[slot] = _Group(FRAMES.read(frames), due, period_s, until)
+    for slot, frames, position, due, period_s, until, spacing_s in raw:
+        group = slots[slot] = _Group(FRAMES.read(frames), due, period_s, until, spacing_s)
         group.position = position
     return slots

@@ -79,6 +79,11 @@ class Robot(Kept, ABC):
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
+    @property
+    def idle_stop_s(self) -> float:
+        """Most seconds between two stops while nobody drives; ``inf``: as many as the configuration says."""
+        return math.inf
+
     def stop_frames(self) -> tuple[bytes, ...]:
         """Give the frames of a stop as the driving session would write them now; change nothing.
 

@@ -108,6 +108,8 @@ class FragileRobot(FragileServer):
         self.misread: list[tuple[float, Channel, int, bytes]] = []
         self.piled: list[tuple[float, Channel, int, bytes]] = []
         """What was lost in a read that this process itself joined, because it was late."""
+        self.ignored: list[tuple[float, Channel, int, bytes]] = []
+        """What robots of 1.1 and 1.2 ignored: the first packet read alone after they lost what had piled up."""
         self.machine = Machine(random.Random(f"{seed} talk"))
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
@@ -126,6 +128,7 @@ class FragileRobot(FragileServer):
     def _forget(self) -> None:
         """Forget the HQ."""
         self._reads = wire.Reads()
+        self._ignores_next = False
         self._awake = asyncio.Event()
         self._hq_features: frozenset[Feature] = frozenset()
         self._source: tuple[str, int] | None = None
@@ -210,7 +213,13 @@ class FragileRobot(FragileServer):
             del self.piled[: -self._keep]
         if problem:
             self._violate(problem)
-        if received is not None:
+        if joined:
+            self._ignores_next = self.version in wire.IGNORE_ONE
+        elif received is not None and self._ignores_next:
+            self._ignores_next = False
+            self.ignored.append((time.monotonic(), "tcp", received.kind, received.body))
+            del self.ignored[: -self._keep]
+        elif received is not None:
             await self._take(received, "tcp")
 
     async def _nap(self) -> None:

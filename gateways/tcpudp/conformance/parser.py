@@ -62,6 +62,10 @@ KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GE
 """The packet ids that do not cripple an HQ of a version."""
 
 
+IGNORE_ONE = frozenset({"1.1", "1.2"})
+"""Versions of robots that ignore the first packet read alone after a stall ("The gateway as robot")."""
+
+
 class Times(msgspec.Struct, frozen=True, kw_only=True):
     """The robot's times in seconds; the defaults are those of the deployed robots."""
 

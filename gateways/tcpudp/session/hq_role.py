@@ -53,7 +53,7 @@ class HqRole(HqHandshake):
     ``announce``: the features that we announce. ``predecessor``: the session of the connection before.
     """
 
-    kept: ClassVar[dict[str, Any]] = {"autonomous": bool, "_chosen": FRAME, "_raw": FRAMES}
+    kept: ClassVar[dict[str, Any]] = {"sent_autonomous": bool, "_chosen": FRAME, "_raw": FRAMES}
 
     def __init__(
         self,
@@ -66,8 +66,8 @@ class HqRole(HqHandshake):
     ) -> None:
         signs = predecessor._signs if predecessor is not None else None
         super().__init__(limits, udp=udp, announce=announce, signs=signs)
-        self.autonomous: bool = predecessor is not None and predecessor.autonomous
-        """True from a mode 3 that was sent until another mode is commanded and sent; outlives connections."""
+        self.sent_autonomous: bool = predecessor is not None and predecessor.sent_autonomous
+        """Whether the robot was ever sent mode 3; outlives connections. No packet shows that another mode ended it."""
         self._registered = Registered(force)
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
@@ -87,6 +87,11 @@ class HqRole(HqHandshake):
     def may_send(self, message: Packet) -> None:
         """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
         self._registered.check(message, self.settings, self._agreed)
+
+    @property
+    def misreads(self) -> bool:
+        """Whether the robot's version misreads some packets, and ignores one after it lost what piled up."""
+        return self._agreed in _MISREADING
 
     # What is sent once and matters
 
@@ -132,13 +137,12 @@ class HqRole(HqHandshake):
 
     def outgoing(self, now: float) -> bytes | None:
         frame = super().outgoing(now)
-        if type(frame) is _Chosen:
-            # A robot that may have misread another mode is in mode 3 until that was sent again.
-            self.autonomous = frame.autonomous or (self.autonomous and self.outbox.is_set(_MODE_AGAIN))
+        if type(frame) is _Chosen and frame.autonomous:
+            self.sent_autonomous = True
         return frame
 
     def _send_surely(self, frame: bytes, again: str, now: float) -> None:
         """Send a packet, to robots that misread some again; a newer one replaces the repetition of an older one."""
         self.outbox.put(frame)
-        if self._agreed in _MISREADING:
+        if self.misreads:
             self.outbox.set(again, (frame,), now + AGAIN_S)

@@ -3,9 +3,14 @@
 Source: "Translation" and "The gateway as HQ" of the protocol page. Telemetry is translated by :mod:`.telemetry`.
 
 Theory of operation of the stop. One slot of the outbox holds what is repeated: the packets of the last drive, or packet
-13. From a mode 3 until another mode was sent, 13 alone does not stop the robot: then the stop is the pair 1, 13. A mode
-that is commanded while a stop is repeated stays in force: with mode 3 the repetitions end, with another mode they go on
-as 13 alone.
+13. Packet 13 does not end mode 3, and no packet acknowledges a mode: a robot that stalls drops what piled up, another
+mode included. So once a mode 3 was written, every stop and every neutral is a pair: packet 10, then packet 13. The mode
+of the pair is the one that was commanded last, or 1 where that is mode 3 (``_stop_packets``). A mode that is commanded
+while a stop is repeated stays in force: mode 3 ends the repetitions, another mode replaces that of the pair.
+
+After a stall, robots of 1.1 and 1.2 drop what piled up, and then ignore the first packet that they read alone. Some
+read every 0.1 to 0.2 s only, and join packets that come closer together. So they are sent :data:`IDLE_STOP_S` stops
+evenly while nobody drives, and the two packets of a pair at half that distance.
 """
 
 from __future__ import annotations
@@ -53,6 +58,8 @@ REPEAT_S = 0.25
 """Seconds after which a drive command is repeated while the robot moves."""
 STOP_REPEAT_S = 0.1
 """Seconds between the repetitions of a stop: a late datagram can restart motion."""
+IDLE_STOP_S = 0.25
+"""Seconds between two stops to robots of 1.1 and 1.2 while nobody drives: after a stall they ignore the first one."""
 AUTONOMOUS = "autonomous"
 _MODES = {"none": 1, "manual": 2, AUTONOMOUS: 3}
 _MOTION = "motion"
@@ -66,7 +73,6 @@ class TcpUdpRobot(Robot):
     kept: ClassVar[dict[str, Any]] = {
         "_chosen": str | None,
         "_rests_until": float,
-        "_paired_until": float,
         "_telemetry": TelemetryTranslator,
     }
 
@@ -79,8 +85,8 @@ class TcpUdpRobot(Robot):
         self._session: HqRole | None = None
         self._chosen: str | None = None
         """The mode that was commanded last."""
-        self._rests_until = self._paired_until = -math.inf
-        """How long packet 13 is repeated, and how long as the pair 1, 13."""
+        self._rests_until = -math.inf
+        """How long a stop or a neutral is repeated."""
 
     @property
     def driving(self) -> HqRole | None:
@@ -94,7 +100,7 @@ class TcpUdpRobot(Robot):
             announce=self._announce,
             predecessor=self._session,
         )
-        self._rests_until = self._paired_until = -math.inf
+        self._rests_until = -math.inf
         self._telemetry.begin(self._session)
         return self._session
 
@@ -110,7 +116,7 @@ class TcpUdpRobot(Robot):
         return carry_out(self, command, now) or _NOTHING
 
     def stop(self, now: float, until: float) -> None:
-        """Send packet 13, in mode 3 the pair 1, 13.
+        """Send packet 13, or the pair once a mode 3 was sent.
 
         A stop that is repeated cancels the repetitions of other commands; a single one, which is routine, does not.
         """
@@ -119,12 +125,19 @@ class TcpUdpRobot(Robot):
         session.withdraw_raw()
         if until > now:
             session.send_nothing_again()
-        self._rest(now, period_s=STOP_REPEAT_S, until=until, paired=session.autonomous, urgent=True)
+        elif session.misreads:
+            self._rest(now, until=until, spacing_s=IDLE_STOP_S / 2)
+            return
+        self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+
+    @property
+    def idle_stop_s(self) -> float:
+        return IDLE_STOP_S if self._session is not None and self._session.misreads else math.inf
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        """Packet 13; the pair 1, 13 also where mode 3 was chosen and is not written yet."""
+        """Packet 13; the pair also where mode 3 was commanded and is not written yet."""
         session = self._connected()
-        return _sendable(session, _stop_packets(paired=session.autonomous or self._chosen == AUTONOMOUS))
+        return _sendable(session, self._stop_packets(paired=session.sent_autonomous or self._chosen == AUTONOMOUS))
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         """Load numpy for a robot that has maps or takes scans: now, and not when the first one comes while it moves."""
@@ -147,11 +160,9 @@ class TcpUdpRobot(Robot):
     def _drive(self, command: Drive, now: float) -> Outcome:
         left_out = "light: a TCP/UDP robot has none" if command.light is not None else None
         if not command.moving:
-            session, on_its_own = self._connected(), self._chosen == AUTONOMOUS
-            if on_its_own:
-                session.withdraw_autonomous()
-            paired = on_its_own and session.autonomous
-            self._rest(now, period_s=REPEAT_S, until=now + 1.0, paired=paired, urgent=paired)
+            session = self._connected()
+            session.withdraw_autonomous()
+            self._rest(now, period_s=REPEAT_S, until=now + 1.0, urgent=session.sent_autonomous)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
         packets: list[Packet] = []
@@ -167,18 +178,20 @@ class TcpUdpRobot(Robot):
         session = self._connected()
         frames = tuple(session.encode(packet) for packet in packets)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
-        self._rests_until = self._paired_until = -math.inf
+        self._rests_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _mode(self, command: Mode, now: float) -> None:
-        """Send the mode. While a stop is repeated: mode 3 ends it, any other mode turns the pair into 13 alone."""
-        self._connected().choose_mode(_MODES[command.mode], now)
+        """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""
+        session = self._connected()
+        session.choose_mode(_MODES[command.mode], now)
         self._chosen = command.mode
+        if now >= self._rests_until:
+            return
         if command.mode == AUTONOMOUS:
-            if now < self._rests_until:
-                self._connected().outbox.clear(_MOTION)
-        elif now < self._paired_until:
-            self._rest(now, period_s=STOP_REPEAT_S, until=self._paired_until, paired=False, urgent=False)
+            session.outbox.clear(_MOTION)
+        elif session.sent_autonomous:
+            self._rest(now, period_s=STOP_REPEAT_S, until=self._rests_until)
 
     def _switch_lidar(self, command: Switch, now: float) -> None:
         self._connected().switch_lidar(ON if command.on else OFF, now)
@@ -201,21 +214,24 @@ class TcpUdpRobot(Robot):
     def _send(self, message: Packet) -> None:
         self._connected().send(message)
 
-    def _rest(self, now: float, *, period_s: float, until: float, paired: bool, urgent: bool) -> None:
-        """Repeat packet 13, ``paired`` with a mode 1 before it; raise Refused if the robot may be sent neither."""
+    def _rest(
+        self, now: float, *, until: float, period_s: float = math.inf, spacing_s: float = 0.0, urgent: bool = False
+    ) -> None:
+        """Repeat the packets of a stop; raise Refused if the robot may be sent none of them."""
         session = self._connected()
-        packets = _stop_packets(paired=paired)
-        session.outbox.set(_MOTION, _sendable(session, packets), now, period_s=period_s, until=until, urgent=urgent)
-        self._rests_until, self._paired_until = until, until if paired else -math.inf
+        frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
+        session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
+        self._rests_until = until
+
+    def _stop_packets(self, *, paired: bool) -> tuple[Packet, ...]:
+        """Packet 13; ``paired``: after a mode that ends mode 3, the one that the holder wants or none."""
+        mode = _MODES["manual" if self._chosen == "manual" else "none"]
+        return (ClientControllMode(mode), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
 
     def _connected(self) -> HqRole:
         if self._session is None:
             raise NotReady("offline")
         return self._session
-
-
-def _stop_packets(*, paired: bool) -> tuple[Packet, ...]:
-    return (ClientControllMode(_MODES["none"]), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
 
 
 def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:

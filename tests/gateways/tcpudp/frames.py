@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import msgspec
+
 from gateways.tcpudp.messages import Packet
 from gateways.tcpudp.session import HqRole, RobotRole
 from gateways.tcpudp.translate import Options, TcpUdpRobot
@@ -155,6 +157,16 @@ class Stage:
         """Lose the connection and connect again."""
         self.session.lost("closed by peer")
         self.timed = self._connected(settings, self.now)
+
+    def hand_over(self) -> None:
+        """Let another process take the robot over, with what this one describes."""
+        session_state, robot_state = msgspec.msgpack.decode(
+            msgspec.msgpack.encode([self.session.export(), self.robot.export()])
+        )
+        self.robot = TcpUdpRobot(self.robot.options)
+        self.timed.session = session = self.robot.session("robot", "tcp://robot.test:1")
+        session.restore(session_state)
+        self.robot.restore(robot_state)
 
     def _connected(self, settings: bytes, now: float) -> Timed:
         timed = Timed(self.robot.session("robot", "tcp://robot.test:1"), now)

@@ -1,4 +1,4 @@
-"""What is repeated, and what a stop is: packet 13, in mode 3 the pair 1, 13; what it drops, what keeps it."""
+"""What is repeated, and what a stop is: packet 13, after a mode 3 a pair; what it drops, what keeps it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from zbridge.fleet.messages import Drive, Mode, Switch, Text
 pytestmark = pytest.mark.jumping
 
 NONE, AUTONOMOUS = bytes.fromhex("06000000 02 0a 01000000"), bytes.fromhex("06000000 02 0a 03000000")
+MANUAL = bytes.fromhex("06000000 02 0a 02000000")
 STOP = bytes.fromhex("02000000 02 0d")
 PAIR = [NONE, STOP]
 SETTINGS = {
@@ -67,6 +68,8 @@ def left(version: str, script: str, **options: object) -> str:
             stage.timed.stream(START, stage.now)
         elif word == "reconnect":
             stage.connect(SETTINGS[version])
+        elif word == "hand_over":
+            stage.hand_over()
         else:
             stage.command(*ACTS[word])
     return letters
@@ -83,21 +86,31 @@ ROWS = {
     "a routine stop is sent exactly once and ends motion": (ALL, "left +0.1 once +3 once +3", "LSS"),
     "a late 4 is followed by silence": (("1.3",), "start +0.1 stop +2.39", "7"),
     "a stop in that silence is kept": (("1.3",), "start +0.1 stop +4", "7S+"),
-    # mode 3: every stop is the pair, until another mode is commanded
+    # once a 3 was written every stop is a pair: 2, 13 if mode manual was commanded last, else 1, 13
     "never in mode 3, never a 1": (ALL, "stop +2 neutral +2 manual +2 stop +2 left +2 stop +2", "[SML]*"),
     "the 1 of a stop is no other mode": (ALL, "auto +1 stop +3 stop +0.35 stop +3", "A+ pairs (NS){4} pairs"),
     "a routine stop is one pair": (ALL, "auto +1 once +1 once +1", "A+ NSNS"),
-    "after mode 2": (WELL, "auto +0.1 stop +2 manual +0.1 stop +2 auto +0.1 stop +2", "A pairs M stops A pairs"),
-    "after mode 1": (WELL, "auto +0.1 stop +2 none +1 stop +2 auto +0.1 none +1 stop +2", "A pairs N stops AN stops"),
+    "after mode 2": (WELL, "auto +0.1 stop +2 manual +0.1 stop +2 auto +0.1 stop +2", "A pairs M manuals A pairs"),
+    "after mode 1": (WELL, "auto +0.1 stop +2 none +1 stop +2 auto +0.1 none +1 stop +2", "A pairs N pairs AN pairs"),
+    "a routine stop long after mode 2": (WELL, "auto +0.1 manual +3600 once +1 once +1", "AM MSMS"),
+    "a routine stop long after mode 1": (WELL, "auto +0.1 none +3600 once +1 once +1", "AN NSNS"),
+    "a neutral in mode 2": (WELL, "auto +0.1 manual left +0.1 neutral +3 left +0.1", "A(ML|LM) (MS){4,5} L"),
     "never a 3 after a reconnection": (ALL, "auto +0.1 reconnect stop +3 reconnect stop +3", "A pairs pairs"),
+    "after mode 2 and a reconnection": (WELL, "auto +0.1 manual +0.1 reconnect stop +3", "AM manuals"),
+    "after mode 2 and a handover": (WELL, "auto +0.1 manual +0.1 hand_over stop +3 once +1", "AM manuals MS"),
+    "after a handover and a reconnection": (WELL, "auto +0.1 hand_over reconnect stop +3", "A pairs"),
     "another mode did not leave before the connection ended": (ALL, "auto +0.1 none reconnect stop +3", "A pairs"),
     "a 3 that still waits never leaves and no 1 either": (ALL, "hi +0 auto stop +3", "H stops"),
-    "another mode that still waits leaves behind the pair": (WELL, "auto +0 manual stop +0.05", "ANSM"),
-    "the next holder's mode is not undone": (WELL, "auto +0.1 stop +0.05 manual +3", "A NS (MS|SM) S{7,9}"),
+    "another mode that still waits leaves behind the pair": (WELL, "auto +0 manual stop +0.05", "AMSM"),
+    "the next holder's mode is not undone": (WELL, "auto +0.1 stop +0.05 manual +3", "A NS M?(MS){7,9}"),
     "a stop ends where the next holder lets the robot be": (WELL, "auto +0.1 stop +0.05 auto +3", "ANSA"),
     "the mode of a holder does not end its drive": (WELL, "stop +0.05 left +0.05 manual +1 auto +1", "SL ML{4} AL{4}"),
     "neutral in mode 3 is a stop": (WELL, "auto +0.1 neutral +0.02 +3 neutral left +0.05", "A NS (NS){3,4} NSL"),
-    "neutral after another mode that waits": (WELL, "auto +0 manual neutral +0.1 stop +2", "A(MS|SM) stops"),
+    "neutral after another mode that waits": (WELL, "auto +0 manual neutral +0.1 stop +2", "A(MS)+M manuals"),
+    # 1.1 and 1.2 ignore the first stop that they read alone after a stall, and some join what comes within 0.2 s
+    "a routine stop to them is one packet": (BADLY, "left +0.1 once +3 once +3", "LSS"),
+    "the next one goes on where the one before was": (BADLY, "auto +1 once +0.12 once +1", "AA NS"),
+    "its packets are an eighth of a second apart": (BADLY, "auto +1 once +0.13", "AA NS"),
     # what is sent again to robots that misread
     "robots that read well are sent it once": (WELL, "manual on +5", "MI"),
     "a newer one replaces the repetition": (BADLY, "auto on +0.2 manual off +5", "AI MO MO"),
@@ -109,7 +122,7 @@ ROWS = {
     "the pair where a mode may be misread": (
         BADLY,
         "auto +1 manual +0.2 stop +2 manual +1 stop +2",
-        "AAM pairs MM stops",
+        "AAM manuals MM manuals",
     ),
     "a lidar mode that still waits is sent": (BADLY, "hi +0 on stop +5", "H S?I S{9,10}"),
     "nothing is sent again on the next connection": (BADLY, "manual on +0.1 reconnect +5", "MI"),
@@ -118,7 +131,7 @@ ROWS = {
 
 @pytest.mark.parametrize(("versions", "script", "expected"), ROWS.values(), ids=ROWS)
 def test_what_leaves_a_robot(versions: tuple[str, ...], script: str, expected: str) -> None:
-    a_second = {"pairs": "(NS){9,11}", "stops": "S{9,11}", " ": ""}
+    a_second = {"pairs": "(NS){9,11}", "manuals": "(MS){9,11}", "stops": "S{9,11}", " ": ""}
     for name, pattern in a_second.items():
         expected = expected.replace(name, pattern)
     for version in versions:
@@ -253,14 +266,19 @@ async def test_after_a_reconnection_in_mode_3_the_pair_comes_first_after_the_sil
         (("left",), [STOP]),
         (("manual",), [STOP]),
         (("auto",), PAIR),  # also before it is written
-        (("auto", "manual"), [STOP]),
+        (("auto", "manual"), [STOP]),  # neither is written
+        (("auto", "+", "manual"), [MANUAL, STOP]),
+        (("auto", "+", "none"), PAIR),
     ],
 )
 def test_the_frames_of_a_stop_are_told_and_change_nothing(acts: tuple[str, ...], frames: list[bytes]) -> None:
     stage, other = Stage(SETTINGS["1.3"]), Stage(SETTINGS["1.3"])
     for act in acts:
-        stage.command(*ACTS[act])
-        other.command(*ACTS[act])
+        for each in (stage, other):
+            if act == "+":
+                each.after(0.1)
+            else:
+                each.command(*ACTS[act])
     assert list(stage.robot.stop_frames()) == frames
     assert stage.after(2.0) == other.after(2.0)
 

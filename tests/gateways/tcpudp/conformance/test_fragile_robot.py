@@ -305,6 +305,19 @@ async def test_what_piled_up_while_the_process_stood_still_is_read_as_one_packet
         await hq.play(["wait 0.1", "moving yes", "took 3 11", "> STOP", "moving no"])
 
 
+@pytest.mark.parametrize("version", ["1.1", "1.2"])
+async def test_robots_of_1_1_and_1_2_ignore_the_first_packet_that_they_read_alone_after_that(version: str) -> None:
+    robot = quick(version)
+    async with facing(robot) as hq:
+        await hq.play([f"greet {version}", "> FORWARD", "moving yes"])
+        for _ in range(5):
+            hq.peer.tcp.send(hq.raw("STOP"))
+            time.sleep(0.05)  # noqa: ASYNC251 - nobody is to run meanwhile
+        await hq.violated("5 packets in one read")
+        await hq.play(["> STOP", "wait 0.1", "moving yes", "> STOP", "moving no"])
+        assert [row[1:] for row in robot.ignored] == [("tcp", 13, b"")]
+
+
 async def test_packets_back_to_back_are_held_against_the_hq() -> None:
     robot = quick(times=Times(read_s=0.002, gap_s=0.01, unasked_s=0))
     async with facing(robot) as hq:

@@ -70,10 +70,6 @@ SCRIPTS = {
         OPEN + "send H; send N; out = H; due 1.2; limit 1.2; half h,1 =; at 1.1999; expire; out = nothing;"
         "at 1.2; expire; failed H; out = N; at 1.5; written; due 1.7; hear n,5 = n,5"
     ),
-    "an answer that waited while the process stood still is in time, and is given more time once": (
-        OPEN + "send H; out = H; at 9; expire; due 9.05; hear h,1 = h,1; at 9.1; send H; out = H; at 12; expire;"
-        "failed; at 13; expire; failed H"
-    ),
     "silence takes the robot from its drivers, an answer gives it back, and long silence ends the session": (
         OPEN + f"{fail(1.2)}; busy no; {fail(1.4)}; busy the robot does not answer; is established; send H; out = H;"
         f"hear h = h; busy no; {fail(1.6, 1.8, 2.0, 2.2)}; is closed (no answer to 4 requests in a row); due never;"

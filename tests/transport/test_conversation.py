@@ -94,6 +94,70 @@ async def test_what_becomes_due_while_the_process_is_frozen_waits_for_the_next_l
     assert (looks[1:], up.link.written[1:]) == ([4.0], [b"motion"])
 
 
+class Watching(Toy):
+    """Ends when its peer says nothing for three seconds."""
+
+    heard_at = 0.0
+
+    def receive(self, data: bytes, now: float) -> list[bytes]:
+        self.heard_at = now
+        return super().receive(data, now)
+
+    def timers(self) -> float:
+        return self.heard_at + 3.0
+
+    def on_timer(self, now: float) -> None:
+        self.fail("no report for 3 s")
+
+
+def watching(order: list[str]) -> Rig:
+    """A session that watches for silence, and what it does in which order."""
+    up = Rig(before=lambda: order.append("stop"), read=lambda: order.append("read"))
+    up.session = up.conversation.session = Watching(LIMITS, name="robot")
+    up.begin()
+    order.clear()
+    return up
+
+
+@pytest.mark.parametrize("frozen_s", [0.6, 4.0])
+@pytest.mark.parametrize("lasts_s", [2.9, 0.0])
+async def test_a_process_that_was_frozen_stops_then_reads_what_waits_and_then_judges_silence(
+    frozen_s: float, lasts_s: float
+) -> None:
+    order = list[str]()
+    up = watching(order)
+    await asyncio.sleep(lasts_s)  # of silence before the freeze
+    up.loop._jumping.now += frozen_s
+    up.loop.call_later(0.001, up.conversation.received, b"\x01a")  # it waited in the kernel; uvloop's timers come first
+    await asyncio.sleep(0.1)
+    assert up.session.state is State.ESTABLISHED
+    assert order[0] == "stop"
+    assert order.index("read") > 0
+    await asyncio.sleep(2.8)
+    assert up.session.state is State.ESTABLISHED
+    await asyncio.sleep(0.2)
+    assert up.session.reason == "no report for 3 s"
+
+
+async def test_a_peer_that_said_nothing_during_a_freeze_is_lost_soon_after_it() -> None:
+    up = watching([])
+    up.loop._jumping.now += 4.0
+    await asyncio.sleep(0.04)
+    assert up.session.state is State.ESTABLISHED
+    await asyncio.sleep(0.02)
+    assert up.session.reason == "no report for 3 s"
+
+
+async def test_frames_are_written_at_their_times_while_a_process_that_was_frozen_reads() -> None:
+    up = watching([])
+    up.loop._jumping.now += 4.0
+    await asyncio.sleep(0)
+    up.session.outbox.set("stop", (b"1", b"2", b"3"), up.loop.time(), urgent=True)
+    up.conversation.pump()
+    await asyncio.sleep(0.03)
+    assert up.link.written == [b"1", b"2", b"3"]
+
+
 async def test_nothing_is_looked_at_while_nothing_is_due() -> None:
     looks = list[float]()
     up = Rig(clock=lambda: 1.0, before=lambda: looks.append(1.0)).begin()

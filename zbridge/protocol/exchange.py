@@ -21,9 +21,6 @@ Silence: each request without an answer within ``answer_s`` counts as failed. :c
 session (``unanswered``). After ``busy_after`` failures in a row the robot takes no commands: the gateway stops it, and
 motion needs a neutral. After ``lost_after`` in a row the session ends. One answer ends the silence.
 
-A process that stood still for a while looks at its timers before it reads: the answer may have come meanwhile. So if
-``expire`` is called more than ``LATE_S`` too late, the request on the wire is given ``LATE_S`` more, once.
-
 An answer that matches no request on the wire is malformed: it is counted and not handed on. A robot that also speaks
 unasked overrides ``unasked``.
 """
@@ -44,8 +41,6 @@ from zbridge.wire.frames import FrameBuffer
 M = TypeVar("M")
 
 SILENT = "the robot does not answer"
-LATE_S = 0.05
-"""How late ``expire`` may be called, seconds. If it is called later, an answer has as much time again."""
 
 
 class Exchange(Outbox):
@@ -60,7 +55,6 @@ class Exchange(Outbox):
         "failed_in_a_row": int,
         "_answer_at": float,
         "_open": bool,
-        "_late": bool,
     }
 
     def __init__(
@@ -81,7 +75,6 @@ class Exchange(Outbox):
         self._expects = expects
         self._answer_at = math.inf
         self._open = False
-        self._late = False
 
     def __repr__(self) -> str:
         return f"<Exchange awaits {self.awaited!r}, {self.failed_in_a_row} failed in a row, {super().__repr__()}>"
@@ -92,7 +85,7 @@ class Exchange(Outbox):
             return None
         request = super().take(now)
         if request is not None and not self._open and self._expects(request):
-            self.awaited, self._answer_at, self._late = request, now + self.answer_s, False
+            self.awaited, self._answer_at = request, now + self.answer_s
         return request
 
     def written(self, now: float) -> None:
@@ -117,9 +110,6 @@ class Exchange(Outbox):
     def expire(self, now: float) -> bytes | None:
         """Let the request on the wire fail if its time is up; give it."""
         if now < self._answer_at:
-            return None
-        if now > self._answer_at + LATE_S and not self._late:
-            self._late, self._answer_at = True, now + LATE_S
             return None
         request, self.awaited, self._answer_at = self.awaited, None, math.inf
         self.failed += 1

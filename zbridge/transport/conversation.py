@@ -1,5 +1,9 @@
 """Runs one session over one link: bytes in, frames out, timers. Knows neither protocol nor bus.
 
+A process that was frozen finds its timers overdue and the peer's bytes unread. The order then is: what must leave first
+(``before``), what waits to be read, and the session's timers :data:`CATCH_UP_S` later. So no session ends for a silence
+that was its own.
+
 ``pump`` is the one place that writes. Everything that may give the session something to write, or change its state,
 ends with it: bytes, a timer, a command of the device. What the protocol's own code raises in any of them ends its
 session, with the place as the reason.
@@ -9,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec
@@ -25,6 +30,10 @@ from zbridge.transport.stalls import Stalls
 
 log = logging.getLogger("zbridge.link")
 
+LATE_S = 0.02
+"""A timer of a session that fires so much late tells of a process, or a machine, that was held up; seconds."""
+CATCH_UP_S = 0.05
+"""Seconds for which such a process reads before the timers of the session run."""
 _ESTABLISHED = State.ESTABLISHED
 
 
@@ -95,6 +104,8 @@ class Conversation:
         self._link: Link | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at: float | None = None
+        self._reads_until = -math.inf
+        """The timers of the session do not run before: the process was held up, and reads first."""
         self._seen = (session.state, session.busy, session.doubts)
         self._malformed = malformed or Count()
         self._foreign = foreign or Count()
@@ -123,6 +134,7 @@ class Conversation:
         """Take bytes from the link."""
         begun = self._clock()
         try:
+            self._before()
             messages = self.session.receive(data, begun)
             self._read()
             self._hand_on(messages)
@@ -228,7 +240,7 @@ class Conversation:
             self._end()
         else:
             ready = writing and link is not None and link.ready
-            self._set_timer(self._stalls.next(session.deadline(writing=ready), link))
+            self._set_timer(self._stalls.next(self._deadline(now, writing=ready), link))
 
     @_then_pump
     def close(self, reason: str) -> None:
@@ -319,8 +331,19 @@ class Conversation:
 
     @_then_pump
     def _tick(self) -> None:
-        self._timer = None
-        self.session.expire(self._clock())
+        self._timer, due, now = None, self._timer_at, self._clock()
+        if due is not None and due != self._reads_until and now > due + LATE_S:
+            self._before()
+            self._reads_until = now + CATCH_UP_S
+        elif now >= self._reads_until:
+            self.session.expire(now)
+
+    def _deadline(self, now: float, *, writing: bool) -> float | None:
+        """Give the time of the next tick; ``writing`` False: the link takes nothing now."""
+        if now >= self._reads_until:
+            return self.session.deadline(writing=writing)
+        writes_at = self.session.outbox.deadline() if writing else None
+        return self._reads_until if writes_at is None else min(writes_at, self._reads_until)
 
     def _set_timer(self, deadline: float | None) -> None:
         if self._timer is not None:

@@ -1,6 +1,7 @@
 """Proofs as the design defines them, made without the code under test.
 
-``proof = HMAC-SHA256(token, concrete key + 0x00 + seq as 8 bytes big-endian + payload)[:16]``
+``proof = HMAC-SHA256(token, concrete key + 0x00 + seq as 8 bytes big-endian + payload)[:16]``, and of what is dated
+``HMAC-SHA256(token, concrete key + 0x01 + seq as 8 bytes big-endian + t as 8 bytes big-endian + payload)[:16]``.
 """
 
 from __future__ import annotations
@@ -15,14 +16,16 @@ from typing import Any
 import msgpack
 
 
-def proof(token: bytes, key: str, seq: int, payload: bytes = b"") -> bytes:
+def proof(token: bytes, key: str, seq: int, payload: bytes = b"", t: int | None = None) -> bytes:
     """Prove one command; a question about the lease has no payload here."""
-    return hmac.new(token, key.encode() + b"\x00" + struct.pack(">Q", seq) + payload, hashlib.sha256).digest()[:16]
+    numbers = b"\x00" + struct.pack(">Q", seq) if t is None else b"\x01" + struct.pack(">QQ", seq, t)
+    return hmac.new(token, key.encode() + numbers + payload, hashlib.sha256).digest()[:16]
 
 
-def shown(lease: bytes, token: bytes, key: str, seq: int, payload: bytes = b"") -> bytes:
+def shown(lease: bytes, token: bytes, key: str, seq: int, payload: bytes = b"", t: int | None = None) -> bytes:
     """Write the attachment of a command, or the payload of a question."""
-    return packed({"lease": lease, "seq": seq, "proof": proof(token, key, seq, payload)})
+    fields = {"lease": lease, "seq": seq, "proof": proof(token, key, seq, payload, t)}
+    return packed(fields if t is None else {**fields, "t": t})
 
 
 def packed(fields: dict[str, Any]) -> bytes:
@@ -45,15 +48,15 @@ class Holder:
         """Make one of the answer that granted the lease."""
         return cls(answer["lease"], answer["token"], robot, first=first)
 
-    def attachment(self, command: str, payload: bytes) -> bytes:
-        """Give what goes with the next command: ``drive``, ``motor/left``."""
+    def attachment(self, command: str, payload: bytes, t: int | None = None) -> bytes:
+        """Give what goes with the next command: ``drive``, ``motor/left``; t: its date, in ms."""
         self.seq += 1
-        return shown(self.lease, self.token, f"{self._keys}@cmd/{command}", self.seq, payload)
+        return shown(self.lease, self.token, f"{self._keys}@cmd/{command}", self.seq, payload, t)
 
-    def question(self, name: str) -> bytes:
+    def question(self, name: str, t: int | None = None) -> bytes:
         """Give what is asked next: ``renew`` or ``release``."""
         self.asked += 1
-        return shown(self.lease, self.token, f"{self._keys}@rpc/control/{name}", self.asked)
+        return shown(self.lease, self.token, f"{self._keys}@rpc/control/{name}", self.asked, t=t)
 
 
 def numbered() -> Callable[[int], bytes]:

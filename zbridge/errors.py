@@ -8,6 +8,7 @@ ZbridgeError
 │   ├── Held         ... because another program holds the lease                     held
 │   ├── LeaseLost    ... because there is no lease, or it has ended                  no_lease, lease_ended
 │   ├── NeutralFirst ... because a neutral must come before motion                   neutral_first
+│   ├── Stale        ... because it was given too long ago                           stale
 │   ├── NotReady     ... because the robot or its gateway accepts none now           not_ready, busy, closing
 │   ├── Unsupported  ... because this robot cannot do it                             unsupported
 │   ├── Malformed    ... because it cannot be read, or its number is out of order    malformed, out_of_order
@@ -49,6 +50,7 @@ class Code(StrEnum):
     OUT_OF_ORDER = "out_of_order"
     RATE = "rate"
     CLOSING = "closing"
+    STALE = "stale"
 
 
 class ZbridgeError(Exception):
@@ -102,6 +104,12 @@ class NeutralFirst(Refused):
     """The robot was stopped: a neutral must come before motion."""
 
     codes = (Code.NEUTRAL_FIRST,)
+
+
+class Stale(Refused):
+    """The command was given too long ago: the network held it up."""
+
+    codes = (Code.STALE,)
 
 
 class NotReady(Refused):

@@ -66,7 +66,7 @@ def attach(given: Given, seq: int, key: str = DRIVE, payload: bytes = PAYLOAD) -
 
 
 def command(attachment: bytes | None, at: float = 0.0) -> Does:
-    return lambda authority: authority.admit(attachment, DRIVE, PAYLOAD, NOW + at)
+    return lambda authority: authority.admit(attachment, DRIVE, PAYLOAD, NOW + at).who
 
 
 def applied(*, moving: bool, at: float = 0.0, part: str = "drive") -> Does:

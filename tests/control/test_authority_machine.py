@@ -287,7 +287,7 @@ class Driving(RuleBasedStateMachine):
         self.wake()
         admitted = sender is not None and sender is self.driver
         try:
-            who = self.authority.admit(attachment, KEY, PAYLOAD, self.now)
+            who = self.authority.admit(attachment, KEY, PAYLOAD, self.now).who
         except Refused:
             self.take_events()
             assert not admitted

@@ -13,7 +13,8 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
-from zbridge.control.enforcer import Enforcer
+from zbridge.control.enforcer import SUSPENDED_S, Enforcer
+from zbridge.control.events import Sender
 from zbridge.control.faults import Faults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -29,7 +30,7 @@ FORWARD = Drive(forward=1.0)
 
 class Rig:
     def __init__(self, limits: MotionLimits | None = None) -> None:
-        self.now = 100.0
+        self.now, self.suspended_s = 100.0, 7200.0
         self.machine = Machine()
         self.shown: list[FleetMessage] = []
         self.metrics = Metrics()
@@ -45,6 +46,7 @@ class Rig:
             pump=lambda: None,
             clock=lambda: self.now,
             clock_ns=time.time_ns,
+            suspended_s=lambda: self.suspended_s,
         )
         standstill = Standstill(context, self.authority, 0.0)
         self.enforcer = Enforcer(context, self.authority, standstill, Audit("r1", lambda line: None), limits)
@@ -54,7 +56,7 @@ class Rig:
     def drive(self) -> Drive | Motor:
         """Drive at full speed; return what the robot was told."""
         permitted = self.enforcer.permit(FORWARD, self.now)
-        self.enforcer.moved(PATH, permitted, self.now, moving=permitted.moving)
+        self.enforcer.moved(PATH, permitted, self.now, Sender("a", self.now), moving=permitted.moving)
         self.enforcer.settle()
         return permitted
 
@@ -73,11 +75,24 @@ async def test_a_gateway_frozen_past_the_deadman_stops_the_robot_before_it_write
         rig.enforcer.permit(FORWARD, rig.now)
 
 
+async def test_a_machine_that_was_suspended_stops_its_robot_and_ends_the_lease_before_anything_is_read() -> None:
+    rig = Rig()
+    rig.drive()
+    rig.suspended_s += SUSPENDED_S / 2  # within what two readings of clocks may differ by
+    rig.enforcer.keep_time()
+    assert (rig.machine.stops, rig.authority.state) == (0, "held")
+    rig.suspended_s += 3600.0
+    rig.enforcer.keep_time()
+    assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
+    rig.enforcer.keep_time()
+    assert rig.machine.stops == 1, "once"
+
+
 async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_motion() -> None:
     rig = Rig()
     rig.enforcer.hold_back("the robot's link took nothing", stops=True)
     with pytest.raises(NeutralFirst):
-        rig.enforcer.moved(PATH, FORWARD, rig.now, moving=True)
+        rig.enforcer.moved(PATH, FORWARD, rig.now, Sender("a", rig.now), moving=True)
     assert not rig.authority.moving
 
 

@@ -100,7 +100,7 @@ def test_what_the_gate_proved_is_admitted_once_and_only_as_it_was() -> None:
     for key, payload in ((DRIVE, packed({"forward": 1.0})), (MODE, FORWARD)):
         with pytest.raises(Refused, match="wrong proof"):
             rig.authority.admit(attachment, key, payload, rig.now)
-    assert rig.authority.admit(attachment, DRIVE, FORWARD, rig.now) == "me"
+    assert rig.authority.admit(attachment, DRIVE, FORWARD, rig.now).who == "me"
     with pytest.raises(Refused, match="repeated"):
         rig.authority.admit(attachment, DRIVE, FORWARD, rig.now)
 

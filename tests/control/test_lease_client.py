@@ -25,13 +25,21 @@ from zbridge.fleet.topics import KeySpace
 KEYS = KeySpace("fleet", "r1")
 NOW = 100.0
 WAIT_S = 5.0
+CLOCK_MS = 7777.9
+"""The raw clock, which stands still here."""
 GRANTED = Lease(ok=True, lease=b"L" * 8, token=b"T" * 32, expires_in_s=LEASE_S)
 
 
 def client(*, wait_s: float | None = None, takeover: bool = False) -> LeaseClient:
     request = Acquire(who="ann")
     return LeaseClient(
-        KEYS, request, "ann", concerns=lambda refusal: refusal.who == "ann", takeover=takeover, wait_s=wait_s
+        KEYS,
+        request,
+        "ann",
+        concerns=lambda refusal: refusal.who == "ann",
+        clock_ms=lambda: CLOCK_MS,
+        takeover=takeover,
+        wait_s=wait_s,
     )
 
 
@@ -190,7 +198,7 @@ def test_a_question_has_a_key_a_payload_and_a_time_of_its_own() -> None:
         assert question is not None
         assert name_of(question) == name
         assert question.timeout_s == pytest.approx(timeout_s)
-        assert payloads.decode(Acquire, question.payload) == Acquire(who="ann")
+        assert payloads.decode(Acquire, question.payload) == Acquire(who="ann", t=7777)
     program = Program(WAIT_S)
     for step in ("want", "granted shortly", "0.5 s"):
         program.take(step)

@@ -37,7 +37,7 @@ class Scene:
         self.events: list[LeaseEvent] = []
         self.tasks: list[asyncio.Task[None]] = []
         request = Acquire(who="ann", alive=TOKEN)
-        client = LeaseClient(KEYS, request, "ann", concerns=lambda refusal: True, wait_s=wait_s)
+        client = LeaseClient(KEYS, request, "ann", concerns=lambda refusal: True, clock_ms=lambda: 0.0, wait_s=wait_s)
         self.holder = LeaseHolder(
             self.bus, client, spawn=self._spawn, on_event=self.events.append, clock=self.loop.time
         )

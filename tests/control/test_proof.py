@@ -16,40 +16,65 @@ from zbridge.fleet.messages import Authorization, Lease
 LEASE, TOKEN = bytes(range(8)), bytes(range(100, 132))
 GRANTED = Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="ann")
 DRIVE, RENEW = "fleet/r1/@cmd/drive", "fleet/r1/@rpc/control/renew"
+RELEASE = "fleet/r1/@rpc/control/release"
 PAYLOAD = packed({"forward": 0.5})
 PROOF = proof(TOKEN, DRIVE, 9, PAYLOAD)
 WHOLE = {"lease": LEASE, "seq": 9, "proof": PROOF}
 ATTACHMENT = packed(WHOLE)
 
 
-@pytest.mark.parametrize(
-    ("key", "payload", "signed"),
-    [
-        (DRIVE, PAYLOAD, b"fleet/r1/@cmd/drive\0\0\0\0\0\0\0\0\x03\x81\xa7forward\xcb\x3f\xe0\0\0\0\0\0\0"),
-        (RENEW, None, b"fleet/r1/@rpc/control/renew\0\0\0\0\0\0\0\0\x03"),
-    ],
-)
-def test_a_proof_is_what_the_design_says_byte_by_byte_and_commands_are_numbered_apart(key, payload, signed) -> None:
-    signer = Signer(GRANTED)
+T = 0x0102030405
+DATED = Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="ann", max_age_s=0.4)
+THREE = b"\0\0\0\0\0\0\0\x03"
+DATE = b"\0\0\0\x01\x02\x03\x04\x05"
+SIGNED = {
+    "command": (GRANTED, DRIVE, PAYLOAD, b"fleet/r1/@cmd/drive\0" + THREE + PAYLOAD, {}),
+    "renew": (GRANTED, RENEW, None, b"fleet/r1/@rpc/control/renew\0" + THREE, {}),
+    "dated command": (DATED, DRIVE, PAYLOAD, b"fleet/r1/@cmd/drive\1" + THREE + DATE + PAYLOAD, {"t": T}),
+    "dated renew": (DATED, RENEW, None, b"fleet/r1/@rpc/control/renew\1" + THREE + DATE, {"t": T}),
+    "release": (DATED, RELEASE, None, b"fleet/r1/@rpc/control/release\0" + THREE, {}),
+}
+
+
+@pytest.mark.parametrize(("lease", "key", "payload", "signed", "dated"), SIGNED.values(), ids=SIGNED)
+def test_a_proof_is_what_the_design_says_byte_by_byte_and_commands_are_numbered_apart(
+    lease: Lease, key: str, payload: bytes | None, signed: bytes, dated: dict[str, int]
+) -> None:
+    assert PAYLOAD == b"\x81\xa7forward\xcb\x3f\xe0\0\0\0\0\0\0"
+    signer = Signer(lease)
     for _ in range(2):
-        signer.command("fleet/r1/@cmd/mode", b"")
-        signer.question(RENEW)
-    said = signer.question(key) if payload is None else signer.command(key, payload)
+        signer.command("fleet/r1/@cmd/mode", b"", T)
+        signer.renewal(RENEW, T)
+    if payload is not None:
+        said = signer.command(key, payload, T)
+    else:
+        said = signer.release(key) if key == RELEASE else signer.renewal(key, T)
     expected = hmac.new(TOKEN, signed, hashlib.sha256).digest()[:16]
-    assert msgpack.unpackb(said) == {"lease": LEASE, "seq": 3, "proof": expected}
+    assert msgpack.unpackb(said) == {"lease": LEASE, "seq": 3, "proof": expected, **dated}
     assert Verifier(LEASE, TOKEN).proves(read(said), key, payload or b"")
 
 
-@given(st.binary(min_size=32, max_size=32), st.text(min_size=1), st.integers(0, 2**64 - 1), st.binary(max_size=300))
-def test_a_verifier_takes_what_the_design_defines_and_nothing_near_it(token, key, seq, payload) -> None:
+@given(
+    st.binary(min_size=32, max_size=32),
+    st.text(min_size=1),
+    st.integers(0, 2**64 - 1),
+    st.binary(max_size=300),
+    st.none() | st.integers(0, 2**53 - 1),
+)
+def test_a_verifier_takes_what_the_design_defines_and_nothing_near_it(token, key, seq, payload, t) -> None:
     key = key.encode("utf-8", "ignore").decode()
     verifier = Verifier(LEASE, token)
-    said = shown(LEASE, token, key, seq, payload)
+    said = shown(LEASE, token, key, seq, payload, t)
     assert LEAST_BYTES <= len(said) <= MOST_BYTES
     assert verifier.plausible(said)
     assert verifier.proves(read(said), key, payload)
     assert not verifier.proves(read(said), key, payload + b"x")
     assert not verifier.proves(read(said), key + "x", payload)
+    undated = {name: value for name, value in msgpack.unpackb(said).items() if name != "t"}
+    if t is not None:
+        assert not verifier.proves(read(packed(undated)), key, payload), "a date cannot be taken off"
+    later = packed({**undated, "t": (t or 0) + 1})
+    assert t == 2**53 - 1 or not verifier.proves(read(later), key, payload), "nor altered, nor put on"
 
 
 def test_a_proof_or_a_token_with_one_bit_changed_proves_nothing() -> None:
@@ -87,6 +112,10 @@ MALFORMED = {
     "a negative number": packed({**WHOLE, "seq": -1}),
     "a fraction": packed({**WHOLE, "seq": 9.5}),
     "a truth": packed({**WHOLE, "seq": True}),
+    "a date of 2**53": packed({**WHOLE, "t": 2**53}),
+    "a date before zero": packed({**WHOLE, "t": -1}),
+    "a date that is a fraction": packed({**WHOLE, "t": 1.5}),
+    "a date that is nil": packed({**WHOLE, "t": None}),
     "more behind it": ATTACHMENT + b"\x00",
     "much beside it": packed({**WHOLE, "x": bytes(200)}),
     "deeply nested": b"\x91" * 100_000 + b"\xc0",

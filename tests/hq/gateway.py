@@ -9,7 +9,7 @@ from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import IncomingQuery, Sample
 from zbridge.control.authority import Authority
 from zbridge.control.proof import read
-from zbridge.errors import Refused
+from zbridge.errors import Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw
@@ -46,10 +46,11 @@ class Gateway:
         if what == "acquire":
             self.requests.append(request := payloads.decode(Acquire, question.payload))
             assert request.who.startswith(f"{name}."), "asked in the name of the listener"
-            lease = self.authority.acquire(request, now)
+            lease = self.authority.acquire(request, now, now * 1000)
+        elif what == "renew":
+            lease = self.authority.renew(read(question.payload), question.asked, now, now * 1000)
         else:
-            decide = self.authority.renew if what == "renew" else self.authority.release
-            lease = decide(read(question.payload), question.asked, now)
+            lease = self.authority.release(read(question.payload), question.asked, now)
         question.answer(payloads.encode(lease))
 
     def _take(self, sample: Sample) -> None:
@@ -57,14 +58,16 @@ class Gateway:
         assert topic is not None
         message = payloads.decode(topic.message, sample.payload)
         if isinstance(message, Drive | Motor | Mode | Raw):
-            who = None
+            who, now = None, self.scene.now
             try:
-                who = self.authority.admit(sample.attachment, sample.key, sample.payload, self.scene.now)
-                moving = isinstance(message, Drive | Motor) and message.moving
+                sender = self.authority.admit(sample.attachment, sample.key, sample.payload, now, now * 1000)
+                who, moving = sender.who, isinstance(message, Drive | Motor) and message.moving
+                if moving and sender.stale:
+                    raise Stale("too late")
                 if moving:
                     self.authority.require_motion()
                 if isinstance(message, Drive | Motor):
-                    self.authority.applied(topic.path, self.scene.now, moving=moving)
+                    self.authority.applied(topic.path, sender.given_at, moving=moving, stale=sender.stale)
             except Refused as refusal:
                 self.refused.append(str(refusal))
                 self.authority.refuse(topic.path.removeprefix("@cmd/"), refusal, refusal.who or who)

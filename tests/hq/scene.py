@@ -228,7 +228,9 @@ class Scene:
         protocol = Protocol("toy", "", HqSettings, 1, robot=None, simulate=None, hq=self._side)  # type: ignore[arg-type]
         plan = ListenerPlan(protocol, None, Address("127.0.0.1", 0), limits, networks)
         self.accept: Callable[[], Receiver]
-        self.listener = Listener(plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now)
+        self.listener = Listener(
+            plan, "toy", self.robot, self.manager, self.metrics, lambda: self.now, clock_ms=lambda: self.now * 1000
+        )
         self.hosts = 0
         self.programs: dict[str, Program] = {}
 

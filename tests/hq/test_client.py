@@ -97,7 +97,8 @@ what was said while the process stood still moves nothing, and neutral must come
     holder nothing; wait 0.4; a says go; driven nothing; a says stand, go; driven 0.5
 what a client holds is repeated until its machine falls silent [side=HoldingSide]
     a drives; wait 4; forget; wait 0.1; driven 0.5; holder hq.toy.2; a owes 1.2; wait 0.3; holder nothing; forget
-    a owes 0; a says go; driven nothing; a says stand, go; driven 0.5
+    a owes 0; a says go; driven nothing; a says stand, go; driven nothing; a says stand; wait 0.31; a says go
+    driven 0.5
 one drives, another is told who, and only the first is told of what becomes of it
     a drives; b drives; b hears ! not driving: held by hq.toy.2 (priority 0); c greets; gateway-refuses busy: map
     a says go; shown; a hears ! drive: busy: map: send a neutral drive first; forget; a says stand, go; driven 0.5

@@ -109,6 +109,29 @@ the deadman counts from the motion and not from the grant [ready]
     0 motion -> acquire; granted 3; expire 1.25; is owes neutral
 neutral of one part, or a mode, does not put the deadman of the others off [driving]
     0.1 neutral of a part -> send; 1 mode autonomous -> send; 1.1 mode manual -> send; expire 1.25; is owes neutral
+# What may have waited in the network
+a push right behind the neutral that ends a silence moves nothing, however often both come [driving]
+    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; 2.4 motion ! deadman: release the stick
+    2.45 neutral -> send; 2.5 motion ! deadman; heard 2.7; 2.7 motion ! deadman; is owes neutral
+a neutral after a silence counts once three tenths of a second pass without motion [driving]
+    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; heard 2.6; 2.6 neutral -> send
+    is owes neutral; heard 2.71; 2.71 neutral -> send; not owes neutral; 2.72 motion -> send
+it counts without another one, too [driving]
+    heard 0.1; 0.1 motion -> send; expire 1.4; heard 2.4; 2.4 neutral -> send; expire 2.69; is owes neutral; expire 2.71
+    not owes neutral; heard 2.8; 2.8 motion -> send
+mode autonomous behind it is motion [choosing]
+    heard 0.1; 0.1 mode autonomous -> acquire; granted 3; lost stop; heard 2.0; 2.0 neutral -> nothing
+    2.1 mode autonomous ! stop: release the stick first; 2.4 mode autonomous ! stop; 2.5 neutral -> nothing
+    2.81 mode autonomous -> acquire
+a neutral still ends motion at once, and one without a silence before it counts at once [driving]
+    heard 0.1; 0.1 motion -> send; heard 1.3; 1.3 motion -> send; heard 2.6; 2.6 neutral -> send; 2.61 motion ! deadman
+    heard 2.7; 2.7 neutral -> send; heard 3.1; 3.1 neutral -> send; not owes neutral; refused busy; 3.2 neutral -> send
+    not owes neutral; 3.21 motion -> send
+a neutral that was said before a stop does not count after it [driving]
+    heard 0.1; 0.1 motion -> send; heard 2.0; 2.0 neutral -> send; lost stop; expire 2.4; is owes neutral
+    2.4 motion ! stop
+a new program was not silent
+    heard 0; 0 neutral -> nothing; 0.1 motion -> acquire
 # Control modes
 a stick that was pushed while the mode was none moves nothing when the mode is chosen [choosing]
     0.5 motion ! control mode is none; not asking; 0.61 mode manual -> nothing

@@ -171,6 +171,7 @@ class Scene:
             is_motion=is_motion_of_wheels if kind == "steers" else lambda command: command.moving,
             tell=self.told.append,
             clock=lambda: self.now,
+            clock_ms=lambda: self.now * 1000,
         )
         self.program.hold = kind == "holds"
         if kind == "modes":
@@ -386,7 +387,8 @@ async def test_every_motor_there_can_be_is_set_and_held(scene: Scene) -> None:
 
 async def test_what_is_asked_for_names_the_program_its_deadman_and_its_token(scene: Scene) -> None:
     await scene.play(DRIVES)
-    assert scene.gateway.requests == [Acquire(who="hq.toy.1", deadman_s=DEADMAN_S, alive="hq.toy.1")]
+    asked = Acquire(who="hq.toy.1", deadman_s=DEADMAN_S, alive="hq.toy.1", t=round(scene.now * 1000))
+    assert scene.gateway.requests == [asked]
 
 
 async def test_a_robot_that_must_hear_neutral_first_makes_the_program_say_it(scene: Scene) -> None:

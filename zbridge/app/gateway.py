@@ -299,7 +299,7 @@ class Gateway:
             protocol=plan.protocol.name,
             keys=self._keys,
             bus=bus,
-            authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes),
+            authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes, control.max_age_s),
             limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
             manager=self.sessions,
             metrics=self.metrics,

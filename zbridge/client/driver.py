@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
+from zbridge.control.clocks import raw_ms
 from zbridge.control.lease_client import RETRY_S, LeaseClient
 from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
@@ -53,7 +54,9 @@ class Driver:
         self._bus = bus
         self._keys = keys
         self._wait_s = wait_s
-        self._client = LeaseClient(keys, request, name, concerns=self._concerns, takeover=takeover, wait_s=wait_s)
+        self._client = LeaseClient(
+            keys, request, name, concerns=self._concerns, clock_ms=raw_ms, takeover=takeover, wait_s=wait_s
+        )
         loop = asyncio.get_running_loop()
         self._holder = LeaseHolder(bus, self._client, spawn=self._spawn, on_event=self._on_event, clock=loop.time)
         self._granted: asyncio.Future[None] = loop.create_future()
@@ -108,21 +111,25 @@ class Driver:
         """
         if self._lock.locked():
             return False
-        refusal = self._put(topics.CMD_DRIVE, drive)
+        refusal = self._put(topics.CMD_DRIVE, drive, raw_ms())
         if refusal is not None:
             raise refusal
         return True
 
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
+        given_ms = raw_ms()
         async with self._lock:
-            refusal = self._put(topic, message)
+            refusal = self._put(topic, message, given_ms)
             if topic is not topics.CMD_DRIVE:  # a thread writes it: the next command must not overtake it
                 await self._bus.flush()
             if refusal is not None:
                 raise refusal
 
-    def _put(self, topic: Topic, message: FleetMessage) -> Refused | None:
-        """Put a command; return the refusal of an earlier one that is to be raised now that neutral was sent."""
+    def _put(self, topic: Topic, message: FleetMessage, given_ms: float) -> Refused | None:
+        """Put a command; return the refusal of an earlier one that is to be raised now that neutral was sent.
+
+        given_ms: the raw clock when the program gave it.
+        """
         if self.loss is not None:
             loss = self.loss  # raise a new one each time: the traceback of a raised exception grows
             raise LeaseLost(str(loss), loss.code, holder=loss.holder)
@@ -133,7 +140,7 @@ class Driver:
         if publisher is None:
             publisher = self._publishers[topic.path] = self._bus.publisher(self._keys.key(topic.path), topic)
         payload = payloads.encode(message)
-        publisher.put(payload, self._client.prove(publisher.key, payload))
+        publisher.put(payload, self._client.prove(publisher.key, payload, given_ms))
         return refusal
 
     # The lease

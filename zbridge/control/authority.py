@@ -17,7 +17,8 @@ bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is
-decided by its proof first and its number second: knowing a lease's public id allows nothing.
+decided by its proof first and its number second: knowing a lease's public id allows nothing. What was given too long
+ago (:mod:`zbridge.control.command_age`) extends no lease and no motion, and allows no motion either.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ import math
 from collections.abc import Callable
 from typing import ClassVar, TypeAlias
 
-from zbridge.control.events import Event, EventKind, Input, State
+from msgspec import UNSET
+
+from zbridge.control.command_age import MAX_AGE_S, CommandAge
+from zbridge.control.events import Event, EventKind, Input, Sender, State
 from zbridge.control.proof import Holder, Holders, Verifier
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.control.wishes import capped, name_of
@@ -41,11 +45,15 @@ class Authority:
 
     lease_s, deadman_s: the most a holder may ask for, and the default, in seconds.
     random: returns as many unguessable bytes as it is asked for.
+    max_age_s: commands that are later are stale, in seconds; 0: none is.
     """
 
-    def __init__(self, lease_s: float, deadman_s: float, random: Callable[[int], bytes]) -> None:
+    def __init__(
+        self, lease_s: float, deadman_s: float, random: Callable[[int], bytes], max_age_s: float = MAX_AGE_S
+    ) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
+        self._max_age_s = max_age_s or math.inf
         self.on_its_own = False
         """Whether the robot may have moved by itself since its last stop: without a deadman, but every stop ends it."""
         self.verifier: Verifier | None = None
@@ -81,24 +89,25 @@ class Authority:
         """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be at rest."""
         return bool(self._moving) or self._autonomous
 
-    # Questions about the lease
+    # Questions about the lease. received_ms: the gateway's raw clock, for the age of what is dated.
 
-    def acquire(self, request: Acquire, now: float) -> Lease:
+    def acquire(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
         """Grant the lease of a robot that is free or stopped, or held with a lower priority."""
         self.expire(now)
         outranks = self._holders.current is not None and request.priority > self._holders.current.priority
         asked = Input.OUTRANK if outranks else Input.ACQUIRE
-        return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now)
+        return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now, received_ms)
 
-    def takeover(self, request: Acquire, now: float) -> Lease:
+    def takeover(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
         """Grant the lease whoever has it; the previous holder loses it, and a moving robot is stopped."""
         self.expire(now)
-        return self._reply("takeover", request.who, now, Input.TAKEOVER, request, EventKind.TAKEN_OVER, now)
+        kind = EventKind.TAKEN_OVER
+        return self._reply("takeover", request.who, now, Input.TAKEOVER, request, kind, now, received_ms)
 
-    def renew(self, shown: Authorization, key: str, now: float) -> Lease:
-        """Postpone the end of the lease by its full length. key: the key that was queried."""
+    def renew(self, shown: Authorization, key: str, now: float, received_ms: float = 0.0) -> Lease:
+        """Postpone the end of the lease by its full length; a stale question does not. key: the key queried."""
         self.expire(now)
-        return self._reply("renew", None, now, Input.RENEW, shown, key, now)
+        return self._reply("renew", None, now, Input.RENEW, shown, key, now, received_ms)
 
     def release(self, shown: Authorization, key: str, now: float) -> Lease:
         """End the lease at its holder's wish; a moving robot is stopped. key: the key that was queried."""
@@ -107,35 +116,45 @@ class Authority:
 
     # Commands
 
-    def admit(self, attachment: bytes | None, key: str, payload: bytes, now: float) -> str:
-        """Return the holder who sent a command, use its number up and renew the lease; raise Refused for other senders.
+    def admit(self, attachment: bytes | None, key: str, payload: bytes, now: float, received_ms: float = 0.0) -> Sender:
+        """Return who of the holders sent a command, and when; use its number up and renew the lease.
 
-        key: the key that the command came on, without wildcards.
+        Raises Refused for other senders. A stale command renews nothing. key: the key that the command came on,
+        without wildcards. received_ms: the gateway's raw clock.
         """
         holders = self._holders
         if now >= self._stop_at or (holders.current is not None and now >= holders.current.expires_at):
             self.expire(now)
-        holder = holders.of_command(attachment, key, payload)
-        holder.expires_at = now + holder.lease_s
-        return holder.who
+        holder, shown = holders.of_command(attachment, key, payload)
+        late_s = holder.late_s(shown, received_ms)
+        stale = holder.age.is_stale(late_s)
+        if not stale:
+            holder.expires_at = now + holder.lease_s
+        return Sender(holder.who, now - late_s, late_s, stale)
 
     def require_motion(self) -> None:
         """Raise Refused if the holder must send neutral before the robot moves."""
         if self._held_back is not None:
             raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
 
-    def applied(self, part: str, now: float, *, moving: bool) -> None:
-        """Record that the holder's command for one part of the robot was carried out."""
+    def applied(self, part: str, given_at: float, *, moving: bool, stale: bool = False) -> None:
+        """Record that the holder's command for one part of the robot was carried out.
+
+        given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends
+        motion and does not allow it again.
+        """
         parts = self._moving
         if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
-            self._stop_at = now + self._deadman_s
+            self._stop_at = given_at + self._deadman_s
             return
         if not moving and not parts and self._held_back is None:  # nor is repeated neutral
             self._autonomous = False
             return
         (parts.add if moving else parts.discard)(part)
-        action, after = self.TABLE[self._state][_MOTION if parts else _NEUTRAL]
-        action(self, now)
+        if stale and parts:  # motion of another part goes on, and with it its deadman
+            return
+        action, after = self.TABLE[self._state][_MOTION if parts else _STALE_NEUTRAL if stale else _NEUTRAL]
+        action(self, given_at)
         self._state = after or self._state
 
     def mode_chosen(self, *, autonomous: bool) -> None:
@@ -237,7 +256,7 @@ class Authority:
 
     # Actions
 
-    def _grant(self, request: Acquire, kind: EventKind, now: float) -> Lease:
+    def _grant(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
         """End the current lease, if there is one, and give a new one; raise Malformed, and change nothing."""
         who, lease_s = name_of(request), capped("lease_s", request.lease_s, self.lease_s)
         deadman_s = capped("deadman_s", request.deadman_s, self.deadman_s)
@@ -245,19 +264,25 @@ class Authority:
             self._end(f"taken over by {who}", EventKind.ENDED)
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
-        self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, now + lease_s)
+        age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
+        age.late_s(request.t, received_ms)
+        expires_at = now + lease_s
+        self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, expires_at, age)
         self._held_back = None
         self._events.append(Event(kind, who, priority=request.priority))
-        return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who)
+        max_age_s = age.limit_s if request.t is not UNSET and age.limit_s < math.inf else UNSET
+        return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who, max_age_s=max_age_s)
 
-    def _deny(self, request: Acquire, kind: EventKind, now: float) -> Lease:
+    def _deny(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
         """Refuse the lease and name its holder."""
         assert self._holders.current is not None
         raise Held(f"held by {self._holders.current.described}", holder=self._holders.current.who)
 
-    def _extend(self, shown: Authorization, key: str, now: float) -> Lease:
-        """Renew the lease if its holder asks; raise Refused for other senders."""
+    def _extend(self, shown: Authorization, key: str, now: float, received_ms: float) -> Lease:
+        """Renew the lease if its holder asks, and asked lately; raise Refused for other senders."""
         holder = self._holders.of_question(shown, key)
+        if holder.age.is_stale(holder.late_s(shown, received_ms)):
+            return Lease(ok=True, expires_in_s=holder.expires_at - now, holder=holder.who)
         holder.expires_at = now + holder.lease_s
         return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
 
@@ -266,18 +291,22 @@ class Authority:
         self._holders.of_question(shown, key)
         self._end("released", EventKind.RELEASED)
 
-    def _explain(self, shown: Authorization, key: str, now: float = 0.0) -> None:
+    def _explain(self, shown: Authorization, key: str, now: float = 0.0, received_ms: float = 0.0) -> None:
         """Refuse what only a holder may ask, and say why its lease ended if it had one."""
         self._holders.of_question(shown, key)
 
-    def _move(self, now: float) -> None:
+    def _move(self, given_at: float) -> None:
         """Start the deadman."""
-        self._stop_at = now + self._deadman_s
+        self._stop_at = given_at + self._deadman_s
 
-    def _rest(self, now: float) -> None:
+    def _rest(self, given_at: float) -> None:
         """Stop the deadman; neutral also takes the robot out of its mode, and allows motion again."""
-        self._autonomous = False
+        self._rest_stale(given_at)
         self._held_back = None
+
+    def _rest_stale(self, given_at: float) -> None:
+        """Stop the deadman; neutral also takes the robot out of its mode."""
+        self._autonomous = False
         self._stop_at = math.inf
 
     def _hold_back(self, reason: str, *, stops: bool = True) -> None:
@@ -309,6 +338,7 @@ class Authority:
         Input.RELEASE: (_explain, None),
         Input.MOTION: (_move, None),
         Input.NEUTRAL: (_rest, None),
+        Input.STALE_NEUTRAL: (_rest_stale, None),
         Input.DEADMAN: (_hold_back, None),
         Input.HOLD_BACK: (_hold_back, None),
         Input.STOP: (_end, State.STOPPED),
@@ -320,6 +350,7 @@ class Authority:
         Input.RENEW: (_extend, None),
         Input.RELEASE: (_give_back, State.FREE),
         Input.NEUTRAL: (_rest, State.HELD),
+        Input.STALE_NEUTRAL: (_rest_stale, State.HELD),
         Input.HOLD_BACK: (_hold_back, State.HELD_BACK),
         Input.STOP: (_end, State.STOPPED),
         Input.EXPIRED: (_end, State.STOPPED),
@@ -331,10 +362,19 @@ class Authority:
         State.STOPPED: _NOBODY,
         State.HELD: _HOLDER | {Input.MOTION: (_move, State.MOVING)},
         State.MOVING: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, State.HELD_BACK)},
-        State.HELD_BACK: _HOLDER | {Input.MOTION: (_move, None), Input.DEADMAN: (_hold_back, None)},
+        State.HELD_BACK: _HOLDER
+        | {
+            Input.MOTION: (_move, None),
+            Input.STALE_NEUTRAL: (_rest_stale, None),
+            Input.DEADMAN: (_hold_back, None),
+        },
     }
     """What to do with an input, and the state after it; None: the state stays."""
 
 
-_MOTION, _NEUTRAL = Input.MOTION, Input.NEUTRAL  # looking up a member of an enum costs more than a command may
+_MOTION, _NEUTRAL, _STALE_NEUTRAL = (
+    Input.MOTION,
+    Input.NEUTRAL,
+    Input.STALE_NEUTRAL,
+)  # looking up a member of an enum costs more than a command may
 _SHOWN = {State.MOVING: "held", State.HELD_BACK: "held"}

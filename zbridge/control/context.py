@@ -7,6 +7,7 @@ from collections.abc import Callable
 import msgspec
 
 from zbridge.bus import Bus
+from zbridge.control import clocks
 from zbridge.control.conditions import Conditions
 from zbridge.control.faults import Faults
 from zbridge.fleet.messages import FleetMessage
@@ -20,6 +21,7 @@ class RobotContext(msgspec.Struct, frozen=True):
 
     publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
     clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
+    raw_ms, suspended_s: see :mod:`zbridge.control.clocks`.
     """
 
     robot: Robot
@@ -32,3 +34,5 @@ class RobotContext(msgspec.Struct, frozen=True):
     pump: Callable[[], object]
     clock: Callable[[], float]
     clock_ns: Callable[[], int]
+    raw_ms: Callable[[], float] = clocks.raw_ms
+    suspended_s: Callable[[], float] = clocks.suspended_s

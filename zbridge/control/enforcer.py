@@ -5,8 +5,9 @@ three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` b
 :meth:`Enforcer.moved` after it was told. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
 sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms the timer
 for the authority's deadline. The timer is re-armed only for an earlier deadline: commands mostly postpone it, and an
-early wake-up is harmless. Before anything is written to the robot :meth:`Enforcer.keep_time` does what is due, since
-the process may have been frozen past its deadline.
+early wake-up is harmless. Before anything is written to the robot, or read from it or from the bus,
+:meth:`Enforcer.keep_time` does what is due, since the process may have been frozen past its deadline, or the machine
+suspended: then no clock of the event loop shows how long.
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import Event, EventKind
+from zbridge.control.events import Event, EventKind, Sender
 from zbridge.control.gate import CommandGate, Sieve
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
-from zbridge.errors import Refused
+from zbridge.errors import Refused, Stale
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.protocol.session import State
 
+SUSPENDED_S = 0.1
+"""A machine that was suspended for longer stops its robots, and ends their leases."""
 _CONTROL_S = 0.05
 """Least time between two publications of ``control`` while refusals come in."""
 
@@ -48,6 +51,7 @@ class Enforcer:
         """Sorts commands on the bus's threads."""
         self._context = context
         self._clock = context.clock
+        self._suspended_s = context.suspended_s()
         self._standstill = standstill
         self._audit = audit
         self._limits = limits
@@ -61,18 +65,25 @@ class Enforcer:
         self._refused = context.metrics.count("refused")
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")
+        self._stale = context.metrics.count("commands_stale")
 
     def __repr__(self) -> str:
         return f"<Enforcer {self._context.keys.robot} {self.authority!r}>"
 
     # A command of the holder's
 
-    def admit(self, sample: Sample, now: float) -> str:
-        """Return the holder who sent a command, and renew the lease; raise Refused where nobody's lease shows it."""
-        who = self.authority.admit(sample.attachment, sample.key, sample.payload, now)
+    def admit(self, sample: Sample, now: float) -> Sender:
+        """Return who of the holders sent a command, and renew the lease; raise Refused for other senders."""
+        sender = self.authority.admit(sample.attachment, sample.key, sample.payload, now, self._context.raw_ms())
         if self.authority.eventful:
             self.settle()
-        return who
+        return sender
+
+    def require_fresh(self, sender: Sender) -> None:
+        """Raise Refused for a command that is too old to set the robot in motion."""
+        if sender.stale:
+            self._stale.value += 1
+            raise Stale("given too long ago: the network held it up")
 
     def require_motion(self) -> None:
         """Raise Refused where the holder must send neutral before the robot moves."""
@@ -87,15 +98,15 @@ class Enforcer:
         self._slowed.value += limited is not command and limited != command
         return limited
 
-    def moved(self, path: str, command: Drive | Motor, now: float, *, moving: bool) -> None:
-        """Note that the robot was told to move, or to be at rest.
+    def moved(self, path: str, command: Drive | Motor, now: float, sender: Sender, *, moving: bool) -> None:
+        """Record that the robot was sent motion, or neutral.
 
         Raises Refused where the link had just begun to take again: then a stop went instead of the motion.
         """
         authority = self.authority
         if moving:
             authority.require_motion()
-        authority.applied(path, now, moving=moving)
+        authority.applied(path, sender.given_at, moving=moving, stale=sender.stale)
         if isinstance(command, Drive):
             if self._limits is not None:
                 self._limits.sent(command, now)
@@ -147,7 +158,11 @@ class Enforcer:
         self.settled()
 
     def keep_time(self) -> None:
-        """Do what is due, before anything is written: the loop may come back late, from a process that was frozen."""
+        """Do what is due, before anything is read or written: the process may have been frozen, the machine asleep."""
+        suspended_s = self._context.suspended_s()
+        if suspended_s > self._suspended_s + SUSPENDED_S:
+            asleep_s, self._suspended_s = suspended_s - self._suspended_s, suspended_s
+            self.stop(f"the gateway's machine was suspended for {asleep_s:.1f} s")
         if self._clock() >= self._timer_at:
             self._on_time()
 

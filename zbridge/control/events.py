@@ -29,6 +29,7 @@ class Input(StrEnum):
     RELEASE = "release"
     MOTION = "motion carried out"
     NEUTRAL = "neutral carried out"
+    STALE_NEUTRAL = "stale neutral carried out"
     DEADMAN = "deadman"
     HOLD_BACK = "hold back"
     STOP = "stop"
@@ -46,6 +47,19 @@ class EventKind(Enum):
     REFUSED = "refused"
     STOPPED = "stopped"
     ENDED = "ended"
+
+
+class Sender(msgspec.Struct, frozen=True):
+    """Who sent a command of the lease, and when it was given.
+
+    given_at: on the time line of the event loop, seconds. late_s: for how long it was on its way. stale: it is too old
+    to be obeyed, but for neutral and for a mode that ends autonomous motion.
+    """
+
+    who: str
+    given_at: float
+    late_s: float = 0.0
+    stale: bool = False
 
 
 class Event(msgspec.Struct, frozen=True):

@@ -62,8 +62,9 @@ class LeaseClient:
     """The lease of one robot for one program.
 
     name: the name in the key of the question; ``request.who`` begins with it. concerns: whether a refusal is this
-    program's. wait_s: seconds for which a gateway that does not answer is asked again; a held lease then ends only if
-    the gateway says so, or at its expiry. None: a missing answer denies the lease, or ends it.
+    program's. clock_ms: the raw clock, which dates questions and commands. wait_s: seconds for which a gateway that
+    does not answer is asked again; a held lease then ends only if the gateway says so, or at its expiry. None: a
+    missing answer denies the lease, or ends it.
     """
 
     def __init__(
@@ -73,6 +74,7 @@ class LeaseClient:
         name: str,
         *,
         concerns: Callable[[Refusal], bool],
+        clock_ms: Callable[[], float],
         takeover: bool = False,
         wait_s: float | None = None,
     ) -> None:
@@ -81,6 +83,7 @@ class LeaseClient:
         self.renews = wait_s is not None
         """Whether the lease is renewed three times in its length; else commands must do so."""
         self.news = RefusalNews(concerns)
+        self.clock_ms = clock_ms
         self._acquire_key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
         self._wait_s = wait_s
         self._state = State.FREE
@@ -107,10 +110,13 @@ class LeaseClient:
         """Whether there is no lease, and no question on its way."""
         return self._state is State.FREE
 
-    def prove(self, key: str, payload: bytes) -> bytes:
-        """Return the attachment of the next command on this key; only while :attr:`held`."""
+    def prove(self, key: str, payload: bytes, given_ms: float | None = None) -> bytes:
+        """Return the attachment of the next command on this key; only while :attr:`held`.
+
+        given_ms: the raw clock when the command was given; None: now.
+        """
         assert self._signer is not None, "a command without a lease"
-        return self._signer.command(key, payload)
+        return self._signer.command(key, payload, int(self.clock_ms() if given_ms is None else given_ms))
 
     # What the program wants
 
@@ -226,7 +232,8 @@ class LeaseClient:
     def _ask(self, now: float, *rest: object) -> None:
         """Ask for the lease."""
         left_s = max(RETRY_S, self._wait_until - now) if self._wait_s is not None else ASK_S
-        self._put(Question(self._acquire_key, payloads.encode(self.request), min(ASK_S, left_s), now))
+        request = msgspec.structs.replace(self.request, t=int(self.clock_ms()))
+        self._put(Question(self._acquire_key, payloads.encode(request), min(ASK_S, left_s), now))
 
     def _pause(self, now: float) -> None:
         """Ask again soon."""
@@ -248,7 +255,7 @@ class LeaseClient:
         assert self._signer is not None
         key = self.keys.key(topics.RPC_RENEW.path)
         timeout_s = ASK_S if self._wait_s is None else min(ASK_S, self._lease_s / 3)
-        self._put(Question(key, self._signer.question(key), timeout_s, now))
+        self._put(Question(key, self._signer.renewal(key, int(self.clock_ms())), timeout_s, now))
 
     def _extend(self, now: float, expires_at: float) -> None:
         """Note how long the lease lasts at least."""
@@ -268,7 +275,7 @@ class LeaseClient:
         signer, self._signer = signer or self._signer, None
         assert signer is not None
         key = self.keys.key(topics.RPC_RELEASE.path)
-        self._put(Question(key, signer.question(key), ASK_S, now, returns=True))
+        self._put(Question(key, signer.release(key), ASK_S, now, returns=True))
 
     def _put(self, question: Question) -> None:
         self._waiting = self._unasked = question

@@ -80,6 +80,7 @@ class LeaseServer:
         command = name.removesuffix("/*")
 
         def answer(query: IncomingQuery) -> None:
+            self._enforcer.keep_time()
             if self._closing is not None:
                 query.refuse(NotReady(self._closing, Code.CLOSING))
                 return
@@ -102,16 +103,16 @@ class LeaseServer:
             self._enforcer.settle()
 
     def _acquire(self, query: IncomingQuery) -> FleetMessage:
-        return self._authority.acquire(_request(query), self._clock())
+        return self._authority.acquire(_request(query), self._clock(), self._context.raw_ms())
 
     def _take_over(self, query: IncomingQuery) -> FleetMessage:
         request = _request(query)
         if not self._takeovers.take(self._clock()):
             raise TooFast(f"more than {TAKEOVERS_HZ:g} takeovers a second")
-        return self._authority.takeover(request, self._clock())
+        return self._authority.takeover(request, self._clock(), self._context.raw_ms())
 
     def _renew(self, query: IncomingQuery) -> FleetMessage:
-        return self._authority.renew(read(query.payload), query.asked, self._clock())
+        return self._authority.renew(read(query.payload), query.asked, self._clock(), self._context.raw_ms())
 
     def _release(self, query: IncomingQuery) -> FleetMessage:
         return self._authority.release(read(query.payload), query.asked, self._clock())

@@ -2,14 +2,14 @@
 
 The token of a lease is sent once, in the answer that grants it. Each command and question of the holder carries the
 lease's public id, a number that rises, and a proof: the first 16 bytes of HMAC-SHA256(token, key + 0x00 + number as 8
-bytes big-endian + payload). Who overhears it can neither forge nor alter it, nor use it for another key, and the
-gateway accepts each number once. Commands and questions are numbered separately; the proof of a question covers an
-empty payload.
+bytes big-endian + payload). If it is dated, the proof covers key + 0x01 + number + date as 8 bytes big-endian +
+payload. Who overhears it can neither forge nor alter it, nor use it for another key, and the gateway accepts each
+number once. Commands and questions are numbered separately; the proof of a question covers an empty payload.
 
 :class:`Signer` is the holder's end. :class:`Verifier` and :class:`Holders` are the gateway's: the first checks proofs,
 the second also numbers. The bus's thread verifies a command and leaves a note in the verifier; the event loop's thread
 takes the note, so that each proof is computed once.
-Source: the design's "Who may drive".
+Source: the design's "Who may drive" and "Command age".
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
+from zbridge.control.command_age import CommandAge
 from zbridge.errors import Code, Held, LeaseLost, Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
 
@@ -45,6 +47,8 @@ class Signer:
         if lease.lease is None or lease.token is None:
             raise PayloadError("Lease: granted without an id or a token")
         self.lease = lease.lease
+        self.dates = lease.max_age_s is not UNSET
+        """Whether commands and renewals must be dated."""
         self._prepared = _prepare(lease.token)
         self._commands = 0
         self._questions = 0
@@ -52,18 +56,28 @@ class Signer:
     def __repr__(self) -> str:
         return f"<Signer of {self.lease.hex()}>"
 
-    def command(self, key: str, payload: bytes) -> bytes:
-        """Return the attachment of the next command. key: the key it is put on, without wildcards."""
+    def command(self, key: str, payload: bytes, given_ms: int) -> bytes:
+        """Return the attachment of the next command.
+
+        key: the key it is put on, without wildcards. given_ms: the raw clock when it was given.
+        """
         self._commands += 1
-        return self._sign(key, self._commands, payload)
+        return self._sign(key, self._commands, payload, given_ms)
 
-    def question(self, key: str) -> bytes:
-        """Return the payload of the next question, ``renew`` or ``release``."""
+    def renewal(self, key: str, given_ms: int) -> bytes:
+        """Return the payload of the next question, ``renew``."""
         self._questions += 1
-        return self._sign(key, self._questions, b"")
+        return self._sign(key, self._questions, b"", given_ms)
 
-    def _sign(self, key: str, seq: int, payload: bytes) -> bytes:
-        return _encode(Authorization(lease=self.lease, seq=seq, proof=_proof(self._prepared, key, seq, payload)))
+    def release(self, key: str) -> bytes:
+        """Return the payload of the next question, ``release``: it is never too late."""
+        self._questions += 1
+        return self._sign(key, self._questions, b"", UNSET)
+
+    def _sign(self, key: str, seq: int, payload: bytes, given_ms: int | UnsetType) -> bytes:
+        date = given_ms if self.dates else UNSET
+        proof = _proof(self._prepared, key, seq, payload, date)
+        return _encode(Authorization(lease=self.lease, seq=seq, proof=proof, t=date))
 
 
 class Verifier:
@@ -83,7 +97,7 @@ class Verifier:
 
     def proves(self, shown: Authorization, key: str, payload: bytes = b"") -> bool:
         """Return whether the proof is the holder's, for this key and payload. The caller must check the number."""
-        return hmac.compare_digest(_proof(self._prepared, key, shown.seq, payload), shown.proof)
+        return hmac.compare_digest(_proof(self._prepared, key, shown.seq, payload, shown.t), shown.proof)
 
     def note(self, attachment: bytes, shown: Authorization, key: str, payload: bytes) -> None:
         """Record that this command was verified, until :meth:`noted` is asked for it. One thread may call this."""
@@ -106,9 +120,17 @@ class Holder(msgspec.Struct):
     lease_s: float
     alive: str | None
     expires_at: float
+    age: CommandAge
     numbers: dict[str, int] = msgspec.field(default_factory=dict)
     """The highest number used, of commands and of questions."""
     ended: str | None = None
+
+    def late_s(self, shown: Authorization, received_ms: float) -> float:
+        """Return by how many seconds a command or question is late; raise Malformed where it should be dated."""
+        try:
+            return self.age.late_s(shown.t, received_ms)
+        except Malformed as error:
+            raise Malformed(str(error), who=self.who) from None
 
     @property
     def described(self) -> str:
@@ -147,14 +169,18 @@ class Holders:
                 self._ended.popitem(last=False)
         return holder
 
-    def of_command(self, attachment: bytes | None, key: str, payload: bytes) -> Holder:
-        """Return the holder who sent a command and use its number up; raise Refused for other senders."""
+    def of_command(self, attachment: bytes | None, key: str, payload: bytes) -> tuple[Holder, Authorization]:
+        """Return the holder who sent a command, and its authorization, and use its number up.
+
+        Raises Refused for other senders.
+        """
         if attachment is None:
             raise LeaseLost("no lease: acquire first", Code.NO_LEASE)
         holder = self.current
         if holder is not None and (noted := holder.verifier.noted(attachment, key, payload)) is not None:
-            return _use_up("commands", noted.seq, holder)
-        return self._sender("commands", read(attachment), key, payload)
+            return _use_up("commands", noted.seq, holder), noted
+        shown = read(attachment)
+        return self._sender("commands", shown, key, payload), shown
 
     def of_question(self, shown: Authorization, key: str) -> Holder:
         """Return the holder who asked to renew or release, use its number up; raise Refused for other senders."""
@@ -205,9 +231,12 @@ def _prepare(token: bytes) -> hmac.HMAC:
     return hmac.new(token, digestmod=hashlib.sha256)
 
 
-def _proof(prepared: hmac.HMAC, key: str, seq: int, payload: bytes) -> bytes:
+def _proof(prepared: hmac.HMAC, key: str, seq: int, payload: bytes, date: int | UnsetType) -> bytes:
     code = prepared.copy()
-    code.update(b"%b\0%b%b" % (key.encode(), seq.to_bytes(8, "big"), payload))
+    if date is UNSET:
+        code.update(b"%b\0%b%b" % (key.encode(), seq.to_bytes(8, "big"), payload))
+    else:
+        code.update(b"%b\1%b%b%b" % (key.encode(), seq.to_bytes(8, "big"), date.to_bytes(8, "big"), payload))
     return code.digest()[:PROOF_BYTES]
 
 

@@ -16,6 +16,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 LeaseId = Annotated[bytes, msgspec.Meta(min_length=8, max_length=8)]
 Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
 Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+GivenMs = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 TOLD = 16
 """Most different refusals in one report of a listener."""
 if TYPE_CHECKING:
@@ -275,6 +276,7 @@ class Acquire(FleetMessage, frozen=True):
     who: the name that others are shown. priority: a higher priority gets the lease of a holder with a lower one.
     lease_s, deadman_s: wishes in seconds, capped by the robot's configuration; None: its default.
     alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``; its loss ends the lease.
+    t: the sender's CLOCK_MONOTONIC_RAW, ms; absent where the sender does not date its commands.
     """
 
     who: str
@@ -282,13 +284,15 @@ class Acquire(FleetMessage, frozen=True):
     lease_s: float | None = None
     deadman_s: float | None = None
     alive: str | None = None
+    t: GivenMs | UnsetType = UNSET
 
 
 class Lease(FleetMessage, frozen=True):
     """The answer to every query about the lease.
 
     lease: its public id, 8 bytes. token: 32 secret bytes for the holder, never sent again. Both only where the lease is
-    granted. code: a :class:`zbridge.errors.Code` where it is refused, for programs.
+    granted. code: a :class:`zbridge.errors.Code` where it is refused, for programs. max_age_s: what is later than that
+    is stale, in seconds; where it is given, commands and renewals must be dated.
     """
 
     ok: bool
@@ -298,17 +302,20 @@ class Lease(FleetMessage, frozen=True):
     holder: str | None = None
     reason: str | None = None
     code: str | None = None
+    max_age_s: float | UnsetType = UNSET
 
 
 class Authorization(FleetMessage, frozen=True):
     """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.control.proof`.
 
     Attachment of a command; payload of ``renew`` and ``release``. seq: rises with each command (query) of the lease.
+    t: the sender's CLOCK_MONOTONIC_RAW when the command was given, ms; absent where the sender does not date it.
     """
 
     lease: LeaseId
     seq: Annotated[int, msgspec.Meta(ge=0)]
     proof: Proof
+    t: GivenMs | UnsetType = UNSET
 
 
 class Denied(FleetMessage, frozen=True):

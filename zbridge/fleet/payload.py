@@ -1,7 +1,8 @@
 """Fleet messages as bus payloads: MessagePack maps with the field names as declared. Sans-IO.
 
 ``ranges`` and ``cells`` are little-endian ``bin``, all other vectors plain arrays. ``stamp_ns``, ``seq`` and
-``device_ms`` are absent where unknown; every other field is always present.
+``device_ms`` are absent where unknown, ``t`` and ``max_age_s`` where nothing is dated; every other field is always
+present.
 """
 
 from __future__ import annotations

@@ -31,15 +31,20 @@ class Bridge:
     def __repr__(self) -> str:
         return f"<Bridge to {self.keys.robot}>"
 
-    def put(self, topic: Topic, message: FleetMessage, lease: LeaseClient | None = None) -> None:
-        """Put a command on the bus; ``lease`` proves one that needs the lease."""
+    def put(
+        self, topic: Topic, message: FleetMessage, lease: LeaseClient | None = None, given_ms: float | None = None
+    ) -> None:
+        """Put a command on the bus; ``lease`` proves one that needs the lease.
+
+        given_ms: the raw clock when its program gave it; None: now.
+        """
         publisher = self._publishers.get(topic.path)
         if publisher is None:
             if len(self._publishers) >= PUBLISHERS:
                 self._publishers.pop(next(iter(self._publishers))).close()
             publisher = self._publishers[topic.path] = self.bus.publisher(self.keys.key(topic.path), topic)
         payload = payloads.encode(message)
-        publisher.put(payload, lease.prove(publisher.key, payload) if lease is not None else None)
+        publisher.put(payload, lease.prove(publisher.key, payload, given_ms) if lease is not None else None)
 
     def close(self) -> None:
         """Close all publishers."""

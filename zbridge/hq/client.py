@@ -268,6 +268,7 @@ class Client:
             is_motion=side.is_motion,
             tell=self.tell,
             clock=self._context.clock,
+            clock_ms=self._context.clock_ms,
         )
         for topic, command in side.initial_commands():
             operator.command(topic, command)

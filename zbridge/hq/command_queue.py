@@ -20,8 +20,16 @@ WAITING = 64
 """Commands of one client that may wait for the bus besides motion; one more is refused."""
 
 
+class _Waiting(msgspec.Struct, frozen=True):
+    """A command that waits, and the raw clock when its program gave it, ms."""
+
+    topic: Topic
+    message: FleetMessage
+    given_ms: float
+
+
 class CommandQueue:
-    """Puts commands on the bus. Each is numbered when it is put, so none may overtake another.
+    """Puts commands on the bus, dated. Each is numbered when it is put, so none may overtake another.
 
     A drive is put at once. All other commands are written by a thread of the bus: the next command waits until the
     bus has them. What waits longer than its sender means it is dropped. late: called when the queue goes on; returns
@@ -33,7 +41,7 @@ class CommandQueue:
         self._lease = lease
         self._who = who
         self._late = late
-        self._waiting: list[tuple[Topic, FleetMessage]] = []
+        self._waiting: list[_Waiting] = []
         self._writing = False
         self._light = False
 
@@ -42,39 +50,49 @@ class CommandQueue:
 
     def send(self, topic: Topic, message: FleetMessage) -> None:
         """Put a command on the bus after those before it; raise NotReady if too many wait."""
-        if self._writing or not self._lease.held:
-            self.wait(topic, message)
-        else:
-            self.put(topic, message)
+        self._send(_Waiting(topic, message, self._lease.clock_ms()))
 
     def put(self, topic: Topic, message: FleetMessage) -> None:
         """Put a command on the bus now."""
+        self._put(_Waiting(topic, message, self._lease.clock_ms()))
+
+    def _send(self, command: _Waiting) -> None:
+        if self._writing or not self._lease.held:
+            self._keep(command)
+        else:
+            self._put(command)
+
+    def _put(self, command: _Waiting) -> None:
+        topic, message = command.topic, command.message
         if isinstance(message, Drive):
             message = self._lit(message)
-        self._bridge.put(topic, message, self._lease)
+        self._bridge.put(topic, message, self._lease, command.given_ms)
         if topic is not topics.CMD_DRIVE:
             self._writing = True
             self._bridge.spawn(self._written())
 
     def wait(self, topic: Topic, message: FleetMessage) -> None:
         """Keep a command for later, of motion only the newest of each key; raise NotReady if too many wait."""
-        if isinstance(message, Drive | Motor):
-            self._waiting = [entry for entry in self._waiting if entry[0].path != topic.path]
+        self._keep(_Waiting(topic, message, self._lease.clock_ms()))
+
+    def _keep(self, command: _Waiting) -> None:
+        if isinstance(command.message, Drive | Motor):
+            self._waiting = [entry for entry in self._waiting if entry.topic.path != command.topic.path]
         elif len(self._waiting) >= WAITING:
             raise NotReady(f"{WAITING} commands wait for the bus", Code.BUSY)
-        self._waiting.append((topic, message))
+        self._waiting.append(command)
 
-    def begin(self) -> list[tuple[Topic, FleetMessage]]:
+    def begin(self) -> list[_Waiting]:
         """Start a new lease: the light is unknown; return what waited for it."""
         self._light = False
         waiting, self._waiting = self._waiting, []
         return waiting
 
-    def resume(self, waiting: list[tuple[Topic, FleetMessage]]) -> None:
+    def resume(self, waiting: list[_Waiting]) -> None:
         """Send what waited for the lease and is not late."""
-        for topic, message in waiting:
-            if not self._overdue(message):
-                self.send(topic, message)
+        for command in waiting:
+            if not self._overdue(command.message):
+                self._send(command)
 
     def clear(self) -> None:
         """Drop what waits."""
@@ -87,9 +105,9 @@ class CommandQueue:
             log.warning("%s: %s", self._who, error)
         self._writing = False
         while self._waiting and not self._writing and self._lease.held:
-            topic, message = self._waiting.pop(0)
-            if not self._overdue(message):
-                self.send(topic, message)
+            command = self._waiting.pop(0)
+            if not self._overdue(command.message):
+                self._send(command)
 
     def _overdue(self, message: FleetMessage) -> bool:
         """Return whether this is motion that waited until neutral had to come first."""

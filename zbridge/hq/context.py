@@ -35,7 +35,7 @@ class ListenerCounts(msgspec.Struct, frozen=True):
 class ListenerContext(msgspec.Struct, frozen=True):
     """One listener: its name on the bus, its protocol's side, the robot it shows, and what its parts report to.
 
-    clock: seconds on the event loop's time line.
+    clock: seconds on the event loop's time line. clock_ms: the raw clock, which dates commands.
     """
 
     name: str
@@ -49,6 +49,7 @@ class ListenerContext(msgspec.Struct, frozen=True):
     failures: FailureLog
     freeze: FreezeWatch
     clock: Callable[[], float]
+    clock_ms: Callable[[], float]
     limits: Limits
     """What is demanded of every client."""
 

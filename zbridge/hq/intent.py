@@ -10,6 +10,10 @@ The listener's operator calls :meth:`motion`, :meth:`neutral` and :meth:`choose`
 carry out the :class:`Action` they return. It calls :meth:`granted`, :meth:`lost`, :meth:`released` and :meth:`refused`
 for what became of the lease and of motion. Motion that is not repeated within ``deadman_s`` has ended; the robot's
 gateway has stopped the robot by then. The control mode stands: it is kept when the lease is not.
+
+After a silence of the program longer than ``deadman_s``, what comes may have waited in the network: an old neutral, and
+an old push behind it. So a neutral then counts only once :data:`RESTS_S` pass without motion. Until then it is passed
+on, as neutral of a part is, and what is owed stays owed.
 Source: the design's "Old HQ programs".
 """
 
@@ -27,6 +31,8 @@ EARLY_S = 0.3
 """Seconds by which a robot is released before its lease expires: an expiry would count as a loss."""
 TOGETHER_S = 0.1
 """A mode and motion sent this close together, by stream and by datagram, may arrive in either order; seconds."""
+RESTS_S = 0.3
+"""Seconds without motion after which a neutral counts that came after a silence: what waited comes at once."""
 _MODE_NONE = "control mode is none"
 
 
@@ -90,6 +96,10 @@ class Intent:
         self._moved_at = -math.inf
         self._used_at = -math.inf
         self._heard_at = -math.inf
+        self._waited = False
+        """Whether what comes may have waited in the network: there was a silence, and no neutral counted since."""
+        self._rests_at = math.inf
+        """When the neutral counts that came last after a silence, unless motion comes before."""
         self._modeless_at = -math.inf
 
     def __repr__(self) -> str:
@@ -113,7 +123,9 @@ class Intent:
     # What the program says
 
     def heard(self, now: float) -> None:
-        """Record that the program sent anything at all."""
+        """Record that the program sent anything at all. To be called before what it says is taken."""
+        if -math.inf < self._heard_at < now - self.deadman_s:
+            self._waited, self._rests_at = True, math.inf
         self._heard_at = now
 
     def motion(self, now: float, *, lasts: bool = True) -> Action:
@@ -122,6 +134,7 @@ class Intent:
         lasts: whether the program repeats this motion within the deadman.
         """
         self.expire(now)
+        self._rests_at = math.inf
         if self.mode == "none" and self.held_back is None:
             self.refused(_MODE_NONE)
             self._modeless_at = now
@@ -142,12 +155,18 @@ class Intent:
             return self._handle(Input.PART_NEUTRAL)
         if self.mode == "autonomous" and self.held_back is None and not self._moving:
             return Action.NOTHING
-        self.held_back, self._moving = None, False
+        self._moving = False
+        if self._waited:
+            self._rests_at = min(self._rests_at, now + RESTS_S)
+            return self._handle(Input.PART_NEUTRAL)
+        self.held_back = None
         return self._handle(_NEUTRAL)
 
     def choose(self, mode: str, now: float) -> Action:
         """Take a control mode; ``autonomous`` counts as motion, ``none`` releases the robot."""
         self.expire(now)
+        if mode == "autonomous":
+            self._rests_at = math.inf
         if mode != "none" and self.held_back == _MODE_NONE and now - self._modeless_at < TOGETHER_S:
             self.held_back = None  # the motion was sent after this, and arrived first
             self._handle(Input.LATE_MODE)
@@ -167,7 +186,7 @@ class Intent:
 
     def lost(self, why: str) -> None:
         """Record that the lease was refused or has ended; the program owes neutral."""
-        self.held_back, self._moving = why, False
+        self._hold_back(why)
         self._handle(Input.LOST)
 
     def released(self) -> None:
@@ -177,7 +196,7 @@ class Intent:
 
     def refused(self, why: str) -> None:
         """Record that motion was not carried out; the program owes neutral."""
-        self.held_back, self._moving = why, False
+        self._hold_back(why)
         self._handle(Input.REFUSED)
 
     def resume(self, mode: str, why: str) -> None:
@@ -187,9 +206,16 @@ class Intent:
     # Time
 
     def expire(self, now: float) -> None:
-        """End motion that was not repeated in time: the robot's gateway has stopped it."""
+        """End motion that was not repeated in time: the robot's gateway has stopped it.
+
+        Let a neutral count that came after a silence and was not followed by motion.
+        """
+        if now >= self._rests_at:
+            self._waited, self._rests_at = False, math.inf
+            self.held_back = None
+            self._handle(_NEUTRAL)
         if self._moving and now - self._moved_at >= self.deadman_s:
-            self.held_back, self._moving = "deadman", False
+            self._hold_back("deadman")
             self._handle(Input.DEADMAN)
 
     def wants_release(self, now: float) -> bool:
@@ -199,6 +225,10 @@ class Intent:
         """
         used_at = max(self._used_at, self._heard_at) if self.mode == "autonomous" else self._used_at
         return self.held and now - used_at >= self.lease_s - min(EARLY_S, self.lease_s / 4)
+
+    def _hold_back(self, why: str) -> None:
+        """Demand a neutral that is said from now on."""
+        self.held_back, self._moving, self._rests_at = why, False, math.inf
 
     def _handle(self, said: Input) -> Action:
         """Carry out the table; raise NeutralFirst if its action is to refuse. A missing pair changes nothing."""

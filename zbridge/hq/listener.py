@@ -13,6 +13,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from zbridge.control.clocks import raw_ms
 from zbridge.hq.admission import FULL, Admission
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.broadcast import Broadcast
@@ -44,7 +45,8 @@ class Listener:
     """Serves the clients of one ``[[hq]]`` until cancelled.
 
     name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
-    given: the listener as another process handed it over, and its sockets.
+    given: the listener as another process handed it over, and its sockets. clock_ms: the raw clock, which dates
+    commands.
     """
 
     def __init__(
@@ -56,8 +58,10 @@ class Listener:
         metrics: Metrics,
         clock: Callable[[], float] | None = None,
         given: tuple[Exported, Parcel] | None = None,
+        clock_ms: Callable[[], float] = raw_ms,
     ) -> None:
         self._given = given
+        self._clock_ms = clock_ms
         self.name = name
         self.address = plan.address
         self.ready = asyncio.Event()
@@ -130,6 +134,7 @@ class Listener:
             failures=FailureLog(self.name, counts.left_out),
             freeze=FreezeWatch(self._clock(), self._on_freeze),
             clock=self._clock,
+            clock_ms=self._clock_ms,
             limits=Limits(
                 frame_bytes=_FRAME_BYTES, handshake_s=plan.settings.handshake_s, rate_hz=plan.settings.rate_hz
             ),

@@ -39,7 +39,7 @@ class Operator:
 
     who: the client's name on the bus and its liveliness token. protocol: of the client; only robots of the same one are
     told a control mode, and only once the client has chosen one. is_motion: whether a command is motion, see
-    :meth:`zbridge.protocol.plugin.HqSide.is_motion`. clock: seconds.
+    :meth:`zbridge.protocol.plugin.HqSide.is_motion`. clock: seconds. clock_ms: the raw clock, which dates commands.
     """
 
     def __init__(
@@ -52,6 +52,7 @@ class Operator:
         is_motion: Callable[[Drive | Motor], bool],
         tell: Callable[[str], None],
         clock: Callable[[], float],
+        clock_ms: Callable[[], float],
     ) -> None:
         self.intent = intent
         self.who = who
@@ -62,7 +63,7 @@ class Operator:
         self._tell = tell
         self._clock = clock
         request = Acquire(who=who, deadman_s=intent.deadman_s, alive=who)
-        client = LeaseClient(bridge.keys, request, who.rpartition(".")[0], concerns=self._concerns)
+        client = LeaseClient(bridge.keys, request, who.rpartition(".")[0], concerns=self._concerns, clock_ms=clock_ms)
         self._lease = LeaseHolder(bridge.bus, client, spawn=bridge.spawn, on_event=self._on_lease, clock=clock)
         self._queue = CommandQueue(bridge, client, who=who, late=self._late)
         self._set: dict[str, tuple[Topic, FleetMessage]] = {}

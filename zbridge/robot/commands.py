@@ -8,6 +8,7 @@ from __future__ import annotations
 from zbridge.bus import Sample
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
+from zbridge.control.events import Sender
 from zbridge.control.gate import OF_THE_HOLDER, is_stop
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported
 from zbridge.fleet import payload as payloads
@@ -45,7 +46,8 @@ class Commands:
     def take(self, sample: Sample) -> None:
         """Carry out one command, or refuse it and show the refusal on ``control``."""
         self._taken.value += 1
-        who = None
+        self._enforcer.keep_time()
+        sender = None
         try:
             topic = self._topics.get(sample.key)
             if topic is None:
@@ -55,11 +57,12 @@ class Commands:
                 topic = self._find(sample.key)
             now = self._clock()
             if topic.message in OF_THE_HOLDER:
-                who = self._enforcer.admit(sample, now)
-            self._carry_out(topic, sample.payload, now, who)
+                sender = self._enforcer.admit(sample, now)
+            self._carry_out(topic, sample.payload, now, sender)
         except (Refused, PayloadError, EncodeError) as error:
             refused = error if isinstance(error, Refused) else Malformed(str(error))
-            self._enforcer.refuse(sample.key.rpartition("@cmd/")[2], refused, refused.who or who)
+            who = refused.who or (sender.who if sender is not None else None)
+            self._enforcer.refuse(sample.key.rpartition("@cmd/")[2], refused, who)
         self._enforcer.settle()
 
     def require_ready(self) -> Session[object]:
@@ -88,25 +91,28 @@ class Commands:
             raise Unsupported("no such command")
         return topic
 
-    def _carry_out(self, topic: Topic, payload: bytes, now: float, who: str | None) -> None:
+    def _carry_out(self, topic: Topic, payload: bytes, now: float, sender: Sender | None) -> None:
         if self._closing is not None:
             raise NotReady(self._closing, Code.CLOSING)
         command = payloads.decode(topic.message, payload)
-        if isinstance(command, _MOTIONS):
-            self._move(topic, command, now, who)
+        if sender is not None and isinstance(command, _MOTIONS):
+            self._move(topic, command, now, sender)
             return
         session = self.require_ready()
         self.require_flowing()
-        if isinstance(command, Raw) or (isinstance(command, Mode) and command.mode == "autonomous"):
+        if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
+            self._enforcer.require_fresh(sender)
             _require_sure(session)
             self._enforcer.require_motion()
-        self._show(topic, self._tell(topic, command, now), who)
+        self._show(topic, self._tell(topic, command, now), sender)
         self._enforcer.commanded(command)
         self._pump()
 
-    def _move(self, topic: Topic, command: Drive | Motor, now: float, who: str | None) -> None:
-        """Tell the robot to move, or to be at rest: the robot is written to before anything is accounted for."""
+    def _move(self, topic: Topic, command: Drive | Motor, now: float, sender: Sender) -> None:
+        """Tell the robot to move, or to stand: the robot is written to before anything is accounted for."""
         moving = command.moving
+        if moving:
+            self._enforcer.require_fresh(sender)
         try:
             session = self.require_ready()
             if moving:
@@ -122,9 +128,9 @@ class Commands:
         outcome = self._tell(topic, command, now)
         self._unwritten.value += self.blocked
         self._pump()
-        self._enforcer.moved(topic.path, command, now, moving=moving)
+        self._enforcer.moved(topic.path, command, now, sender, moving=moving)
         if outcome.telemetry or outcome.left_out:
-            self._show(topic, outcome, who)
+            self._show(topic, outcome, sender)
 
     def _tell(self, topic: Topic, command: FleetMessage, now: float) -> Outcome:
         """Tell the robot; refuse the command where the protocol's own code raises what it must not."""
@@ -138,11 +144,16 @@ class Commands:
             raise self._context.faults.refusal(topic.path, error) from error
         return outcome
 
-    def _show(self, topic: Topic, outcome: Outcome, who: str | None) -> None:
+    def _show(self, topic: Topic, outcome: Outcome, sender: Sender | None) -> None:
         for shown, message in outcome.telemetry:
             self._context.publish(shown, message)
         if outcome.left_out:
+            who = sender.who if sender is not None else None
             self._enforcer.refuse(topic.path.removeprefix("@cmd/"), Unsupported(outcome.left_out), who)
+
+
+def _is_autonomous(command: FleetMessage) -> bool:
+    return isinstance(command, Mode) and command.mode == "autonomous"
 
 
 def _require_sure(session: Session[object]) -> None:

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from zbridge.bus import Bus, Handle
+from zbridge.control import clocks
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
@@ -78,8 +79,14 @@ class Device:
         observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
+        raw_ms: Callable[[], float] = clocks.raw_ms,
+        suspended_s: Callable[[], float] = clocks.suspended_s,
     ) -> None:
-        """Begin. share: of the processor, where the process serves other robots too."""
+        """Begin. share: of the processor, where the process serves other robots too.
+
+        clock: seconds on the event loop's time line. clock_ns: Unix time. raw_ms, suspended_s: see
+        :mod:`zbridge.control.clocks`.
+        """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
         self._released = asyncio.Event()
@@ -91,7 +98,18 @@ class Device:
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
         self._context = context = RobotContext(
-            robot, keys, bus, metrics, conditions, Faults(keys.robot), publishers.publish, links.pump, clock, clock_ns
+            robot,
+            keys,
+            bus,
+            metrics,
+            conditions,
+            Faults(keys.robot),
+            publishers.publish,
+            links.pump,
+            clock,
+            clock_ns,
+            raw_ms,
+            suspended_s,
         )
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)

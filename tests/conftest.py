@@ -1,6 +1,7 @@
 """Marks by folder, and how hypothesis runs here: a machine that is busy with other tests is no failure."""
 
 import asyncio
+import itertools
 from collections.abc import Callable
 from fnmatch import fnmatch
 
@@ -8,8 +9,10 @@ import pytest
 import uvloop
 from hypothesis import HealthCheck, settings
 
+from tests import STATE
 from tests.clock import JumpingLoop
 
+_numbers = itertools.count()
 REAL = ("tests/e2e/*", "tests/gateways/*/conformance/*")
 """Where tests take real sockets and real time: scenes on Zenoh, and the judges against plain sockets."""
 
@@ -22,6 +25,12 @@ for profile, examples in PROFILES.items():
 
 def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("quick" if config.getoption("markexpr") == "not e2e" else "zbridge")
+
+
+@pytest.fixture(autouse=True)
+def _state_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no test find what another one's gateways kept."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(STATE / str(next(_numbers))))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

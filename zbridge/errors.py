@@ -6,6 +6,7 @@ ZbridgeError
 ├── PayloadError     a payload on the bus is not the message that its key announces
 ├── Refused          a command or query is not carried out
 │   ├── Held         ... because another program holds the lease                     held
+│   ├── Latched      ... because a latched stop is in force                          latched
 │   ├── LeaseLost    ... because there is no lease, or it has ended                  no_lease, lease_ended
 │   ├── NeutralFirst ... because a neutral must come before motion                   neutral_first
 │   ├── Stale        ... because it was given too long ago                           stale
@@ -51,6 +52,7 @@ class Code(StrEnum):
     RATE = "rate"
     CLOSING = "closing"
     STALE = "stale"
+    LATCHED = "latched"
 
 
 class ZbridgeError(Exception):
@@ -92,6 +94,12 @@ class Held(Refused):
     """Another program holds the lease; ``holder`` names it."""
 
     codes = (Code.HELD,)
+
+
+class Latched(Refused):
+    """A latched stop is in force; the text says whose, and why."""
+
+    codes = (Code.LATCHED,)
 
 
 class LeaseLost(Refused):

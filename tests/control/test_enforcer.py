@@ -8,6 +8,7 @@ import pytest
 
 from tests.client import Machine
 from tests.proofs import numbered
+from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
@@ -117,7 +118,7 @@ async def test_limits_refuse_what_comes_too_often_and_slow_what_grows_too_fast_f
 async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_is_folded() -> None:
     rig = Rig()
     rig.drive()
-    rig.enforcer.stop_commanded()
+    rig.enforcer.stop_commanded(Sample("fleet/r1/@cmd/stop", b""))
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
     assert rig.metrics.count("control", what="stopped").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]

@@ -79,6 +79,7 @@ COMMANDS: dict[str, tuple[str, dict[str, Any], bytes]] = {
 WORDS = {packet: word for word, (_, _, packet) in COMMANDS.items() if packet}
 FOREVER_S = 1e6
 """A lease that no test outlives."""
+_LISTS = ("refusals", "latches", "stops")
 NEED_A_LEASE = {"drive", "motor", "mode", "raw"}
 
 
@@ -251,8 +252,8 @@ class Rig:
 
     @property
     def control(self) -> dict[str, Any]:
-        """What ``control`` shows, without the refusals."""
-        return {name: value for name, value in self.last("control").items() if name != "refusals"}
+        """What ``control`` shows, without the refusals and what is said of stops."""
+        return {name: value for name, value in self.last("control").items() if name not in _LISTS}
 
     async def refused(self) -> list[tuple[str | None, str, str, int]]:
         """What ``control`` shows: who, command, reason, count."""

@@ -338,7 +338,7 @@ SCENES = {
         2 > stop x9-10
         bus_back neutral left >
         refused driver drive: the lease has ended (bus lost) x2
-        acquire left > left""",
+        1.0 acquire left > left""",
     "the loss of the bus ends the lease of a standing robot and sends it nothing": """
         bus_lost 1 >
         control stopped""",

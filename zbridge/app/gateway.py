@@ -32,6 +32,7 @@ from zbridge.bus.tls.member import own_name
 from zbridge.control.audit_log import Audit, AuditFile
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
+from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import Held, ZbridgeError, describe
 from zbridge.fleet import payload as payloads
@@ -207,6 +208,7 @@ class Gateway:
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         ownership, incoming = Ownership(bus, self._keys), self._incoming
+        self.restarts.latches = store = LatchStore(self._keys, self.conditions)
         self.restarts.claim = ClaimPart(ownership)
         try:
             bus.gather(self._keys.key("@rpc/**"))
@@ -214,9 +216,14 @@ class Gateway:
                 given = incoming.given
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
-                    device = self._make_device(bus, audit, plan)
+                    device = self._make_device(bus, audit, plan, store)
                     device.take_over(given.device, incoming.parcel)
-                    await self._serve_shown(bus, ownership, device, incoming.taken)
+
+                    async def begin(incoming: Incoming = incoming, device: Device = device) -> None:
+                        await incoming.taken()
+                        device.restore_latches(store.load())  # one that came last is only in the file
+
+                    await self._serve_shown(bus, ownership, device, begin)
                 elif not incoming.given.listeners:
                     await incoming.finish()
                 await incoming.begun.wait()
@@ -225,9 +232,10 @@ class Gateway:
                 await ownership.take()
                 if shown is not None:
                     shown.close()
-                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan))
+                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan, store))
         finally:
             ownership.release()
+            await asyncio.shield(store.flush())
 
     async def _serve_shown(
         self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
@@ -289,7 +297,7 @@ class Gateway:
 
         return tell
 
-    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan) -> Device:
+    def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> Device:
         near = self._neighbourhood
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
@@ -299,7 +307,9 @@ class Gateway:
             protocol=plan.protocol.name,
             keys=self._keys,
             bus=bus,
-            authority=Authority(control.lease_s, control.deadman_s, secrets.token_bytes, control.max_age_s),
+            authority=Authority(
+                control.lease_s, control.deadman_s, secrets.token_bytes, control.max_age_s, store.load()
+            ),
             limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
             manager=self.sessions,
             metrics=self.metrics,
@@ -310,6 +320,7 @@ class Gateway:
             connect=partial(connect, buffer=near.buffer) if near is not None else connect,
             observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
+            keep_latches=store.save,
         )
 
     @contextlib.contextmanager

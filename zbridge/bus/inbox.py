@@ -29,7 +29,7 @@ QUEUE = 4096
 """Items of one source that may wait in a lane; one more drops the oldest."""
 QUEUE_BYTES = 4 * 2**20
 """Bytes of one source's items that may wait in a lane; more drop the oldest."""
-SHARES = {Lane.STOP: 64, Lane.COMMAND: 128, Lane.OTHER: 64}
+SHARES = {Lane.STOP: 64, Lane.LATCH: 64, Lane.COMMAND: 128, Lane.OTHER: 64}
 """Items of each lane that one batch serves at most."""
 
 Handler = Callable[[Any], None]

@@ -140,11 +140,15 @@ Batch = Sequence[tuple[Publisher, list[bytes]]]
 
 
 class Lane(IntEnum):
-    """Where input waits for the event loop, in the order of service; each lane has a bound and a share of its own."""
+    """Where input waits for the event loop, in the order of service; each lane has a bound and a share of its own.
+
+    STOP: stops that are all the same: of a source only one waits. LATCH: stops that have an id; each is served.
+    """
 
     STOP = 0
-    COMMAND = 1
-    OTHER = 2
+    LATCH = 1
+    COMMAND = 2
+    OTHER = 3
 
 
 Look = Callable[[], bytes]

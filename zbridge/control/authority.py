@@ -6,7 +6,8 @@ nothing. An action that raises Refused has changed nothing, and the state stays.
 
 States. FREE and STOPPED: nobody has the lease (they differ in what people are shown). HELD: a program has the lease
 and no motion is commanded. MOVING: the last command for at least one part of the robot was motion; the deadman runs.
-HELD_BACK: a program has the lease and must send neutral before motion.
+HELD_BACK: a program has the lease and must send neutral before motion. LATCHED: a latched stop is in force; nobody has
+the lease, and nobody gets it.
 
 Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:`renew` and :meth:`release` for queries,
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
@@ -24,18 +25,21 @@ ago (:mod:`zbridge.control.command_age`) extends no lease and no motion, and all
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import ClassVar, TypeAlias
 
 from msgspec import UNSET
 
 from zbridge.control.command_age import MAX_AGE_S, CommandAge
 from zbridge.control.events import Event, EventKind, Input, Sender, State
+from zbridge.control.latch import STOPS, Latches, latch_of
 from zbridge.control.proof import Holder, Holders, Verifier
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.control.wishes import capped, name_of
-from zbridge.errors import Held, NeutralFirst, Refused
-from zbridge.fleet.messages import Acquire, Authorization, Control, Lease
+from zbridge.errors import Held, Latched, NeutralFirst, Refused
+from zbridge.fleet.messages import Acquire, Authorization, Control, FleetLatches, Latch, Lease, Stop
+from zbridge.protocol.kept import Exported
 
 Row: TypeAlias = dict[Input, tuple[Callable[..., Lease | None], State | None]]
 
@@ -45,11 +49,16 @@ class Authority:
 
     lease_s, deadman_s: the most a holder may ask for, and the default, in seconds.
     random: returns as many unguessable bytes as it is asked for.
-    max_age_s: commands that are later are stale, in seconds; 0: none is.
+    max_age_s: commands that are later are stale, in seconds; 0: none is. latches: those that are in force already.
     """
 
     def __init__(
-        self, lease_s: float, deadman_s: float, random: Callable[[int], bytes], max_age_s: float = MAX_AGE_S
+        self,
+        lease_s: float,
+        deadman_s: float,
+        random: Callable[[int], bytes],
+        max_age_s: float = MAX_AGE_S,
+        latches: Latches | None = None,
     ) -> None:
         self.lease_s = lease_s
         self.deadman_s = deadman_s
@@ -58,7 +67,10 @@ class Authority:
         """Whether the robot may have moved by itself since its last stop: without a deadman, but every stop ends it."""
         self.verifier: Verifier | None = None
         """Verifies proofs of the current lease; None while there is none. Read by other threads."""
-        self._state = State.FREE
+        self.latches = latches if latches is not None else Latches()
+        self._stops: deque[bytes] = deque(maxlen=STOPS)
+        """The ids of the last stops that had one."""
+        self._state = State.LATCHED if self.latches else State.FREE
         self._holders = Holders(random)
         self._autonomous = False
         """Whether the mode is autonomous; a stop and neutral end it."""
@@ -76,7 +88,7 @@ class Authority:
 
     @property
     def state(self) -> str:
-        """``free``, ``held`` or ``stopped``, as ``control`` shows it."""
+        """``free``, ``held``, ``stopped`` or ``latched``, as ``control`` shows it."""
         return _SHOWN.get(self._state, self._state.value)
 
     @property
@@ -179,6 +191,44 @@ class Authority:
         """Stop the robot and end the lease, whoever asks: nobody drives before acquiring anew."""
         self._handle(Input.STOP, reason, EventKind.STOPPED)
 
+    def take_stop(self, stop: Stop, *, fleet: bool) -> None:
+        """Stop the robot as somebody on the bus demands. fleet: all robots of the realm were sent this stop."""
+        if isinstance(stop.id, bytes):
+            self._stops.append(stop.id)
+        if stop.latch is True:
+            latch = latch_of(stop, fleet=fleet)
+            self.latches.add(latch)
+            if latch.id in self.latches:
+                self._latch(latch)
+                return
+        self.stop("stop")
+
+    def adopt(self, answers: Iterable[FleetLatches]) -> None:
+        """Take over the fleet's latched stops that other gateways know."""
+        for latch in self.latches.adopt(answers):
+            self._latch(latch)
+
+    def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
+        """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""
+        if self.latches.release(stop_id, fleet=fleet):
+            self._events.append(Event(EventKind.UNLATCHED, who))
+        if not self.latches:
+            self._handle(Input.UNLATCH)
+
+    def restore_latches(self, state: Exported) -> None:
+        """Take over the latched stops of another process, before this one serves the robot; raise ProtocolError."""
+        self.latches.restore(state)
+        if self.latches:
+            self._state = State.LATCHED
+
+    def _latch(self, latch: Latch) -> None:
+        self._handle(Input.LATCH, latch.reason or "stop", EventKind.LATCHED, latch.who)
+
+    @property
+    def stop_ids(self) -> frozenset[bytes]:
+        """The ids of the last stops: what repeats one of them changes nothing. Read by other threads."""
+        return frozenset(self._stops)
+
     def hold_back(self, reason: str, *, stops: bool = True) -> None:
         """Stop the robot, or (``stops=False``) record that it is at rest; motion needs a neutral first."""
         self._handle(Input.HOLD_BACK, reason, stops=stops)
@@ -229,6 +279,8 @@ class Authority:
             priority=holder.priority if holder else None,
             expires_in_s=self._expires_in_s(now),
             refusals=self._refusals.shown(),
+            latches=self.latches.in_force,
+            stops=tuple(self._stops),
         )
 
     def _handle(self, said: Input, *arguments: object, **options: object) -> Lease | None:
@@ -317,14 +369,26 @@ class Authority:
         self._still()
         self._held_back = reason
 
-    def _end(self, reason: str, kind: EventKind) -> None:
-        """End the lease, if there is one, and stop the robot: if it moves, or if that was asked for."""
-        stops = kind is EventKind.STOPPED or self.moving
+    def _end(self, reason: str, kind: EventKind, who: str | None = None) -> None:
+        """End the lease, if there is one, and stop the robot: if it moves, or if that was asked for.
+
+        who: of a latched stop, what its sender says.
+        """
+        stops = kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving
         holder, self.verifier = self._holders.end(reason), None
         self._still()
         self._held_back = None
         self._deadman_s = self.deadman_s
-        self._events.append(Event(kind, holder.who if holder else None, reason, stops=stops))
+        if kind is not EventKind.LATCHED:
+            who = holder.who if holder else None
+        self._events.append(Event(kind, who, reason, stops=stops))
+
+    def _refuse_latched(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
+        """Refuse the lease, and say who latched the robot."""
+        raise Latched(self.latches.described)
+
+    def _free(self) -> None:
+        """Do nothing: from now on the robot may be acquired."""
 
     def _still(self) -> None:
         self._moving.clear()
@@ -342,6 +406,7 @@ class Authority:
         Input.DEADMAN: (_hold_back, None),
         Input.HOLD_BACK: (_hold_back, None),
         Input.STOP: (_end, State.STOPPED),
+        Input.LATCH: (_end, State.LATCHED),
     }
     _HOLDER: ClassVar[Row] = {
         Input.ACQUIRE: (_deny, None),
@@ -353,6 +418,7 @@ class Authority:
         Input.STALE_NEUTRAL: (_rest_stale, State.HELD),
         Input.HOLD_BACK: (_hold_back, State.HELD_BACK),
         Input.STOP: (_end, State.STOPPED),
+        Input.LATCH: (_end, State.LATCHED),
         Input.EXPIRED: (_end, State.STOPPED),
         Input.HOLDER_LOST: (_end, State.STOPPED),
         Input.BUS_LOST: (_end, State.STOPPED),
@@ -367,6 +433,14 @@ class Authority:
             Input.MOTION: (_move, None),
             Input.STALE_NEUTRAL: (_rest_stale, None),
             Input.DEADMAN: (_hold_back, None),
+        },
+        State.LATCHED: _NOBODY
+        | {
+            Input.ACQUIRE: (_refuse_latched, None),
+            Input.TAKEOVER: (_refuse_latched, None),
+            Input.STOP: (_end, None),
+            Input.LATCH: (_end, None),
+            Input.UNLATCH: (_free, State.STOPPED),
         },
     }
     """What to do with an input, and the state after it; None: the state stays."""

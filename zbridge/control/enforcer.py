@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from zbridge.bus import Sample
 from zbridge.control.audit_log import Audit
@@ -22,11 +22,13 @@ from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.events import Event, EventKind, Sender
 from zbridge.control.gate import CommandGate, Sieve
+from zbridge.control.latch import Latches, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
 SUSPENDED_S = 0.1
@@ -36,7 +38,10 @@ _CONTROL_S = 0.05
 
 
 class Enforcer:
-    """Carries out the decisions of one robot's authority. limits: None where drives are not limited."""
+    """Carries out the decisions of one robot's authority.
+
+    limits: None where drives are not limited. keep: writes the latched stops down, so that they survive a restart.
+    """
 
     def __init__(
         self,
@@ -45,8 +50,10 @@ class Enforcer:
         standstill: Standstill,
         audit: Audit,
         limits: MotionLimits | None = None,
+        keep: Callable[[Latches], object] = lambda latches: None,
     ) -> None:
         self.authority = authority
+        self._keep = keep
         self.gate = CommandGate(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
         self._context = context
@@ -58,6 +65,7 @@ class Enforcer:
         self.settled: Callable[[], object] = lambda: None
         """Called after :meth:`settle`: whether the robot is driven may have changed."""
         self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
+        self._fleet_stop = KeySpace(context.keys.realm, "*").key(topics.CMD_STOP.path)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_at = math.inf
@@ -131,10 +139,16 @@ class Enforcer:
         self.authority.stop(reason)
         self.settle()
 
-    def stop_commanded(self) -> None:
+    def stop_commanded(self, sample: Sample) -> None:
         """Obey a stop from the bus, which anybody may send; the gate folds those that follow at once."""
-        self.stop("stop")
+        self.authority.take_stop(read_stop(sample.payload), fleet=sample.key == self._fleet_stop)
+        self.settle()
         self.gate.stopped()
+
+    def adopt(self, answers: Iterable[FleetLatches]) -> None:
+        """Take over the fleet's latched stops that other gateways know."""
+        self.authority.adopt(answers)
+        self.settle()
 
     def hold_back(self, reason: str, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
@@ -173,6 +187,7 @@ class Enforcer:
     def beat(self) -> None:
         """Publish ``control``, and write down what was folded. To be called once a second."""
         self._count_kept_back()
+        self._keep(self.authority.latches)
         self.report()
         self._audit.flush()
 
@@ -209,6 +224,8 @@ class Enforcer:
             self._context.metrics.count("control", what=event.what.value).value += 1
         if event.stops:
             self._send_stop()
+        if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
+            self._keep(self.authority.latches)
         self._audit.write(event)
 
     def _send_stop(self) -> None:

@@ -17,6 +17,7 @@ class State(StrEnum):
     MOVING = "moving"
     HELD_BACK = "held back"
     STOPPED = "stopped"
+    LATCHED = "latched"
 
 
 class Input(StrEnum):
@@ -33,6 +34,8 @@ class Input(StrEnum):
     DEADMAN = "deadman"
     HOLD_BACK = "hold back"
     STOP = "stop"
+    LATCH = "latch"
+    UNLATCH = "last latch released"
     EXPIRED = "lease expired"
     HOLDER_LOST = "holder lost"
     BUS_LOST = "bus lost"
@@ -46,6 +49,8 @@ class EventKind(Enum):
     RELEASED = "released"
     REFUSED = "refused"
     STOPPED = "stopped"
+    LATCHED = "latched"
+    UNLATCHED = "unlatched"
     ENDED = "ended"
 
 

@@ -10,7 +10,7 @@ little: a gate drops it before the event loop is woken.
 - All other input is limited in rate. What passes is refused by the event loop with reason and sender. The rest is
   counted by code and shown once a second.
 - A stop is never refused. A stop that follows another within :data:`SAME_STOP_S`, for a robot at rest without a
-  holder, changes nothing and is only counted.
+  holder, changes nothing and is only counted; one with an id of its own does, for ``control`` has to show the id.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 
 import msgspec
+from msgspec import UNSET
 
 from zbridge.bus import Lane, Look
 from zbridge.control.authority import Authority
+from zbridge.control.latch import read_stop
 from zbridge.control.proof import read
 from zbridge.errors import Code, LeaseLost, Malformed, Refused, TooFast
 from zbridge.fleet import topics
@@ -155,7 +157,7 @@ class CommandGate:
     def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
         kind = self._kinds.get(key) or self._find(key)
         if kind.stop:
-            return self._stop()
+            return self._stop(look() if size else b"")
         if size > kind.most_bytes:
             return self.sieve.lane(Code.MALFORMED)
         if kind.leased:
@@ -169,13 +171,15 @@ class CommandGate:
         """Note that a stop was carried out now; on the event loop's thread."""
         self._stopped_at = self._clock()
 
-    def _stop(self) -> Lane | None:
+    def _stop(self, payload: bytes) -> Lane | None:
         """Let a stop through unless it changes nothing. The holder is looked at last: a new one may come meanwhile."""
+        stop_id = read_stop(payload).id
+        known = stop_id is UNSET or stop_id in self._authority.stop_ids
         fresh = self._clock() - self._stopped_at < SAME_STOP_S
-        if fresh and not self._authority.moving and self._authority.verifier is None:
+        if known and fresh and not self._authority.moving and self._authority.verifier is None:
             self.same_stops += 1
             return None
-        return Lane.STOP
+        return Lane.STOP if stop_id is UNSET else Lane.LATCH
 
     def _find(self, key: str) -> _Kind:
         kind = self._read(key)

@@ -1,4 +1,4 @@
-"""Answers queries about the lease of one robot: acquire, takeover, renew, release, and what listeners refused.
+"""Answers queries about the lease of one robot: acquire, takeover, renew, release, unlatch, what listeners refused.
 
 Every kind of query has a gate on the bus's threads; the authority decides, the enforcer carries out.
 """
@@ -6,6 +6,7 @@ Every kind of query has a gate on the bus's threads; the authority decides, the 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from zbridge.bus import Handle, IncomingQuery
 from zbridge.control.context import RobotContext
@@ -16,7 +17,7 @@ from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, Too
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals
+from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals, Unlatch
 from zbridge.protocol.rate_limit import RateLimit
 
 TELLINGS_HZ = 20.0
@@ -28,7 +29,7 @@ _COUNTED = 1_000_000
 """Most refusals of one kind that a report counts."""
 _NAMED = 64
 """Characters of a wrong name that a refusal repeats."""
-_BY_NAME = ("acquire", "takeover", "refused")
+_BY_NAME = ("acquire", "takeover", "unlatch", "unlatch_fleet", "refused")
 """Queries whose key ends with the name of who asks. On a secure bus nobody can ask at another's key."""
 _ANYBODY = "*"
 
@@ -49,11 +50,15 @@ class LeaseServer:
             "takeover": NameGate(clock),
             "renew": QueryGate(authority, clock),
             "release": QueryGate(authority, clock),
+            "unlatch": NameGate(clock),
+            "unlatch_fleet": NameGate(clock),
             "refused": NameGate(clock),
         }
         for command, gate in self._gates.items():
             enforcer.watch_sieve(command, gate.sieve)
         self._closing: str | None = None
+        self._waits: str | None = None
+        """Why no lease is granted yet."""
         self._takeovers = RateLimit(TAKEOVERS_HZ)
         self._tellings = RateLimit(TELLINGS_HZ)
 
@@ -67,13 +72,20 @@ class LeaseServer:
             self._answer("takeover/*", self._take_over),
             self._answer("renew", self._renew),
             self._answer("release", self._release),
+            self._answer("unlatch/*", partial(self._unlatch, fleet=False)),
+            self._answer("unlatch_fleet/*", partial(self._unlatch, fleet=True)),
             self._answer("refused/*", self._take_told),
+            self._context.bus.answer(self._context.keys.key(topics.RPC_LATCH.path), self._tell_latches),
             self._context.bus.watch_alive(self._context.keys.alive(_ANYBODY), self._on_alive),
         ]
 
     def refuse_all(self, reason: str | None) -> None:
         """Give no lease from now on; None: give leases again."""
         self._closing = reason
+
+    def wait(self, reason: str | None) -> None:
+        """Grant no lease until the fleet's latched stops are known; None: they are."""
+        self._waits = reason
 
     def _answer(self, name: str, decide: Decide) -> Handle:
         """Answer one kind of query, or refuse it and show the refusal on ``control``."""
@@ -103,9 +115,11 @@ class LeaseServer:
             self._enforcer.settle()
 
     def _acquire(self, query: IncomingQuery) -> FleetMessage:
+        self._require_latches()
         return self._authority.acquire(_request(query), self._clock(), self._context.raw_ms())
 
     def _take_over(self, query: IncomingQuery) -> FleetMessage:
+        self._require_latches()
         request = _request(query)
         if not self._takeovers.take(self._clock()):
             raise TooFast(f"more than {TAKEOVERS_HZ:g} takeovers a second")
@@ -116,6 +130,19 @@ class LeaseServer:
 
     def _release(self, query: IncomingQuery) -> FleetMessage:
         return self._authority.release(read(query.payload), query.asked, self._clock())
+
+    def _require_latches(self) -> None:
+        if self._waits is not None:
+            raise NotReady(self._waits)
+
+    def _unlatch(self, query: IncomingQuery, *, fleet: bool) -> FleetMessage:
+        stop_id = payloads.decode(Unlatch, query.payload).id
+        name = topics.unescape(query.asked.rpartition("/")[2])
+        self._authority.unlatch(stop_id, name[:_NAMED], fleet=fleet)
+        return Query()
+
+    def _tell_latches(self, query: IncomingQuery) -> None:
+        query.answer(payloads.encode(self._authority.latches.fleet))
 
     def _take_told(self, query: IncomingQuery) -> FleetMessage:
         """Show what a listener refused its HQ programs.

@@ -26,7 +26,7 @@ class Standstill:
 
     authority: tells whether somebody drives the robot now, or told it to move by itself.
     idle_stop_s: seconds between two stops while nobody drives, fewer where the protocol says so; 0: only when motion
-    ends.
+    ends, and while a latched stop is in force.
     """
 
     def __init__(self, context: RobotContext, authority: Authority, idle_stop_s: float = IDLE_STOP_S) -> None:
@@ -51,8 +51,7 @@ class Standstill:
 
     def begin(self) -> None:
         """Send stops from now on whenever nobody drives."""
-        if self._idle_stop_s:
-            self._timer = self._loop.call_later(self._period_s(), self._on_time)
+        self._timer = self._loop.call_later(self._period_s(), self._on_time)
 
     def close(self) -> None:
         """Send nothing more."""
@@ -71,11 +70,12 @@ class Standstill:
 
     def _period_s(self) -> float:
         """Return the seconds between two stops while nobody drives."""
+        wanted_s = self._idle_stop_s or IDLE_STOP_S
         try:
-            return max(LEAST_IDLE_STOP_S, min(self._idle_stop_s, self._robot.idle_stop_s))
+            return max(LEAST_IDLE_STOP_S, min(wanted_s, self._robot.idle_stop_s))
         except Exception as error:
             self._faults.note("idle_stop_s", error)
-            return self._idle_stop_s
+            return wanted_s
 
     def _send(self, now: float, until: float) -> None:
         try:
@@ -99,7 +99,11 @@ class Standstill:
         session, now = self._robot.driving, self._clock()
         if session is None or session.state is not State.ESTABLISHED:
             self._conditions.set(_CONDITION, None)
-        elif not self._authority.driven and now >= self._repeated_until:
+        elif (
+            (self._idle_stop_s or self._authority.latches)
+            and not self._authority.driven
+            and now >= self._repeated_until
+        ):
             try:
                 self._send(now, now)
             except Refused:

@@ -16,6 +16,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 LeaseId = Annotated[bytes, msgspec.Meta(min_length=8, max_length=8)]
 Token = Annotated[bytes, msgspec.Meta(min_length=32, max_length=32)]
 Proof = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+StopId = Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
 GivenMs = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 TOLD = 16
 """Most different refusals in one report of a listener."""
@@ -197,15 +198,35 @@ class Refusal(msgspec.Struct, frozen=True, kw_only=True):
     by: str | None = None
 
 
-class Control(FleetMessage, frozen=True):
-    """Who drives, and what was refused lately. lease: the public id of the current lease."""
+class Latch(msgspec.Struct, frozen=True):
+    """A latched stop. who and reason are what its sender said. fleet: it was sent to all robots of the realm."""
 
-    state: Literal["free", "held", "stopped"]
+    id: StopId
+    who: str | None = None
+    reason: str | None = None
+    fleet: bool = False
+
+    @property
+    def described(self) -> str:
+        """For people: ``latched by ann (wet floor)``."""
+        by = f" by {self.who}" if self.who else ""
+        return f"latched{by}" + (f" ({self.reason})" if self.reason else "")
+
+
+class Control(FleetMessage, frozen=True):
+    """Who drives, and what was refused lately. lease: the public id of the current lease.
+
+    latches: the latched stops in force. stops: the ids of the last stops that had one.
+    """
+
+    state: Literal["free", "held", "stopped", "latched"]
     holder: str | None = None
     lease: bytes | None = None
     priority: int | None = None
     expires_in_s: float | None = None
     refusals: tuple[Refusal, ...] = ()
+    latches: tuple[Latch, ...] = ()
+    stops: tuple[bytes, ...] = ()
 
 
 class Refusals(FleetMessage, frozen=True):
@@ -246,7 +267,29 @@ class Mode(FleetMessage, frozen=True):
 
 
 class Stop(FleetMessage, frozen=True):
-    """Stop now. Anybody may send it."""
+    """Stop now. Anybody may send it.
+
+    id: ``control`` shows it once the stop was carried out. latch: nobody drives until this id is released. who, reason:
+    for people. What cannot be read is a stop without any of these.
+    """
+
+    latch: bool | UnsetType = UNSET
+    id: StopId | UnsetType = UNSET
+    who: str | UnsetType = UNSET
+    reason: str | UnsetType = UNSET
+
+
+class Unlatch(FleetMessage, frozen=True):
+    """Release one latched stop."""
+
+    id: StopId
+
+
+class FleetLatches(FleetMessage, frozen=True):
+    """What one gateway knows of the fleet's latched stops: those in force, and the ids released last."""
+
+    latches: tuple[Latch, ...] = ()
+    released: tuple[StopId, ...] = ()
 
 
 class SensorSetting(FleetMessage, frozen=True):

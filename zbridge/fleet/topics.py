@@ -38,6 +38,7 @@ from zbridge.fleet.messages import (
     Stop,
     Switch,
     Text,
+    Unlatch,
 )
 
 
@@ -212,6 +213,9 @@ RPC_TAKEOVER = _family("@rpc/control/takeover", Acquire, Delivery.QUERY, QUERY_B
 RPC_RENEW = Topic("@rpc/control/renew", Authorization, Delivery.QUERY, SMALL_BYTES)
 RPC_RELEASE = Topic("@rpc/control/release", Authorization, Delivery.QUERY, SMALL_BYTES)
 RPC_RESTART = _family("@rpc/restart", Query, Delivery.QUERY, QUERY_BYTES)
+RPC_UNLATCH = _family("@rpc/control/unlatch", Unlatch, Delivery.QUERY, SMALL_BYTES)
+RPC_UNLATCH_FLEET = _family("@rpc/control/unlatch_fleet", Unlatch, Delivery.QUERY, SMALL_BYTES)
+RPC_LATCH = Topic("@rpc/latch", Query, Delivery.QUERY, SMALL_BYTES)
 RPC_REFUSED = _family("@rpc/control/refused", Refusals, Delivery.QUERY, SETTING_BYTES)
 
 _TOPICS = {
@@ -220,7 +224,7 @@ _TOPICS = {
         *(SCAN, MOTION, POSE, TEXT, IMAGE, BATTERY),
         *(STATUS, CONTROL, SCANNER, MAP, LIDAR, CAMERA, DEVICES),
         *(CMD_DRIVE, CMD_STOP, CMD_MODE, CMD_LIGHT, CMD_LIDAR, CMD_CAMERA, CMD_TEXT, CMD_SCAN),
-        *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE),
+        *(RPC_MAP, RPC_POSE, RPC_RENEW, RPC_RELEASE, RPC_LATCH),
     )
 }
 _FAMILIES = {
@@ -232,6 +236,8 @@ _FAMILIES = {
     "@rpc/sessions": RPC_SESSIONS,
     "@rpc/control/acquire": RPC_ACQUIRE,
     "@rpc/control/takeover": RPC_TAKEOVER,
+    "@rpc/control/unlatch": RPC_UNLATCH,
+    "@rpc/control/unlatch_fleet": RPC_UNLATCH_FLEET,
     "@rpc/control/refused": RPC_REFUSED,
     "@rpc/restart": RPC_RESTART,
 }

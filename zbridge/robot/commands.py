@@ -52,7 +52,7 @@ class Commands:
             topic = self._topics.get(sample.key)
             if topic is None:
                 if is_stop(sample.key):  # of anybody, with any payload
-                    self._enforcer.stop_commanded()
+                    self._enforcer.stop_commanded(sample)
                     return
                 topic = self._find(sample.key)
             now = self._clock()

@@ -21,6 +21,7 @@ from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.faults import Faults
+from zbridge.control.latch import Latches
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
@@ -34,6 +35,7 @@ from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connect, Connection, Hooks, Links
+from zbridge.robot.fleet_latches import FleetLatchNews
 from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
@@ -81,11 +83,12 @@ class Device:
         clock_ns: Callable[[], int] = time.time_ns,
         raw_ms: Callable[[], float] = clocks.raw_ms,
         suspended_s: Callable[[], float] = clocks.suspended_s,
+        keep_latches: Callable[[Latches], object] = lambda latches: None,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 
         clock: seconds on the event loop's time line. clock_ns: Unix time. raw_ms, suspended_s: see
-        :mod:`zbridge.control.clocks`.
+        :mod:`zbridge.control.clocks`. keep_latches: writes the latched stops down.
         """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
@@ -113,9 +116,10 @@ class Device:
         )
         pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)
-        self._enforcer = Enforcer(context, authority, self._standstill, audit, limits)
+        self._enforcer = Enforcer(context, authority, self._standstill, audit, limits, keep_latches)
         self._enforcer.settled = self._observer.changed
         self._leases = LeaseServer(context, self._enforcer)
+        self._latch_news = FleetLatchNews(bus, keys, self._enforcer, self._leases)
         self._commands = Commands(context, self._enforcer)
         self._queries = Queries(context, self._commands, pending)
         self._telemetry = Telemetry(context, self._publishers, pending, links)
@@ -165,7 +169,7 @@ class Device:
         self._standstill.begin()
         self._observer.began(self)
         async with asyncio.TaskGroup() as tasks:
-            work = [tasks.create_task(self._beat())]
+            work = [tasks.create_task(self._beat()), tasks.create_task(self._latch_news.run())]
             work += [tasks.create_task(connection.run()) for connection in self._links]
             try:
                 await self._released.wait()
@@ -247,6 +251,8 @@ class Device:
     def _on_bus(self, connected: bool) -> None:
         if not connected:
             self._enforcer.bus_lost()
+        else:
+            self._latch_news.returned()
 
     async def _beat(self) -> None:
         while True:
@@ -288,7 +294,8 @@ class Device:
 
     def _describe(self, parcel: Parcel) -> Exported:
         links = [connection.hand_over(parcel) for connection in self._links]
-        return {"links": links, "robot": self._context.robot.export()}
+        latches = self._enforcer.authority.latches.export()
+        return {"links": links, "robot": self._context.robot.export(), "latches": latches}
 
     def keep(self, parcel: Parcel) -> Exported | None:
         """Describe what another process needs to go on if this one dies; None where it could not.
@@ -306,6 +313,7 @@ class Device:
 
     def take_over(self, given: Exported, parcel: Parcel) -> None:
         """Restore what another process handed over; raise ProtocolError. Call :meth:`run` with ``begin`` then."""
+        self._enforcer.authority.restore_latches(given["latches"])
         for connection, link in zip(self._links, given["links"], strict=True):
             connection.take_over(link, parcel)
         self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
@@ -318,6 +326,10 @@ class Device:
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
                     self._standstill.stop()
+
+    def restore_latches(self, latches: Latches) -> None:
+        """Take over latched stops that were written down, before the robot is served."""
+        self._enforcer.authority.restore_latches(latches.export())
 
     async def go_on(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""

@@ -19,6 +19,7 @@ from zbridge.app.handover.outgoing import Outgoing, Part
 from zbridge.app.handover.successor import Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.gate import NameGate
+from zbridge.control.latch_store import LatchStore
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -42,6 +43,7 @@ class Restarts:
         self.listeners: Sequence[Part] = ()
         self.device: Device | None = None
         self.claim: ClaimPart | None = None
+        self.latches: LatchStore | None = None
         self.metrics_sockets: list[socket.socket] = []
         self.gone = asyncio.Event()
         """Set when a successor serves everything: the gateway ends."""
@@ -108,6 +110,8 @@ class Restarts:
             log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
 
     async def _drain(self) -> None:
+        if self.latches is not None:
+            await self.latches.flush()  # the successor reads them
         if self.bus is not None and self.claim is not None:
             await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 

@@ -77,7 +77,7 @@ def sorted_callback(sort: Sort, source: Source) -> Callable[[zenoh.Sample], None
         key = str(sample.key_expr)
         lane = sort(key, shown, size, payload.to_bytes)
         if lane is Lane.STOP:
-            source.fold(Sample(key, b"", shown), lane)  # its payload says nothing
+            source.fold(Sample(key, b"", shown), lane)  # all stops of this lane are the same
         elif lane is not None:
             source.put(Sample(key, payload.to_bytes(), shown), lane, size)
 

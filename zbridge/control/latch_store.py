@@ -1,0 +1,155 @@
+"""Keeps the latched stops of one robot on disk: a gateway that starts reads them before it serves its robot.
+
+A gateway that owns its robot writes ``<realm>@<robot>.latches``. One that waits for another gateway writes what that
+one says to ``<realm>@<robot>.standby.latches``: both may run on one machine, and neither may overwrite what the other
+knows. A file that cannot be read means latched: nobody knows what stood in it.
+Source: the design's "Latched stop".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+
+from zbridge.control.conditions import Conditions
+from zbridge.control.latch import Latches, LatchRecord
+from zbridge.fleet.messages import Latch
+from zbridge.fleet.topics import KeySpace
+
+log = logging.getLogger("zbridge.control.latch")
+
+MOST_BYTES = 64 * 1024
+"""A larger file was not written by a gateway."""
+FLUSH_S = 1.0
+"""Longest wait for a disk."""
+_CONDITION = "latch file"
+_OWN, _STANDBY = "latches", "standby.latches"
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(LatchRecord).decode
+
+
+def state_folder(environment: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder for what must survive a restart: systemd's, else the user's."""
+    if given := environment.get("STATE_DIRECTORY", "").partition(":")[0]:
+        return Path(given)
+    if home := environment.get("XDG_STATE_HOME"):
+        return Path(home) / "zbridge"
+    return Path(environment.get("HOME") or "/") / ".local" / "state" / "zbridge"
+
+
+class LatchStore:
+    """The files of one robot. conditions: show on ``status`` that nothing can be kept."""
+
+    def __init__(self, keys: KeySpace, conditions: Conditions, folder: Path | None = None) -> None:
+        folder = folder if folder is not None else state_folder()
+        self._own, self._standby = (folder / f"{keys.realm}@{keys.robot}.{kind}" for kind in (_OWN, _STANDBY))
+        self._conditions = conditions
+        self._written: dict[Path, LatchRecord] = {}
+        """What is on disk, or on its way there."""
+        self._waiting: dict[Path, LatchRecord] = {}
+        self._writing: asyncio.Task[None] | None = None
+
+    def __repr__(self) -> str:
+        return f"<LatchStore {self._own}>"
+
+    def load(self) -> Latches:
+        """Read what is in force; from a file that cannot be read a latch without an end but its own release."""
+        record = self._read(self._own)
+        latches = Latches(record)
+        if record is not None:
+            self._written[self._own] = record
+        standby = self._read(self._standby)
+        if standby is not None:
+            self._written[self._standby] = standby
+            latches.merge(standby.latches)
+        return latches
+
+    def save(self, latches: Latches) -> None:
+        """Write what is in force, on a thread; the newest counts. Call it again to try again."""
+        self._put(self._own, latches.record)
+        if self._standby in self._written:  # it is in the own file now
+            self._put(self._standby, LatchRecord())
+
+    def mirror(self, latches: Sequence[Latch]) -> None:
+        """Write what the gateway that owns the robot says, on a thread."""
+        self._put(self._standby, LatchRecord(tuple(latches)))
+
+    async def flush(self) -> None:
+        """Wait until everything is written, or could not be, for at most :data:`FLUSH_S`."""
+        if self._writing is not None:
+            await asyncio.wait([self._writing], timeout=FLUSH_S)
+
+    # Reading
+
+    def _read(self, path: Path) -> LatchRecord | None:
+        """Read one file; None where there is none."""
+        try:
+            with path.open("rb") as file:
+                data = file.read(MOST_BYTES + 1)
+            if len(data) > MOST_BYTES:
+                raise ValueError(f"more than {MOST_BYTES} bytes")
+            return _decode(data)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, msgspec.MsgspecError) as error:
+            reason = f"{path} cannot be read: {error}"
+            log.error("%s: the robot is latched", reason)
+            return LatchRecord((Latch(os.urandom(16), "gateway", reason),))
+
+    # Writing
+
+    def _put(self, path: Path, record: LatchRecord) -> None:
+        if self._written.get(path, LatchRecord()) == record:
+            return
+        self._written[path] = self._waiting[path] = record
+        if self._writing is None:
+            self._writing = asyncio.ensure_future(self._write_all())
+
+    async def _write_all(self) -> None:
+        try:
+            while self._waiting:
+                path = next(iter(self._waiting))
+                record = self._waiting.pop(path)
+                try:
+                    await asyncio.to_thread(_write, path, _encode(record))
+                except OSError as error:
+                    self._fail(path, error)
+                else:
+                    self._conditions.set(_CONDITION, None)
+        finally:
+            self._writing = None
+
+    def _fail(self, path: Path, error: OSError) -> None:
+        self._written.pop(path, None)  # so that it is tried again
+        text = f"latched stops do not survive a restart: {path}: {error.strerror or error}"
+        if text not in self._conditions.texts:
+            log.error("%s", text)
+        self._conditions.set(_CONDITION, text)
+
+
+def _write(path: Path, data: bytes) -> None:
+    """Replace a file such that it is whole at any moment, after a loss of power too; raise OSError."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")  # mode 0600
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(name)
+        raise
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

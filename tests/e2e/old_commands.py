@@ -23,7 +23,8 @@ import zbridge
 from tests.e2e.conftest import until
 from tests.e2e.loss import Scene, query
 from tests.e2e.processes import Finding, go_apart, module, report
-from zbridge.errors import LeaseLost, Refused
+from zbridge.client.driver import Driver
+from zbridge.errors import Refused
 
 CUTS_S = (1.0, 2.3, 4.0)
 SILENT_S = 0.5
@@ -117,23 +118,25 @@ async def be_driver(endpoint: str) -> None:
     words = asyncio.Queue[str]()
     loop = asyncio.get_running_loop()
     loop.add_reader(sys.stdin, lambda: words.put_nowait(sys.stdin.readline().strip()))
-    async with (
-        zbridge.connect(endpoints=[endpoint]) as fleet,
-        fleet["r1"].control("driver", deadman_s=DEADMAN_S, lease_s=60.0, wait_s=20.0) as drive,
-    ):
-        print("holds", flush=True)
-        does, tick = "silent", 0
-        while True:
-            with contextlib.suppress(asyncio.QueueEmpty):
-                does, tick = words.get_nowait(), 0
-            tick += 1
-            if does != "silent":
-                neutral = tick == 1 or (does == "wave" and tick % 10 == 0)
-                with contextlib.suppress(Refused):
-                    await drive(forward=0.0 if neutral else 0.5)
-                if drive.loss is not None:
-                    raise LeaseLost(str(drive.loss))
-            await asyncio.sleep(RATE_S)
+    async with zbridge.connect(endpoints=[endpoint]) as fleet:
+        while True:  # a renewal may have been lost three times in a row
+            async with fleet["r1"].control("driver", deadman_s=DEADMAN_S, lease_s=60.0, wait_s=20.0) as drive:
+                print("holds", flush=True)
+                await _drive(drive, words)
+
+
+async def _drive(drive: Driver, words: asyncio.Queue[str]) -> None:
+    """Obey until the lease is lost."""
+    does, tick = "silent", 0
+    while not drive.lost.is_set():
+        with contextlib.suppress(asyncio.QueueEmpty):
+            does, tick = words.get_nowait(), 0
+        tick += 1
+        if does != "silent":
+            neutral = tick == 1 or (does == "wave" and tick % 10 == 0)
+            with contextlib.suppress(Refused):
+                await drive(forward=0.0 if neutral else 0.5)
+        await asyncio.sleep(RATE_S)
 
 
 def main() -> None:

@@ -22,12 +22,14 @@ import zbridge.client
 from zbridge.bus import Tls
 from zbridge.client import driver, feed
 from zbridge.client import fleet as fleets
-from zbridge.errors import BusError, LeaseLost, Refused
+from zbridge.client.stops import Outcome
+from zbridge.errors import BusError, LeaseLost
 from zbridge.fleet.messages import (
     Control,
     Devices,
     FleetMessage,
     Image,
+    Latch,
     Map,
     Motion,
     Pose,
@@ -115,9 +117,17 @@ class Fleet:
         """Return the session tables by robot and process; see :meth:`zbridge.client.fleet.Fleet.sessions`."""
         return self._loop.run(self._fleet.sessions())
 
-    def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
+    def stop(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
         """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed."""
-        return self._loop.run(self._fleet.stop(names))
+        return self._loop.run(self._fleet.stop(names, reason))
+
+    def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
+        """Stop them, and let nobody drive them before they are released."""
+        return self._loop.run(self._fleet.latch(names, reason))
+
+    def unlatch(self) -> dict[str, Outcome]:
+        """Release the latched stops of the whole fleet; return for each robot the error, None if it was released."""
+        return self._loop.run(self._fleet.unlatch())
 
 
 class Feed(Generic[T]):
@@ -221,9 +231,17 @@ class Robot:
         """Ask the robot for its map now."""
         return self._loop.run(self._robot.ask_map())
 
-    def stop(self) -> None:
+    def stop(self, reason: str | None = None) -> None:
         """Stop the robot and end any lease; return when its gateway has confirmed the stop."""
-        self._loop.run(self._robot.stop())
+        self._loop.run(self._robot.stop(reason))
+
+    def latch(self, reason: str | None = None) -> None:
+        """Stop the robot, and let nobody drive it before it is released."""
+        self._loop.run(self._robot.latch(reason))
+
+    def unlatch(self) -> tuple[Latch, ...]:
+        """Release the latched stops of this robot; return those that were in force."""
+        return self._loop.run(self._robot.unlatch())
 
     def set_light(self, on: bool) -> None:
         """Turn the light on or off."""

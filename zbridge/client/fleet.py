@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import itertools
 from collections.abc import AsyncIterator, Iterable
 from typing import Any
 
 from zbridge.bus import Bus, Sample
+from zbridge.client import stops
 from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.settled import settled
-from zbridge.errors import BusError, Malformed, NotReady, PayloadError, Refused, refusal
+from zbridge.client.stops import Outcome
+from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import (
@@ -21,36 +22,29 @@ from zbridge.fleet.messages import (
     Devices,
     FleetMessage,
     Image,
+    Latch,
     Map,
     Motion,
     Pose,
     Query,
     Raw,
     Reading,
-    Refusal,
     Scan,
     Scanner,
     SensorSetting,
     SessionEntry,
     Sessions,
     Status,
-    Stop,
     Switch,
     Text,
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
 
-STOPPED_AT_ONCE = 64
-"""Robots whose confirmation of a stop is waited for at a time."""
-CONFIRM_S = 2.0
-"""Longest wait for the confirmation of a stop, seconds."""
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
 _attempts = itertools.count(1)
 """Numbers the wishes for a lease. Each has a liveliness token of its own: a gateway may hear of the end of the token of
 an earlier wish only after it has granted a later one, which must not end for it."""
-_STOP_EVERY_S = 0.05
-_ASK_S = 0.3
 
 
 class Fleet:
@@ -120,29 +114,37 @@ class Fleet:
                     tables[split[1], who] = payloads.decode(Sessions, answer.payload).sessions
         return tables
 
-    async def stop(self, names: Iterable[str] | None = None) -> dict[str, Refused | BusError | None]:
+    async def stop(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
         """Stop these robots, or all that have a gateway; return for each the error, None if the stop was confirmed.
 
         All are stopped by one message at once, before each is stopped, and asked for its confirmation, by name.
         """
-        if names is None:
-            everybody = KeySpace(self.realm, "*").key(topics.CMD_STOP.path)
-            with contextlib.closing(self._bus.publisher(everybody, topics.CMD_STOP)) as stop:
-                stop.put(payloads.encode(Stop()))
-                with contextlib.suppress(BusError):
-                    await self._bus.flush()
-            names = filter(is_name, await settled(self._gateways, lambda seen: seen))
-        names = [names] if isinstance(names, str) else sorted(names)
-        room = asyncio.Semaphore(STOPPED_AT_ONCE)
-        return dict(zip(names, await asyncio.gather(*(self._stop_one(name, room) for name in names)), strict=True))
+        return await self._stop(names, reason, latch=False)
 
-    async def _stop_one(self, name: str, room: asyncio.Semaphore) -> Refused | BusError | None:
-        async with room:
-            try:
-                await self[name].stop()
-            except (Refused, BusError) as error:
-                return error
-            return None
+    async def latch(self, names: Iterable[str] | None = None, reason: str | None = None) -> dict[str, Outcome]:
+        """Stop them as :meth:`stop` does, and let nobody drive them before they are released.
+
+        The stop of all robots is one of the whole fleet: gateways that come later learn of it, and :meth:`unlatch`
+        releases it. Robots that are named are released each by :meth:`Robot.unlatch`.
+        """
+        return await self._stop(names, reason, latch=True)
+
+    async def unlatch(self) -> dict[str, Outcome]:
+        """Release the latched stops of the whole fleet; return for each robot the error, None if it was released."""
+        names = filter(is_name, await settled(self._gateways, lambda seen: seen))
+        return await stops.unlatch_fleet(self._bus, self.realm, names, self._own)
+
+    async def _stop(self, names: Iterable[str] | None, reason: str | None, *, latch: bool) -> dict[str, Outcome]:
+        stop = stops.new_stop(self._own, reason, latch=latch)
+        if names is None:
+            await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
+            names = filter(is_name, await settled(self._gateways, lambda seen: seen))
+        names = [names] if isinstance(names, str) else names
+        return await stops.stop_robots(self._bus, self.realm, names, stop)
+
+    @property
+    def _own(self) -> str:
+        return self.name or default_who()
 
 
 class ControlFeed(StateFeed[Control]):
@@ -204,6 +206,7 @@ class Robot:
 
     def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
         self.name = keys.robot
+        self._own = own or default_who()
         self._bus = bus
         self._keys = keys
         self.scan: Feed[Scan] = self._feed(topics.SCAN)
@@ -253,27 +256,23 @@ class Robot:
 
     # Commands that need no lease
 
-    async def stop(self) -> None:
+    async def stop(self, reason: str | None = None) -> None:
         """Stop the robot and end any lease; return when its gateway has confirmed the stop.
 
-        Raises BusError if no gateway does within 2 s, Refused if the robot cannot be stopped or reached.
+        Raises BusError if no gateway does within 3 s, Refused if the robot cannot be stopped or reached.
         """
-        await self._put(topics.CMD_STOP, Stop())  # before anything that may take time
-        try:
-            refused = _stops_refused(await self.control.last(_ASK_S))
-        except (BusError, PayloadError):
-            refused = 0
-        control = await self._stop_until_shown()
-        if _stops_refused(control) > refused:
-            stop = _refused_stops(control)[0]
-            raise refusal(stop.code, f"{self.name}: cannot be stopped: {stop.reason}")
-        try:
-            status = await self.status.last()
-        except PayloadError as error:
-            raise NotReady(f"{self.name}: stop taken, but the robot's status cannot be read: {error}") from error
-        if status is not None and status.state != "established":
-            why = status.reason or "no reason known"
-            raise NotReady(f"{self.name}: stop taken, but the robot is {status.state}: {why}")
+        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=False))
+
+    async def latch(self, reason: str | None = None) -> None:
+        """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
+        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=True))
+
+    async def unlatch(self) -> tuple[Latch, ...]:
+        """Release the latched stops of this robot; return those that were in force.
+
+        Raises BusError if no gateway answers, Refused as the gateway did; Unsupported where the whole fleet is latched.
+        """
+        return await stops.unlatch_robot(self._bus, self._keys, self._own)
 
     async def set_light(self, on: bool) -> None:
         """Turn the light on or off."""
@@ -317,33 +316,3 @@ class Robot:
                 raise BusError(f"{self.name}: {answer.error}")
             return payloads.decode(message, answer.payload)
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
-
-    async def _stop_until_shown(self) -> Control:
-        """Repeat the stop until ``control`` shows it; raise BusError if that takes too long."""
-        shown: asyncio.Future[Control] = asyncio.get_running_loop().create_future()
-
-        def look(sample: Sample) -> None:
-            with contextlib.suppress(PayloadError):
-                control = payloads.decode(Control, sample.payload)
-                if control.state == "stopped" and not shown.done():
-                    shown.set_result(control)
-
-        with (
-            contextlib.closing(self._bus.subscribe(self.control.key_expr, look)),
-            contextlib.closing(self._bus.publisher(self._keys.key(topics.CMD_STOP.path), topics.CMD_STOP)) as stop,
-        ):
-            for _ in range(int(CONFIRM_S / _STOP_EVERY_S)):
-                stop.put(payloads.encode(Stop()))
-                done, _ = await asyncio.wait((shown,), timeout=_STOP_EVERY_S)
-                if done:
-                    return shown.result()
-        raise BusError(f"{self.name}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
-
-
-def _refused_stops(control: Control) -> list[Refusal]:
-    """Return the refusals of stops by the robot's gateway."""
-    return [refusal for refusal in control.refusals if refusal.command == "stop" and refusal.by is None]
-
-
-def _stops_refused(control: Control | None) -> int:
-    return sum(refusal.count for refusal in _refused_stops(control)) if control is not None else 0

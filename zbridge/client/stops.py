@@ -1,0 +1,212 @@
+"""Stops robots, latches them, and releases them: what is reported is what their gateways confirmed.
+
+A stop has an id of its own, and is repeated until ``control`` shows that id: whatever the network loses or holds up, a
+robot whose gateway carried the stop out is told from one whose gateway did not. A robot's latched stop is released by
+its id; a stop of the whole fleet has one id for all robots.
+Source: the design's "Latched stop".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable, Iterable
+
+import msgspec
+
+from zbridge.bus import Bus, Sample
+from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
+from zbridge.fleet import payload as payloads
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
+from zbridge.fleet.topics import KeySpace, Topic
+
+REPEAT_S = 0.25
+"""Seconds between two repetitions of a stop that is not confirmed."""
+CONFIRM_S = 3.0
+"""Longest wait for the confirmation of a stop."""
+ANSWER_S = 2.0
+"""Longest wait for the answer to a release."""
+AT_ONCE = 64
+"""Robots whose confirmation is waited for at a time."""
+_ASK_S = 0.3
+_APART_S = 0.1
+"""Seconds after which a repeated stop is no repetition for a gateway."""
+_WHO, _REASON = 64, 100
+"""Characters that fit the bound of a stop, with room for others than ASCII."""
+
+Outcome = Refused | BusError | None
+"""What came of a robot: None if it was confirmed."""
+
+
+def new_stop(who: str, reason: str | None, *, latch: bool) -> Stop:
+    """Make a stop with an id of its own. who, reason: for people, cut to what a stop can carry."""
+    stop = Stop(id=os.urandom(16), who=_cut(who, _WHO))
+    if latch:
+        stop = msgspec.structs.replace(stop, latch=True)
+    return msgspec.structs.replace(stop, reason=_cut(reason, _REASON)) if reason else stop
+
+
+async def put_stop(bus: Bus, keys: KeySpace, stop: Stop) -> None:
+    """Send a stop once. keys: of a robot, or of all (``*``)."""
+    with contextlib.closing(bus.publisher(keys.key(topics.CMD_STOP.path), topics.CMD_STOP)) as publisher:
+        publisher.put(payloads.encode(stop))
+        with contextlib.suppress(BusError):
+            await bus.flush()
+
+
+async def stop_robot(bus: Bus, keys: KeySpace, stop: Stop) -> None:
+    """Stop a robot and return when its gateway has confirmed it.
+
+    Raises BusError if no gateway does within CONFIRM_S, Refused if the robot cannot be stopped, NotReady if its gateway
+    has no connection to it.
+    """
+    await put_stop(bus, keys, stop)  # before anything that may take time
+    control = await _shown(bus, keys, stop, lambda control: stop.id in control.stops, CONFIRM_S)
+    if control is None:
+        raise BusError(f"{keys.robot}: stop sent, but no gateway confirmed it within {CONFIRM_S:g} s")
+    if count := _stops_refused(control):  # of this stop, or of one long ago: the next one tells
+        await asyncio.sleep(_APART_S)
+        control = await _shown(bus, keys, stop, lambda control: _stops_refused(control) > count, REPEAT_S)
+    if control is not None and count:
+        refused = _refused_stops(control)[-1]
+        raise refusal(refused.code, f"{keys.robot}: cannot be stopped: {refused.reason}")
+    try:
+        status = await _last(bus, keys, topics.STATUS, Status, broken=True)
+    except PayloadError as error:
+        raise NotReady(f"{keys.robot}: stop taken, but the robot's status cannot be read: {error}") from error
+    if isinstance(status, Status) and status.state != "established":
+        why = status.reason or "no reason known"
+        raise NotReady(f"{keys.robot}: stop taken, but the robot is {status.state}: {why}")
+
+
+async def stop_robots(bus: Bus, realm: str, names: Iterable[str], stop: Stop) -> dict[str, Outcome]:
+    """Stop robots, so many at a time; return for each what came of it."""
+    room = asyncio.Semaphore(AT_ONCE)
+
+    async def one(name: str) -> Outcome:
+        async with room:
+            try:
+                await stop_robot(bus, KeySpace(realm, name), stop)
+            except (Refused, BusError) as error:
+                return error
+            return None
+
+    names = sorted(set(names))
+    return dict(zip(names, await asyncio.gather(*map(one, names)), strict=True))
+
+
+async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...]:
+    """Release the latched stops of one robot alone, as ``name``; return those that were released.
+
+    Raises BusError if no gateway answers, Refused as the gateway did; where only stops of the whole fleet are in force,
+    its refusal says so.
+    """
+    latches = await _latches(bus, keys)
+    own = tuple(latch for latch in latches if not latch.fleet) or latches
+    for latch in own:
+        await _release(bus, keys, topics.RPC_UNLATCH(name), latch.id)
+    return own
+
+
+async def unlatch_fleet(bus: Bus, realm: str, names: Iterable[str], name: str) -> dict[str, Outcome]:
+    """Release the latched stops of the whole fleet at these robots, as ``name``; return for each what came of it.
+
+    A robot that was not reached by a stop of all may have been sent it by its own name: that is released, too. Robots
+    that do not know a released id are told of it, for they may hear of the stop later.
+    """
+    names, latches = sorted(names), dict[str, tuple[Latch, ...]]()
+    outcomes = dict[str, Outcome].fromkeys(names)
+    for robot in names:
+        try:
+            latches[robot] = await _latches(bus, KeySpace(realm, robot))
+        except BusError as error:
+            outcomes[robot] = error
+    ids = {latch.id for known in latches.values() for latch in known if latch.fleet}
+    for robot, known in latches.items():
+        alone = {latch.id for latch in known if not latch.fleet}
+        try:
+            for stop_id in sorted(ids):
+                family = topics.RPC_UNLATCH if stop_id in alone else topics.RPC_UNLATCH_FLEET
+                await _release(bus, KeySpace(realm, robot), family(name), stop_id)
+        except (Refused, BusError) as error:
+            outcomes[robot] = error
+    return outcomes
+
+
+async def _latches(bus: Bus, keys: KeySpace) -> tuple[Latch, ...]:
+    control = await _last(bus, keys, topics.CONTROL, Control, timeout_s=ANSWER_S)
+    if not isinstance(control, Control):
+        raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s")
+    return control.latches
+
+
+async def _release(bus: Bus, keys: KeySpace, topic: Topic, stop_id: bytes) -> None:
+    question = payloads.encode(Unlatch(id=stop_id))
+    for answer in await bus.ask(keys.key(topic.path), question, timeout_s=ANSWER_S):
+        if isinstance(answer.error, Refused):
+            raise refusal(answer.error.code, f"{keys.robot}: {answer.error}")
+        if answer.error is None:
+            return
+    raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s, or the router's rules forbid it")
+
+
+async def _shown(
+    bus: Bus, keys: KeySpace, stop: Stop, shows: Callable[[Control], bool], within_s: float
+) -> Control | None:
+    """Repeat a stop until ``control`` shows something; return that, None if it does not within this time."""
+    loop = asyncio.get_running_loop()
+    shown: asyncio.Future[Control] = loop.create_future()
+
+    def look(sample: Sample) -> None:
+        with contextlib.suppress(PayloadError):
+            control = payloads.decode(Control, sample.payload)
+            if shows(control) and not shown.done():
+                shown.set_result(control)
+
+    publisher = bus.publisher(keys.key(topics.CMD_STOP.path), topics.CMD_STOP)
+    with (
+        contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), look, history=True)),
+        contextlib.closing(publisher),
+    ):
+        ends_at = loop.time() + within_s
+        while not shown.done() and loop.time() < ends_at:
+            publisher.put(payloads.encode(stop))
+            await asyncio.wait((shown,), timeout=REPEAT_S)
+    return shown.result() if shown.done() else None
+
+
+async def _last(
+    bus: Bus,
+    keys: KeySpace,
+    topic: Topic,
+    kind: type[Control] | type[Status],
+    *,
+    timeout_s: float = _ASK_S,
+    broken: bool = False,
+) -> Control | Status | None:
+    """Return the last value of a state; None if there is none. broken: raise PayloadError for one that is none."""
+    with contextlib.suppress(BusError):
+        for answer in await bus.ask(keys.key(topic.path), timeout_s=timeout_s):
+            try:
+                if answer.error is None:
+                    return payloads.decode(kind, answer.payload)
+            except PayloadError:
+                if broken:
+                    raise
+    return None
+
+
+def _refused_stops(control: Control) -> list[Refusal]:
+    """Return the refusals of stops by the robot's gateway."""
+    return [refusal for refusal in control.refusals if refusal.command == "stop" and refusal.by is None]
+
+
+def _stops_refused(control: Control) -> int:
+    return sum(refusal.count for refusal in _refused_stops(control))
+
+
+def _cut(text: str, most: int) -> str:
+    """Cut a text to so many bytes of UTF-8."""
+    return text.encode("utf-8", "replace")[:most].decode("utf-8", "ignore")

@@ -34,9 +34,11 @@ def test_nobody_but_a_router_deletes_and_every_person_may_stop() -> None:
 
 
 @pytest.mark.parametrize("role", OF_ROBOTS)
-def test_who_names_robots_gets_nothing_of_others(role: str) -> None:
-    robots = {each.robot for each in granted_by_the_code() if each.column == role and each.robot is not None}
-    assert robots == {OWN}
+def test_who_names_robots_gets_nothing_of_others_but_a_gateway_asks_them_for_the_fleets_stops(role: str) -> None:
+    of_others = {
+        (each.path, each.kind) for each in granted_by_the_code() if each.column == role and each.robot == OTHER
+    }
+    assert of_others == ({("@rpc/latch", Kind.QUERY)} if role == "gateway" else set())
 
 
 def test_expressions_are_of_the_realm_the_name_and_the_robots() -> None:

@@ -94,14 +94,38 @@ def test_ls_echo_and_stop_say_what_there_is_and_a_stop_takes_the_robot_from_its_
     fleet.put("r1/@cmd/drive", forward=0.5)
     until(lambda: fleet.refusal(who="driver", reason="the lease has ended (stop)"), what="refusal")
     missing = zbridge("stop", "r9", *at)
-    assert (missing.returncode, missing.stderr) == (1, "r9: stop sent, but no gateway confirmed it within 2 s\n")
+    assert (missing.returncode, missing.stderr) == (1, "r9: stop sent, but no gateway confirmed it within 3 s\n")
     bench.gateway(device(free_port()), robot="r2")
     until(lambda: "refused" in fleet.reason("r2"), what="why it is offline")
     both = zbridge("stop", "--all", *at)
-    assert (both.returncode, both.stdout) == (1, "r1: stopped\n")
+    assert (both.returncode, both.stdout) == (1, "1 of 2 stopped; r2 offline\n")
     assert both.stderr.startswith("r2: stop taken, but the robot is ")
     elsewhere = zbridge("stop", "--all", "--realm", "lab", *at)
     assert (elsewhere.returncode, elsewhere.stderr) == (1, "no gateways on lab/\n")
+
+
+def test_a_latched_robot_is_driven_by_nobody_before_it_is_unlatched(bench: Bench) -> None:
+    fleet, at = bench.fleet, ("--connect", bench.endpoint)
+    bench.serve(bench.simulator())
+    latched = zbridge("stop", "r1", "--latch", "--reason", "a cable is loose", *at)
+    assert (latched.returncode, latched.stdout, latched.stderr) == (0, "r1: latched\n", "")
+    with pytest.raises(AssertionError, match="'ok': False"):
+        fleet.hold("r1", "driver")
+    stopped = zbridge("stop", "r1", *at)
+    assert (stopped.returncode, stopped.stdout) == (0, "r1: stopped\n"), "a plain stop of a latched robot"
+    everybody = zbridge("stop", "--all", "--latch", *at)
+    assert (everybody.returncode, everybody.stdout) == (0, "1 of 1 latched\n")
+    released = zbridge("unlatch", "r1", *at)
+    assert (released.returncode, released.stderr) == (0, "")
+    assert released.stdout.startswith("r1: released the stop of ")
+    assert released.stdout.endswith(" (a cable is loose)\n")
+    fleets = zbridge("unlatch", "r1", *at)
+    assert (fleets.returncode, fleets.stdout) == (1, "")
+    assert "whole fleet" in fleets.stderr
+    released = zbridge("unlatch", "--all", *at)
+    assert (released.returncode, released.stdout) == (0, "1 of 1 unlatched\n")
+    assert zbridge("unlatch", "r1", *at).stdout == "r1: was not latched\n"
+    fleet.hold("r1", "driver")
 
 
 def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it(bench: Bench) -> None:

@@ -41,10 +41,13 @@ class Keys(Enum):
     MARK = ("@mark",)
     ACQUIRE = ("{robot}/@rpc/control/acquire/{name}",)
     TAKEOVER = ("{robot}/@rpc/control/takeover/{name}",)
+    UNLATCH = ("{robot}/@rpc/control/unlatch/{name}",)
+    UNLATCH_FLEET = ("{robot}/@rpc/control/unlatch_fleet/{name}",)
     LEASE = ("{robot}/@rpc/control/renew", "{robot}/@rpc/control/release")
     ASK = ("{robot}/@rpc/map", "{robot}/@rpc/pose")
     RESTART = ("{robot}/@rpc/restart/{name}",)
     SESSIONS = ("{robot}/@rpc/sessions/*",)
+    LATCH = ("{robot}/@rpc/latch",)
     CLAIM = ("{robot}/@rpc/claim/gateway",)
     RPC = ("{robot}/@rpc/**",)
     HQ_ACQUIRE = ("{robot}/@rpc/control/acquire/hq.{name}", "{robot}/@rpc/control/acquire/hq.{name}.$*")
@@ -82,7 +85,7 @@ _VIEWER = (
     Grant(Keys.STOP, (Kind.PUT,)),
     Grant(Keys.WHOAMI, (Kind.QUERY,)),
 )
-_OPERATOR = (
+_DRIVER = (
     *_VIEWER,
     Grant(Keys.COMMANDS, (Kind.PUT,)),
     Grant(Keys.MARK, (Kind.PUT,)),
@@ -91,15 +94,17 @@ _OPERATOR = (
     Grant(Keys.ASK, (Kind.QUERY,)),
     Grant(Keys.OPERATOR_TOKEN, (Kind.TOKEN,)),
 )
+_OPERATOR = (*_DRIVER, Grant(Keys.UNLATCH, (Kind.QUERY,)))
 _SUPERVISOR = (
     *_OPERATOR,
     Grant(Keys.TAKEOVER, (Kind.QUERY,)),
+    Grant(Keys.UNLATCH_FLEET, (Kind.QUERY,)),
     Grant(Keys.RESTART, (Kind.QUERY,)),
     Grant(Keys.WIRE, (Kind.SUBSCRIBE,)),
     Grant(Keys.ADMIN, (Kind.QUERY,)),
 )
 _HQ = (
-    *(msgspec.structs.replace(grant, own=True) for grant in _OPERATOR),
+    *(msgspec.structs.replace(grant, own=True) for grant in _DRIVER),
     Grant(Keys.HQ_ACQUIRE, (Kind.QUERY,), own=True),
     Grant(Keys.HQ_REFUSED, (Kind.QUERY,), own=True),
     Grant(Keys.HQ_SESSIONS, _ANSWER, own=True),
@@ -110,6 +115,7 @@ _GATEWAY = (
     Grant(Keys.COMMANDS, (Kind.SUBSCRIBE,), own=True),
     Grant(Keys.RPC, _ANSWER, own=True),
     Grant(Keys.CLAIM, (Kind.QUERY,), own=True),
+    Grant(Keys.LATCH, (Kind.QUERY,)),
     Grant(Keys.WIRE, (Kind.PUT,), own=True),
     Grant(Keys.ALIVE, _SEE, own=True),
     Grant(Keys.GATEWAY_TOKEN, (Kind.TOKEN,), own=True),
@@ -141,8 +147,8 @@ NEEDED: Mapping[str, Role] = {
     "run, HQ programs only": "hq",
     "replay": "gateway",
     "ls, echo, stop, top, foxglove, ros2, console": "viewer",
-    "drive, mark; foxglove, ros2 and console that drive": "operator",
-    "drive --takeover, restart, doctor": "supervisor",
+    "drive, unlatch, mark; foxglove, ros2 and console that drive": "operator",
+    "drive --takeover, unlatch --all, restart, doctor": "supervisor",
     "record": "recorder",
     "router": "router",
 }

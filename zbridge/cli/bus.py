@@ -1,4 +1,4 @@
-"""``zbridge ls, echo, stop``: the commands that read the bus, and the stop that is open to everyone."""
+"""``zbridge ls, echo``: the commands that read the bus."""
 
 from __future__ import annotations
 
@@ -208,17 +208,3 @@ def _plain(value: Any, depth: int = _DEPTH) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int) else str(value)
-
-
-async def stop(settings: BusSettings, realm: str, robot: str | None) -> bool:
-    """Stop one robot, or all; return whether every gateway confirmed it."""
-    async with connect(settings=settings, realm=realm) as fleet:
-        outcomes = await fleet.stop([robot] if robot is not None else None)
-    for name, error in outcomes.items():
-        if error is None:
-            console.print(shown(f"{name}: stopped"))
-        else:
-            errors.print(shown(error))
-    if not outcomes:
-        errors.print(f"no gateways on {realm}/")
-    return bool(outcomes) and not any(outcomes.values())

@@ -1,4 +1,7 @@
-"""Declares what is done with robots of the bus: ``zbridge ls, health, echo, drive, stop, restart, foxglove, ros2``."""
+"""Declares what is done with robots of the bus.
+
+``zbridge ls, health, echo, drive, stop, unlatch, restart, foxglove, ros2``.
+"""
 
 from __future__ import annotations
 
@@ -142,16 +145,36 @@ def drive(
 def stop(
     robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
     everything: Annotated[bool, typer.Option("--all", help="every robot of the realm")] = False,
+    latch: Annotated[bool, typer.Option("--latch", help="let nobody drive before zbridge unlatch")] = False,
+    reason: Annotated[str, typer.Option(help="shown to whoever wants to drive")] = "",
     connect: Connect = [],
     tls: TlsFolder = None,
     realm: Realm = "fleet",
 ) -> None:
     """Stop a robot, or all of them; open to everyone who can write the key."""
-    from zbridge.cli import bus
+    from zbridge.cli.stops import stop
 
     set_up_log(verbose=False, level=logging.ERROR)
     _check_one_or_all(robot, everything=everything)
-    if not run_loop(bus.stop(bus_settings(connect, tls), realm, robot or None)):
+    settings = bus_settings(connect, tls)
+    if not run_loop(stop(settings, realm, robot or None, latch=latch, reason=reason or None)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def unlatch(
+    robot: Annotated[str, typer.Argument(help="the robot's name", show_default=False)] = "",
+    everything: Annotated[bool, typer.Option("--all", help="the stops of the whole fleet")] = False,
+    connect: Connect = [],
+    tls: TlsFolder = None,
+    realm: Realm = "fleet",
+) -> None:
+    """Release the latched stops of a robot, or those of the whole fleet; robots move only when somebody drives."""
+    from zbridge.cli.stops import unlatch
+
+    set_up_log(verbose=False, level=logging.ERROR)
+    _check_one_or_all(robot, everything=everything)
+    if not run_loop(unlatch(bus_settings(connect, tls), realm, robot or None)):
         raise typer.Exit(1)
 
 

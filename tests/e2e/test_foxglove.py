@@ -157,6 +157,36 @@ def test_a_stop_is_open_to_who_may_not_drive_and_who_is_stopped_must_let_go_firs
         until(lambda: bench.fleet.last("r1/control")["state"] == "stopped", what="a stopped robot")
 
 
+def test_a_robot_that_a_viewer_latched_is_driven_by_nobody_before_a_driver_unlatches_it(
+    bench: Bench, server: Server
+) -> None:
+    with viewing(server.port, origin=PAGE) as driver, viewing(server.port) as looker:
+        driver.publish_on(1, "/r1/cmd_vel")
+        for number, service in enumerate(("/r1/latch", "/latch")):
+            drives(driver, bench)
+            looker.call(service, number, reason="a cable is loose")
+            looker.until(lambda number=number: looker.answers.get(number) == b'{"ok":true}', "the answer to a latch")
+            looker.until(lambda: looker.warned("(a cable is loose)"), "the news that it is latched")
+
+            def refused() -> bool:
+                driver.twist(1)
+                driver.twist(1, forward=0.5)
+                driver.read()
+                return driver.warned("latched by ")
+
+            until(refused, what="a refusal")
+            stays_free(bench)
+            unlatch = service.replace("latch", "unlatch")
+            looker.call(unlatch, 5)
+            looker.until(lambda: looker.told[-1]["op"] == "serviceCallFailure", "a refused call")
+            driver.call(unlatch, 10 + number)
+            driver.until(
+                lambda number=number: driver.answers.get(10 + number) == b'{"ok":true}', "the answer to a release"
+            )
+            driver.told.clear()
+            driver.twist(1)  # let go
+
+
 def test_switches_are_parameters_that_follow_the_robot(bench: Bench, server: Server) -> None:
     def values(viewer: Viewer) -> dict[str, Any]:
         told = [
@@ -310,7 +340,9 @@ def test_robots_come_and_go(bench: Bench) -> None:
         viewer.subscribe("/r1/status")
         viewer.until(lambda: viewer.shown.get("/r1/status"), "a status")
         gateway.end()
-        viewer.until(lambda: not viewer.channels and set(viewer.services) == {"/stop"}, "no robot")
+        viewer.until(
+            lambda: not viewer.channels and set(viewer.services) == {"/stop", "/latch", "/unlatch"}, "no robot"
+        )
 
 
 def test_a_recording_is_played_paused_sped_up_and_sought(bench: Bench) -> None:

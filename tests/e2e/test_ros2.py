@@ -20,6 +20,7 @@ from tests.ports import free_port
 from tests.views.ros2.judge import Publisher, Ros
 
 TRIGGER, SET_BOOL = "std_srvs/srv/Trigger", "std_srvs/srv/SetBool"
+TRIGGERS = ("stop", "latch", "unlatch")
 
 
 class Scene(RosScene):
@@ -65,7 +66,7 @@ def test_the_graph_shows_a_node_for_the_robot_and_what_it_offers(scene: Scene) -
 
     expected = {("MP", f"/r1/{name}") for name in ("scan", "odom", "pose", "map", "imu", "tf", "robot_description")}
     expected |= {("MP", "/tf"), ("MP", "/tf_static"), ("MS", "/r1/cmd_vel"), ("NN", "")}
-    expected |= {("SS", f"/r1/{name}") for name in ("stop", "set_light", "set_lidar", "set_camera")}
+    expected |= {("SS", f"/r1/{name}") for name in (*TRIGGERS, "set_light", "set_lidar", "set_camera")}
     until(lambda: expected <= offered(), what="graph")
 
 
@@ -144,6 +145,26 @@ def test_a_called_stop_stops_and_a_pushed_stick_does_not_move_the_robot_anew(sce
         with repeated(publisher.twist):
             scene.told("r1: cmd_vel", "/teleop=may drive")
         with pushed(publisher, 0.25, lambda: scene.moves(stopped)):
+            pass
+
+
+def test_a_latched_robot_is_driven_by_no_publisher_before_it_is_unlatched(scene: Scene) -> None:
+    with publishing(scene) as publisher:
+        begun = time.monotonic()
+        with pushed(publisher, 0.25, lambda: scene.moves(begun)):
+            assert scene.ros.call("/r1/latch", TRIGGER, scene.ros.request(TRIGGER, none=0))[0].success
+            latched = time.monotonic()
+            scene.told("r1: control", "latched by ")
+        with repeated(publisher.twist):
+            scene.told("r1: cmd_vel", "/teleop=may drive")
+        with repeated(lambda: publisher.twist(0.25)):
+            scene.told("r1: cmd_vel", "latched by ")
+        assert scene.rests()
+        assert not [frame for frame in scene.robot.frames if frame.moves and frame.at > latched + 0.2]
+        assert scene.ros.call("/r1/unlatch", TRIGGER, scene.ros.request(TRIGGER, none=0))[0].success
+        with repeated(publisher.twist):
+            scene.told("r1: cmd_vel", "/teleop=may drive")
+        with pushed(publisher, 0.25, lambda: scene.moves(latched)):
             pass
 
 

@@ -9,7 +9,7 @@ from tests.views.foxglove.test_hub import Looking, ids
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Device, Devices, FleetMessage, Pose, Reading, Switch
+from zbridge.fleet.messages import Control, Device, Devices, FleetMessage, Latch, Pose, Reading, Switch
 from zbridge.fleet.payload import encode
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
@@ -38,7 +38,8 @@ class Scene:
 
     def keys(self) -> list[str]:
         """Give the keys and expressions that are subscribed to, but those of the server itself."""
-        return sorted(key for key, _ in self.bus._shared.subscribers if key != "fleet/*/devices")
+        own = ("fleet/*/devices", "fleet/*/control")
+        return sorted(key for key, _ in self.bus._shared.subscribers if key not in own)
 
     def put(self, topic: Topic, message: FleetMessage | bytes) -> None:
         payload = message if isinstance(message, bytes) else encode(message)
@@ -88,7 +89,7 @@ async def test_a_robot_is_there_while_its_gateway_is_and_leaves_nothing_behind()
     scene.subscribe("/r1/pose")
     token.close()
     assert scene.keys() == []
-    assert {service.name for service in scene.live.services()} == {"/stop"}
+    assert {service.name for service in scene.live.services()} == {"/stop", "/latch", "/unlatch"}
     assert scene.viewer.over
 
 
@@ -116,8 +117,28 @@ async def test_garbage_on_the_bus_is_counted_and_shown_to_nobody(scene: Scene) -
     scene.subscribe("/r1/pose")
     scene.put(topics.POSE, b"\xc1garbage")
     scene.put(topics.DEVICES, b"\xc1garbage")
+    scene.put(topics.CONTROL, b"\xc1garbage")
     assert scene.shown("/r1/pose") == []
-    assert scene.metrics.total("foxglove_malformed") == 2
+    assert scene.metrics.total("foxglove_malformed") == 3
+
+
+async def test_viewers_are_warned_of_a_latched_robot_for_as_long_as_it_is() -> None:
+    scene = Scene()
+    token = scene.robot.announce(GATEWAY)
+    latch = Latch(b"a" * 16, "ann", "a cable is loose")
+    for control in (Control("free"), Control("latched", latches=(latch,)), Control("latched", latches=(latch,))):
+        scene.put(topics.CONTROL, control)
+    later = Looking()
+    scene.hub.join(later)
+    warned = {"op": "status", "level": 1, "id": "latched.r1", "message": "r1: latched by ann (a cable is loose)"}
+    for viewer in (scene.viewer, later):
+        assert [said for said in viewer.said if said["op"] == "status"] == [warned]
+    scene.put(topics.CONTROL, Control("stopped"))
+    removed = {"op": "removeStatus", "statusIds": ["latched.r1"]}
+    assert scene.viewer.said[-1] == later.said[-1] == removed
+    scene.put(topics.CONTROL, Control("latched", latches=(latch,)))
+    token.close()
+    assert [said for said in later.said if said["op"] == "removeStatus"] == [removed] * 2
 
 
 async def test_parameters_follow_the_robot_while_somebody_watches_them(scene: Scene) -> None:

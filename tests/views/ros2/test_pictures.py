@@ -15,6 +15,7 @@ from zbridge.fleet.messages import (
     Control,
     Device,
     Image,
+    Latch,
     Map,
     Motion,
     Pose,
@@ -274,6 +275,14 @@ def test_diagnostics_tell_state_links_control_and_refusals() -> None:
     assert shown["r1: control"] == (0, "held by op2", {"holder": "op2"})
     assert shown["r1: refusals"] == (1, "3 commands refused lately", {"drive of op1": "held by op2 (3)"})
     assert stamp(told.header) == NOW_NS
+    latches = tuple(Latch(bytes([number]) * 16, "ann", why) for number, why in enumerate(("a cable", "rain")))
+    list(pictures.make("control", Control("latched", latches=latches), NOW_NS, ()))
+    (shown_control,) = (e for e in cdr(pictures.diagnostics([], NOW_NS)).status if e.name == "r1: control")
+    assert (shown_control.level, shown_control.message) == (1, "latched by ann (rain)")
+    assert {value.key: value.value for value in shown_control.values} == {
+        "latch 00000000": "latched by ann (a cable)",
+        "latch 01010101": "latched by ann (rain)",
+    }
 
 
 STAMPS = {

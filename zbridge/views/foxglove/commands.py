@@ -4,10 +4,12 @@
 |---|---|---|---|
 | `/r1/cmd_vel` (`geometry_msgs/Twist`) | | | drives, through the lease |
 | `/r1/stop` (any message) | `/r1/stop`, `/stop` | `r1.stop` = true | stops the robot, or all; open to every viewer |
+| | `/r1/latch`, `/latch` `{"reason": "..."}` | | the same, and nobody drives before the release; open to every viewer |
+| | `/r1/unlatch`, `/unlatch` | | releases the stops of the robot, or of the whole fleet |
 | | `/r1/light`, `/r1/lidar`, `/r1/camera` `{"on": true}` | `r1.light`, `r1.lidar`, `r1.camera` | switches |
 | | `/r1/mode` `{"mode": "manual"}` | `r1.mode` | who moves the robot: holds the lease until it is ``none`` |
 
-All but stops need a viewer that may drive.
+All but stops and latches need a viewer that may drive.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 import msgspec
 
 from zbridge.client import Fleet
+from zbridge.client.stops import Outcome
 from zbridge.errors import Held, Malformed, Unsupported, ZbridgeError
 from zbridge.fleet.topics import is_name
 from zbridge.views.foxglove import replies
@@ -30,9 +33,11 @@ from zbridge.views.foxglove.requests import ClientChannel
 from zbridge.views.foxglove.source import Person
 from zbridge.views.foxglove.twist import Scales, read_twist
 
-CMD_VEL, STOP = "cmd_vel", "stop"
+CMD_VEL, STOP, LATCH, UNLATCH = "cmd_vel", "stop", "latch", "unlatch"
 _TWISTS = ("geometry_msgs/Twist", "geometry_msgs/msg/Twist")
 _SWITCHES = ("light", "lidar", "camera")
+_OF_ALL = (STOP, LATCH, UNLATCH)
+"""What is called for one robot, and for all."""
 _MODES = ("none", "manual", "autonomous")
 _UNTOUCHED: Mapping[str, Any] = {"light": False, "lidar": False, "camera": False, "mode": "none", STOP: False}
 """A robot's parameters before anything is known of them."""
@@ -55,7 +60,8 @@ class Commands:
         self._stops: dict[str, asyncio.Task[None]] = {}
         self._stop_again: set[str] = set()
         self._releases: set[asyncio.Task[None]] = set()
-        self._add("", STOP)
+        for what in _OF_ALL:
+            self._add("", what)
 
     def __repr__(self) -> str:
         return f"<Commands of {len(self._robots)} robots, {len(self._pilots)} pilots>"
@@ -71,7 +77,7 @@ class Commands:
     def robot_came(self, robot: str) -> None:
         """Offer the services and parameters of a robot."""
         self._robots[robot] = dict(_UNTOUCHED)
-        services = [self._add(robot, what) for what in (STOP, *_SWITCHES, "mode")]
+        services = [self._add(robot, what) for what in (*_OF_ALL, *_SWITCHES, "mode")]
         self._hub.say(replies.advertise_services(services))
         self._hub.parameters_changed({f"{robot}.{name}": value for name, value in self._robots[robot].items()})
 
@@ -167,9 +173,7 @@ class Commands:
     async def _stop(self, robots: list[str]) -> None:
         """Stop robots; raise Refused or BusError for the first that was not confirmed."""
         self._stopped(robots)
-        for error in (await self._fleet.stop(robots)).values():
-            if error is not None:
-                raise error
+        _raise_first(await self._fleet.stop(robots))
 
     # Services and parameters
 
@@ -186,8 +190,8 @@ class Commands:
             asked = msgspec.json.decode(payload or b"{}", type=dict[str, Any])
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise Malformed(f"{service.name}: {error}") from error
-        if not robot:
-            await self._stop(sorted(self._robots))
+        if what in _OF_ALL:
+            await self._stop_or_release(viewer, robot, what, asked.get("reason"))
         else:
             await self._carry_out(viewer, robot, what, asked.get("mode" if what == "mode" else "on"))
         return b'{"ok":true}'
@@ -205,6 +209,22 @@ class Commands:
         self._known(robot)
         if what != STOP or value is True:
             await self._carry_out(viewer, robot, what, value)
+
+    async def _stop_or_release(self, viewer: Person, robot: str, what: str, reason: object) -> None:
+        """Stop, latch or unlatch one robot, or all."""
+        if what == STOP:
+            await self._stop([robot] if robot else sorted(self._robots))
+        elif what == LATCH:
+            self._stopped([robot] if robot else sorted(self._robots))
+            _raise_first(
+                await self._fleet.latch([robot] if robot else None, reason if isinstance(reason, str) else None)
+            )
+        else:
+            self._may(viewer)
+            if robot:
+                await self._fleet[robot].unlatch()
+            else:
+                _raise_first(await self._fleet.unlatch())
 
     async def _carry_out(self, viewer: Person, robot: str, what: str, value: Any) -> None:
         if what == STOP:
@@ -242,9 +262,17 @@ class Commands:
             raise Unsupported("you may look and stop, not drive: that needs --drive, and a token or a listed Origin")
 
 
+def _raise_first(outcomes: Mapping[str, Outcome]) -> None:
+    for error in outcomes.values():
+        if error is not None:
+            raise error
+
+
 _SWITCH = {"type": "object", "properties": {"on": {"type": "boolean"}}}
 _ASKED: Mapping[str, Mapping[str, Any]] = {
     STOP: {"type": "object", "properties": {}},
+    LATCH: {"type": "object", "properties": {"reason": {"type": "string"}}},
+    UNLATCH: {"type": "object", "properties": {}},
     "mode": {"type": "object", "properties": {"mode": {"type": "string", "enum": list(_MODES)}}},
     **dict.fromkeys(_SWITCHES, _SWITCH),
 }

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import msgspec
 
 from zbridge.views.foxglove import replies
+from zbridge.views.foxglove.replies import Level
 from zbridge.views.pictures import Channel
 
 CHANNELS = 8192
@@ -56,6 +57,7 @@ class Hub:
         self.viewers: set[Receiver] = set()
         self._offers: dict[int, _Offer] = {}
         self._by_topic: dict[str, _Offer] = {}
+        self._news: dict[str, str] = {}
         self._next_id = 1
 
     def __repr__(self) -> str:
@@ -106,6 +108,17 @@ class Hub:
         """Tell all viewers."""
         self._tell(message)
 
+    def warn(self, name: str, text: str | None) -> None:
+        """Show all viewers, those who come later too, what holds until it is called anew with the same name."""
+        if self._news.get(name) == text:
+            return
+        if text is None:
+            del self._news[name]
+            self._tell(replies.remove_status([name]))
+        else:
+            self._news[name] = text
+            self._tell(replies.status(Level.WARNING, text, name))
+
     def parameters_changed(self, values: Mapping[str, Any]) -> None:
         """Tell the viewers that watch these parameters."""
         for viewer in self.viewers:
@@ -118,10 +131,12 @@ class Hub:
     # The viewers' side
 
     def join(self, viewer: Receiver) -> None:
-        """Show a viewer the channels there are."""
+        """Show a viewer the channels there are, and the warnings that hold."""
         self.viewers.add(viewer)
         if self._offers:
             viewer.say(replies.advertise(offer.entry for offer in self._offers.values()))
+        for name, text in self._news.items():
+            viewer.say(replies.status(Level.WARNING, text, name))
 
     def leave(self, viewer: Receiver) -> None:
         """End a viewer's subscriptions; idempotent."""

@@ -17,7 +17,7 @@ from zbridge.bus import Bus, Handle, Sample
 from zbridge.errors import BusError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Devices, FleetMessage, Reading, Switch
+from zbridge.fleet.messages import Control, Devices, FleetMessage, Reading, Switch
 from zbridge.fleet.topics import KeySpace, Topic, is_name, split_key, unescape
 from zbridge.metrics import Metrics
 from zbridge.views.foxglove.commands import Commands
@@ -96,6 +96,7 @@ class Live(Source):
         self._handles = [
             self._bus.watch_alive(f"{self._realm}/*/@alive/gateway", self._on_gateway),
             self._bus.subscribe(f"{self._realm}/*/{topics.DEVICES.path}", self._on_devices, history=True),
+            self._bus.subscribe(f"{self._realm}/*/{topics.CONTROL.path}", self._on_control, history=True),
         ]
 
     async def close(self) -> None:
@@ -131,6 +132,7 @@ class Live(Source):
     def _hide(self, name: str) -> None:
         shown = self._shown[name]
         self._commands.robot_left(name)
+        self.hub.warn(_latched(name), None)
         self.hub.withdraw([channel.topic for channel in shown.offered.values()])
         del self._shown[name]
         for handle in shown.handles.values():
@@ -153,6 +155,19 @@ class Live(Source):
             return
         for device in devices.devices:
             self._found(shown, topics.SENSOR(device.name).path)
+
+    def _on_control(self, sample: Sample) -> None:
+        """Warn of a robot that is latched."""
+        split = split_key(sample.key)
+        if split is None or split[1] not in self._shown:
+            return
+        try:
+            control = payloads.decode(Control, sample.payload)
+        except PayloadError:
+            self._malformed.value += 1
+            return
+        said = "; ".join(latch.described for latch in control.latches)
+        self.hub.warn(_latched(split[1]), f"{split[1]}: {said}" if said else None)
 
     def _found(self, shown: _Shown, path: str) -> None:
         if path not in shown.offered and shown.sensors < SENSORS:
@@ -258,6 +273,11 @@ class Live(Source):
     async def left(self, viewer: Person) -> None:
         """Release what a viewer drove."""
         await self._commands.left(viewer)
+
+
+def _latched(robot: str) -> str:
+    """Name the warning of a robot that is latched."""
+    return f"latched.{robot}"
 
 
 def _sensors_schema() -> Schema:

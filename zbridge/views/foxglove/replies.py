@@ -95,9 +95,15 @@ def message_data(subscription_id: int, log_ns: int, payload: bytes) -> bytes:
     return _MESSAGE.pack(1, subscription_id, log_ns) + payload
 
 
-def status(level: Level, text: str) -> str:
-    """Tell people something."""
-    return _text({"op": "status", "level": int(level), "message": text})
+def status(level: Level, text: str, name: str | None = None) -> str:
+    """Tell people something. name: of what holds until :func:`remove_status`, or until it is told anew."""
+    named = {"id": name} if name is not None else {}
+    return _text({"op": "status", "level": int(level), "message": text} | named)
+
+
+def remove_status(names: Sequence[str]) -> str:
+    """Take back what does not hold any more."""
+    return _text({"op": "removeStatus", "statusIds": names})
 
 
 def advertise_services(services: Iterable[Service]) -> str:

@@ -56,8 +56,11 @@ def _control(robot: str, control: Control | None) -> Entry:
     if control is None:
         return Entry(STALE, name, "no gateway tells")
     values = [("holder", cut(control.holder))] if control.holder else []
+    values += [(f"latch {latch.id.hex()[:8]}", cut(latch.described)) for latch in control.latches]
     text = f"held by {control.holder}" if control.holder else control.state
-    return Entry(WARN if control.state == "stopped" else OK, name, cut(text), values)
+    if control.latches:
+        text = control.latches[-1].described
+    return Entry(OK if control.state in ("free", "held") else WARN, name, cut(text), values[:MOST_VALUES])
 
 
 def _refusals(robot: str, control: Control | None) -> Entry:

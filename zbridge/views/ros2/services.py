@@ -1,4 +1,4 @@
-"""The services of one robot: stop, and where driving is allowed set_light, set_lidar and set_camera."""
+"""The services of one robot: stop and latch; where driving is allowed unlatch, set_light, set_lidar and set_camera."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Services:
         self._called = side.metrics.count("ros2_calls")
         self._refused = side.metrics.count("ros2_calls_refused")
         self._serve(node, "stop", TRIGGER, self._stop)
+        self._serve(node, "latch", TRIGGER, self._latch)
         if drive:
+            self._serve(node, "unlatch", TRIGGER, self._unlatch)
             for name, switch in self._switches().items():
                 self._serve(node, name, SET_BOOL, partial(_switched, switch))
 
@@ -102,6 +104,13 @@ class Services:
     async def _stop(self, request: Any) -> None:
         self._on_stop()
         await self._robot.stop()
+
+    async def _latch(self, request: Any) -> None:
+        self._on_stop()
+        await self._robot.latch()
+
+    async def _unlatch(self, request: Any) -> None:
+        await self._robot.unlatch()
 
 
 class _Cancelled:

@@ -198,7 +198,7 @@ class Teleop:
 
     def _on_control(self, sample: Sample) -> None:
         try:
-            stopped = payloads.decode(Control, sample.payload).state == "stopped"
+            stopped = payloads.decode(Control, sample.payload).state in ("stopped", "latched")
         except PayloadError:
             return
         if stopped and self._stopped is False:

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from zbridge.app import listener_template, load, robot_template, together, until_signal
+from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
+from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
 from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
 from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder

@@ -29,6 +29,8 @@ REFUSED = [
     ({"duration": "long"}, "duration = 'long'"),
     ({"buffer": "1kB"}, "'1kB'"),
     ({"realm": "a/b"}, "realm = 'a/b'"),
+    ({"keys": "fleet/r1/pose*"}, r"keys = 'fleet/r1/pose\*': `\*` may only be preceded by"),
+    ({"keys": "/fleet/**"}, r"keys = '/fleet/\*\*': .*: try 'fleet/\*\*'"),
     ({"configs": (Path("/none.toml"),)}, "none.toml"),
 ]
 

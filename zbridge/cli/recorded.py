@@ -14,7 +14,7 @@ from rich.table import Table
 
 import zbridge
 from zbridge.app import until_signal
-from zbridge.bus import BusSettings
+from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.member import own_name, own_role
 from zbridge.cli.bus import cell, console, errors, joined
 from zbridge.client.driver import default_who
@@ -90,6 +90,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
     if not is_name(options.realm):
         raise ConfigError(f"realm = {options.realm!r}: expected letters, digits, '_', '.' and '-' only")
+    keys = read_key_expr("keys", options.keys) if options.keys else None
     duration_s = amounts.read_seconds("duration", options.duration) if options.duration else None
     tape = Tape(_tape_settings(options))
     buffer, _ = amounts.read_split(options.buffer)
@@ -104,7 +105,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         pictures=Pictures() if options.only != "fleet" else None,
         failed=lambda: loop.call_soon_threadsafe(full.set),
     )
-    plan = RecordPlan(options.realm, options.robots, options.keys, options.wire)
+    plan = RecordPlan(options.realm, options.robots, keys, options.wire)
     async with joined(settings, options.realm) as bus:
         recorder.start()
         recording = Recording(bus, plan, intake)

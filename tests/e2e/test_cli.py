@@ -59,6 +59,9 @@ def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str,
         ("stop r1 --all", 2, "--all"),
         ("stop a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
         ("drive a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
+        ("init tcpudp --name a%b", 2, "--name = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
+        ("echo /fleet/r1/pose", 2, "try 'fleet/r1/pose'\n"),
+        ("record --keys /fleet/** -o never.mcap", 2, "try 'fleet/**'\n"),
         ("simulate tcpudp", 2, "give either --listen"),
         ("simulate tcpudp --listen udp://127.0.0.1:1", 1, "expected tcp://host:port"),
         ("simulate tcpudp --listen tcp://127.0.0.1:0 --camera 8000", 1, "expected tcp://host:port"),
@@ -73,6 +76,7 @@ def test_what_cannot_be_done_is_said_without_a_traceback(command: str, code: int
     assert (ran.returncode, ran.stdout) == (code, "")
     assert said in ran.stderr
     assert "Traceback" not in ran.stderr
+    assert not (ROOT / "never.mcap").exists()
 
 
 def test_ls_echo_and_stop_say_what_there_is_and_a_stop_takes_the_robot_from_its_driver(bench: Bench) -> None:

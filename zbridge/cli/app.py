@@ -14,7 +14,7 @@ from zbridge.app.member import check_member, not_checked
 from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
 from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
-from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder
+from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
@@ -110,6 +110,7 @@ def init(
     hq: Annotated[bool, typer.Option("--hq", help="for a process that only serves HQ programs")] = False,
 ) -> None:
     """Print a commented configuration to start from."""
+    check_name("--name", name)
     found = find_protocol(protocol)
     if hq and found.hq is None:
         give_up(2, f"{protocol} serves no HQ programs")

@@ -29,9 +29,11 @@ FAULT = "a fault of the protocol: "
 
 
 def describe(error: BaseException) -> str:
-    """Say what was raised, and in which line: ``KeyError: 1 (session.py:36)``."""
-    frames = traceback.extract_tb(error.__traceback__)
-    where = f" ({frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno})" if frames else ""
+    """Say what was raised, and where: ``KeyError: 1 in HqRole.decode (session.py:36)``."""
+    where = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        code = frame.f_code
+        where = f" in {code.co_qualname.rpartition('<locals>.')[2]} ({code.co_filename.rpartition('/')[2]}:{line})"
     return f"{type(error).__name__}: {error}{where}"
 
 

@@ -33,6 +33,8 @@ def describe(error: BaseException) -> str:
     where = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         code = frame.f_code
+        if "importlib" in code.co_filename:  # of a module that cannot be imported: who imports it
+            continue
         where = f" in {code.co_qualname.rpartition('<locals>.')[2]} ({code.co_filename.rpartition('/')[2]}:{line})"
     return f"{type(error).__name__}: {error}{where}"
 

@@ -294,7 +294,7 @@ class Gateway:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
-            plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
+            plan.make_robot(self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,
             keys=self._keys,

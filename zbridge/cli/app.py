@@ -18,6 +18,7 @@ from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
+from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
@@ -83,6 +84,8 @@ def check(file: File, tls: FileTls = None) -> None:
     robot, parts = plan.config.robot, []
     try:
         certificate = check_member(plan)
+        if plan.device is not None:
+            plan.device.make_robot(Metrics())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:

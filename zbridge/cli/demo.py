@@ -28,7 +28,7 @@ from zbridge.cli.bus import cell
 from zbridge.cli.processes import end, free_port, process
 from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
-from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
+from zbridge.errors import BusError, ConfigError, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Pose, Status
@@ -100,39 +100,56 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
 
     secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
     """
-    robots = {f"{name}1": name for name in protocol_names() if _is_whole(find_protocol(name))}
+    robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
     watch = Watch(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
         log = stack.enter_context((folder / "log").open("w+b"))
         bus = await stack.enter_async_context(secure_bus(folder, log, list(robots)) if secure else _open_to_all())
         listeners = {robot: f"tcp://127.0.0.1:{free_port()}" for robot in robots}
-        processes = [
-            await stack.enter_async_context(_robot(folder, log, robot, protocol, listeners[robot], bus.table(robot)))
-            for robot, protocol in robots.items()
-        ]
+        processes, failed = [], list[str]()
+        for robot, protocol in robots.items():
+            starting = _robot(folder, log, robot, protocol, listeners[robot], bus.table(robot))
+            try:
+                processes.append(await stack.enter_async_context(starting))
+            except ZbridgeError as error:
+                failed.append(_left_out(error))
+                del watch.rows[robot]
         for key_expr in ("*", "sensor/*"):
             bus.looking.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         how = [
             f"router at {bus.endpoint}; try, in another terminal:",
             *(f"  {line}" for line in bus.commands),
             "HQ programs connect to the robots here; to simulate one:",
-            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in robots),
+            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
         await until_signal(_show(bus.driving, watch, seconds, how))
-        simulators, gateways = zip(*processes, strict=True)
-        await end(gateways)  # all at once: each needs about a second to stop its robot
-        await end(simulators)
-        silent = [robot for robot, row in watch.rows.items() if not row.heard]
-        if seconds and silent:
-            for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
-                print(shown(line), file=sys.stderr)  # noqa: T201
-            raise ZbridgeError(f"no data from {', '.join(silent)}; the end of the processes' log is above")
+        await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
+        await end([simulator for simulator, _ in processes])
+        failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.heard]
+        if seconds and failed:
+            _print_end(folder / "log")
+            raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
 
 
-def _is_whole(protocol: Protocol) -> bool:
-    """Tell whether what the protocol's robots need is installed."""
-    return all(find_spec(module) is not None for module in protocol.requires)
+def _left_out(error: ZbridgeError) -> str:
+    """Print why the demo goes on without a protocol; return it."""
+    print(shown(f"zbridge: {error}; the demo goes on without it"), file=sys.stderr)  # noqa: T201
+    return str(error)
+
+
+def _print_end(log: Path) -> None:
+    for line in log.read_text(errors="replace")[-2000:].splitlines():
+        print(shown(line), file=sys.stderr)  # noqa: T201
+
+
+def _is_whole(name: str) -> bool:
+    """Tell whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
+    try:
+        return all(find_spec(module) is not None for module in find_protocol(name).requires)
+    except ConfigError as error:
+        _left_out(error)
+        return False
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:
@@ -170,9 +187,11 @@ async def _robot(
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with process(log, "simulate", protocol, *listen, read=True) as simulator:
         assert simulator.stdout is not None
-        async with asyncio.timeout(START_S):
-            line = (await simulator.stdout.readline()).decode()
-        addresses = [word for word in line.split() if word.startswith("tcp://")]
+        line = b""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(START_S):
+                line = await simulator.stdout.readline()
+        addresses = [word for word in line.decode().split() if word.startswith("tcp://")]
         if not addresses:
             raise ZbridgeError(f"the {protocol} simulator did not start")
         file = folder / f"{robot}.toml"

@@ -10,11 +10,12 @@ from collections.abc import AsyncIterator, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
+from zbridge.bus.tls.membership import Right, lacking
 from zbridge.control.lease_client import RETRY_S, LeaseClient
 from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
 from zbridge.control.wishes import NAMED
-from zbridge.errors import BusError, Held, LeaseLost, PayloadError, Refused
+from zbridge.errors import BusError, BusRefused, Held, LeaseLost, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -52,6 +53,8 @@ class Driver:
         self.loss: LeaseLost | None = None
         self._bus = bus
         self._keys = keys
+        self._name = name
+        self._takeover = takeover
         self._wait_s = wait_s
         self._client = LeaseClient(keys, request, name, concerns=self._concerns, takeover=takeover, wait_s=wait_s)
         loop = asyncio.get_running_loop()
@@ -142,7 +145,8 @@ class Driver:
         """Get the lease.
 
         Raises Held if another program has it, Malformed if it cannot be asked for like this; after ``wait_s`` NotReady
-        or TooFast if the gateway went on saying so, BusError if none answered.
+        or TooFast if the gateway went on saying so, BusError if none answered; BusRefused where that is because a
+        router knows this program by a role that may not drive.
         """
         self._holder.announce()
         with contextlib.suppress(BusError, PayloadError):
@@ -152,7 +156,14 @@ class Driver:
                     break
         self._spawn(self._holder.keep())
         self._holder.want()
-        await self._granted
+        try:
+            await self._granted
+        except BusError:
+            right = Right.TAKE_OVER if self._takeover else Right.DRIVE
+            lacks = await lacking(self._bus.ask, self._keys.realm, self._name, self.robot, right)
+            if lacks is not None:
+                raise BusRefused(f"{self.robot}: {lacks}") from None
+            raise
 
     def look(self, sample: Sample) -> None:
         """Take news from ``control``: the holder of the lease, and refusals of this program's commands."""

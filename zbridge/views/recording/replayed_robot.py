@@ -98,21 +98,21 @@ class ReplayedRobot:
 
     # On the player's thread
 
-    def play(self, path: str, message: Message) -> None:
-        """Publish a message of the recording, whose key ends with ``path``."""
+    def play(self, path: str, message: Message) -> bool:
+        """Publish a message of the recording, whose key ends with ``path``; False: it is not published again."""
         topic = self._topic(path)
         if topic is None:
-            return
+            return False
         now_ns = self._clock_ns()
         payload = with_stamp(message.data, now_ns - max(0, message.log_ns - message.publish_ns))
         if topic is topics.STATUS or topic is topics.CONTROL:
-            self._play_state(topic, payload)
-            return
+            return self._play_state(topic, payload)
         if topic is topics.MAP or topic is topics.POSE:
             self._last[path] = payload
         self._put(topic, payload)
+        return True
 
-    def _play_state(self, topic: Topic, payload: bytes) -> None:
+    def _play_state(self, topic: Topic, payload: bytes) -> bool:
         try:
             if topic is topics.STATUS:
                 self._note_status(payloads.decode(Status, payload))
@@ -122,6 +122,8 @@ class ReplayedRobot:
                 self._publish_control()
         except PayloadError:
             self.unplayed += 1
+            return False
+        return True
 
     def _note_status(self, status: Status) -> None:
         if status.protocol not in (None, PROTOCOL):

@@ -217,12 +217,16 @@ class HqSide(Kept, ABC):
 
 
 class HqSimulation(msgspec.Struct, frozen=True):
-    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects."""
+    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects.
+
+    ``drive``: forward and turn that it drives once it has sent neutral, fractions of full scale; None: none.
+    """
 
     address: Address
     version: str | None = None
     dialect: str | None = None
     udp: bool = False
+    drive: tuple[float, float] | None = None
 
 
 class Simulation(msgspec.Struct, frozen=True):

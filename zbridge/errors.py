@@ -99,11 +99,14 @@ class Held(Refused):
 class LeaseLost(Refused):
     """There is no lease, or it has ended; the text says why, and who holds one now."""
 
+    expired = False
+    """Whether the program did not renew the lease in time: it was paused, or cut off. What happened meanwhile is not
+    known: somebody may have stopped the robot."""
     codes = (Code.LEASE_ENDED, Code.NO_LEASE)
 
 
 class NeutralFirst(Refused):
-    """The robot was stopped: a neutral must come before motion."""
+    """The robot was stopped: a neutral must come before motion (``Driver.neutral``)."""
 
     codes = (Code.NEUTRAL_FIRST,)
 

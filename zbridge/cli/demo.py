@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import math
 import sys
@@ -28,7 +29,7 @@ from zbridge.cli.bus import cell
 from zbridge.cli.processes import end, free_port, process
 from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
-from zbridge.errors import BusError, ConfigError, PayloadError, Refused, ZbridgeError
+from zbridge.errors import BusError, ConfigError, LeaseLost, NeutralFirst, NotReady, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Pose, Status
@@ -38,8 +39,9 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
 
 REFRESH_S = 0.5
+FIGURE: tuple[dict[str, float], ...] = ({"forward": 0.6}, {"turn": 0.5})
 FIGURE_S = 2.0
-"""Seconds that the robots drive straight on, then turn, and so on."""
+"""Seconds of each motion: the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
 """Below the default of 0: anybody else who asks for a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
@@ -220,7 +222,7 @@ async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> N
         print(line, flush=True)  # noqa: T201
     loop = asyncio.get_running_loop()
     started = loop.time()
-    wandering = [asyncio.create_task(_wander(fleet[robot])) for robot in watch.rows]
+    wandering = [asyncio.create_task(wander(fleet[robot])) for robot in watch.rows]
     try:
         with Live(console=Console(), auto_refresh=False) as live:
             while not seconds or loop.time() - started < seconds:
@@ -232,10 +234,24 @@ async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> N
         await asyncio.gather(*wandering, return_exceptions=True)
 
 
-async def _wander(robot: Robot) -> None:
-    """Drive straight on, turn, and so on, until somebody else takes the robot."""
+async def wander(robot: Robot) -> None:
+    """Drive straight on, turn, and so on, until somebody else takes the robot, or stops it.
+
+    If this program was paused meanwhile, the robot was stopped, and the program begins anew: with a neutral, or with a
+    new lease if the pause was longer than the lease. A robot that accepts no commands for now is waited for.
+    """
     with contextlib.suppress(Refused, BusError):
-        async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
-            while True:
-                await drive.during(FIGURE_S, forward=0.6)
-                await drive.during(FIGURE_S, turn=0.5)
+        while True:
+            try:
+                async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
+                    for motion in itertools.cycle(FIGURE):
+                        try:
+                            await drive.during(FIGURE_S, **motion)
+                        except NeutralFirst:
+                            with contextlib.suppress(NotReady):
+                                await drive.neutral()
+                        except NotReady:
+                            await asyncio.sleep(REFRESH_S)
+            except LeaseLost as loss:
+                if not loss.expired:
+                    raise

@@ -22,10 +22,10 @@ FILE = '[robot]\nname = "r1"\n' + device(1, options="gap = 1")
 NOBODY = "tcp://127.0.0.1:1"
 
 
-def zbridge(*arguments: str, module: str = "zbridge") -> subprocess.CompletedProcess[str]:
+def zbridge(*arguments: str, module: str = "zbridge", timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.run(
-        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30, cwd=ROOT, check=False
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, cwd=ROOT, check=False
     )
 
 
@@ -156,7 +156,7 @@ def test_probe_talks_to_a_robot_only_with_yes_and_asks_a_gateway_first(bench: Be
 
 
 def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
-    shown = zbridge("demo", "--secure", "--seconds", "8")
+    shown = zbridge("demo", "--secure", "--seconds", "8", timeout_s=120.0)  # nine processes start, one by one
     assert (shown.returncode, shown.stderr) == (0, "")
     assert "router at tls/127.0.0.1:" in shown.stdout
     for protocol in protocol_names():

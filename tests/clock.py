@@ -37,6 +37,10 @@ class JumpingLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self._jumping.now
 
+    def pause(self, seconds: float) -> None:
+        """Let time pass in which nothing of this process runs, as if it was stopped: all timers are late then."""
+        self._jumping.now += seconds
+
 
 def jumping(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
     """Run one async test of a module on a :class:`JumpingLoop`; ``pytest.mark.jumping`` does so for all of them."""

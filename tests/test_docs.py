@@ -3,6 +3,7 @@
 import contextlib
 import pkgutil
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -118,7 +119,9 @@ def documented_keys() -> Iterator[str]:
 
 
 def test_the_page_of_keys_names_every_key_and_no_other() -> None:
-    documented = {re.sub(r"<\w+>$", "name", path) for path in documented_keys()}
+    listed = Counter(documented_keys())
+    assert [path for path, count in listed.items() if count > 1] == [], "one key, one row"
+    documented = {re.sub(r"<\w+>$", "name", path) for path in listed}
     found = {
         path: topics.find(path) for path in documented if not path.startswith(("@wire/", "@alive/", "@rpc/claim/"))
     }

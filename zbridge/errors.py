@@ -31,9 +31,13 @@ FAULT = "a fault of the protocol: "
 
 
 def describe(error: BaseException) -> str:
-    """Say what was raised, and in which line: ``KeyError: 1 (session.py:36)``."""
-    frames = traceback.extract_tb(error.__traceback__)
-    where = f" ({frames[-1].filename.rpartition('/')[2]}:{frames[-1].lineno})" if frames else ""
+    """Say what was raised, and where: ``KeyError: 1 in HqRole.decode (session.py:36)``."""
+    where = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        code = frame.f_code
+        if "importlib" in code.co_filename:  # of a module that cannot be imported: who imports it
+            continue
+        where = f" in {code.co_qualname.rpartition('<locals>.')[2]} ({code.co_filename.rpartition('/')[2]}:{line})"
     return f"{type(error).__name__}: {error}{where}"
 
 
@@ -105,11 +109,14 @@ class Latched(Refused):
 class LeaseLost(Refused):
     """There is no lease, or it has ended; the text says why, and who holds one now."""
 
+    expired = False
+    """Whether the program did not renew the lease in time: it was paused, or cut off. What happened meanwhile is not
+    known: somebody may have stopped the robot."""
     codes = (Code.LEASE_ENDED, Code.NO_LEASE)
 
 
 class NeutralFirst(Refused):
-    """The robot was stopped: a neutral must come before motion."""
+    """The robot was stopped: a neutral must come before motion (``Driver.neutral``)."""
 
     codes = (Code.NEUTRAL_FIRST,)
 

@@ -81,7 +81,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.tcpudp.conformance.hq_program import simulate_fragile_hq
 
     version = simulation.version or "1.3"
     if simulation.dialect is not None:
@@ -89,7 +89,8 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
     udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
-    await simulate_fragile_hq(simulation.address.host, simulation.address.port, version=version, udp=udp)
+    address = simulation.address
+    await simulate_fragile_hq(address.host, address.port, version=version, udp=udp, drive=simulation.drive)
 
 
 PROTOCOL = Protocol(

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from zbridge.protocol import Kept, Traffic
 
 FIRST_CLIENT = 2
-"""The id that a robot gives its first client."""
+"""The id that most robots give their first client; a deployed one gave 35."""
 LOOK_S = 5.0
 """Seconds after which a silent connection is a sign."""
 LOOK_AGAIN_S = 1.0
@@ -66,10 +66,14 @@ class Signs(Kept):
             self._silent = UNANSWERED if unanswered and not heard else None
 
     def gather(self, client_id: int, traffic: Traffic) -> tuple[str, ...]:
-        """List the present signs, for people."""
-        later = f"client id {client_id}: {LATER_CLIENT}" if client_id > FIRST_CLIENT else None
+        """List the present signs, for people.
+
+        A client id above :data:`FIRST_CLIENT` is listed only with another sign: a second HQ program gets such an id
+        too, and some robots begin with any number.
+        """
         few = traffic.malformed < max(MALFORMED, MALFORMED_SHARE * traffic.frames_in)
-        return tuple(filter(None, (later, None if few else GARBLED, self._silent)))
+        signs = tuple(filter(None, (None if few else GARBLED, self._silent)))
+        return (f"client id {client_id}: {LATER_CLIENT}", *signs) if signs and client_id > FIRST_CLIENT else signs
 
     def _listen(self, heard: int) -> None:
         self._talked = self._talked or heard > self._asked

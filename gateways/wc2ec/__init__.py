@@ -100,12 +100,13 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.wc2ec.conformance.hq_program import simulate_fragile_hq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")
     dialect = _dialect(simulation.dialect)
-    await simulate_fragile_hq(simulation.address.host, simulation.address.port, dialect=dialect.value)
+    address = simulation.address
+    await simulate_fragile_hq(address.host, address.port, dialect=dialect.value, drive=simulation.drive)
 
 
 PROTOCOL = Protocol(

@@ -227,3 +227,23 @@ async def test_a_bus_that_does_not_open_is_tried_again_at_other_times_and_with_m
     pauses = [after - before for (before, _), (after, _) in itertools.pairwise(tried)]
     assert 0.5 * RETRY_S <= min(pauses) < 0.9 * RETRY_S
     assert 1.1 * RETRY_S < max(pauses) <= 1.5 * RETRY_S
+
+
+@pytest.mark.parametrize(
+    ("bus", "reasons"),
+    [
+        ({}, ()),
+        ({"multicast": False, "listen": ["tcp/127.0.0.1:0"]}, ()),
+        ({"mode": "router", "listen": ["tcp/127.0.0.1:0"]}, ()),
+        ({"mode": "client"}, ("no bus",)),
+        ({"connect": ["tcp/127.0.0.1:1"]}, ("no bus",)),
+        ({"mode": "peer", "connect": ["tcp/127.0.0.1:1"]}, ("no bus",)),
+        ({"connect": ["tls/127.0.0.1:1"], "tls": {"ca": "ca.pem"}}, ("no bus",)),
+    ],
+    ids=str,
+)
+def test_a_peer_that_is_told_of_nobody_is_ready_alone_and_a_client_without_its_router_is_not(
+    bus: dict[str, Any], reasons: tuple[str, ...]
+) -> None:
+    listener = {"protocol": "tcpudp", "listen": "tcp://127.0.0.1:11002"}
+    assert Gateway(plan({"robot": {"name": "r1"}, "hq": [listener], "bus": bus})).missing() == reasons

@@ -150,9 +150,9 @@ def test_stop(zbridge: Any, bus: FakeBus) -> None:
     control, stops = bus.publisher("fleet/r1/control", topics.CONTROL), itertools.count(1)
     control.put(msgpack.packb(FREE))
 
-    def refuse(_: Sample) -> None:
-        refusals = [{**REFUSAL, "count": next(stops)}]
-        control.put(msgpack.packb({**FREE, "state": "stopped", "refusals": refusals}))
+    def refuse(sample: Sample) -> None:
+        refusals, shown = [{**REFUSAL, "count": next(stops)}], [msgpack.unpackb(sample.payload)["id"]]
+        control.put(msgpack.packb({**FREE, "state": "stopped", "refusals": refusals, "stops": shown}))
 
     bus.subscribe("fleet/r1/@cmd/stop", refuse)
     code, _, err = zbridge("stop", "--all")

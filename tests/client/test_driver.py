@@ -391,6 +391,7 @@ async def test_a_loss_is_told_at_once_and_by_every_command_and_nothing_is_asked_
                     await command(drive)
                 assert (str(raised.value), str(drive.loss)) == (said, said)
                 assert (raised.value.code, raised.value.holder) == (Code.LEASE_ENDED, holder)
+                assert not raised.value.expired
             assert len(world.machine.commands) == taken
             assert world.machine.stops >= 1
             assert drive.loss is not None
@@ -411,6 +412,40 @@ async def test_during_ends_where_the_lease_is_lost_or_its_commands_are_refused(e
         with pytest.raises(error):
             await drive.during(10.0, forward=0.5)
         assert world.loop.time() - began < 1.2
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.1])
+async def test_a_program_that_was_paused_moves_the_robot_again_only_after_a_neutral_that_it_sends(
+    late_s: float,
+) -> None:
+    """late_s: how long it takes the news of refusals to come."""
+    async with driving() as (world, drive):
+        await drive(forward=0.5)
+        await asyncio.sleep(1.0)  # longer than its deadman
+        stops = world.machine.stops
+        assert stops >= 1
+        with pytest.raises(NeutralFirst, match="r1: drive: "):
+            await drive.during(1.0, forward=0.6)
+        await asyncio.sleep(1.0)
+        assert world.gateway.driven == [Drive(forward=0.5)], "nothing is sent by itself"
+        with contextlib.suppress(NeutralFirst):
+            await drive(forward=0.6)
+        await asyncio.sleep(late_s)
+        await drive.neutral()
+        assert world.gateway.driven[-1] == Drive()
+        await drive.during(0.2, forward=0.7)
+        assert Drive(forward=0.6) not in world.gateway.driven
+        assert Drive(forward=0.7) in world.gateway.driven
+    with pytest.raises(LeaseLost):
+        await drive.neutral()
+
+
+async def test_a_neutral_hides_no_refusal_of_another_cause() -> None:
+    async with driving() as (world, drive):
+        await world.refused(drive)
+        with pytest.raises(NotReady, match=REFUSED):
+            await drive.neutral()
+        await drive.neutral()
 
 
 async def test_a_loop_that_only_drives_hears_of_its_loss() -> None:
@@ -439,8 +474,9 @@ async def test_a_gateway_that_is_gone_is_noticed_when_the_lease_must_have_run_ou
         await world.gateway.vanish()
         await asyncio.wait_for(drive.lost.wait(), 2 * LEASE_S)
         assert LEASE_S <= world.loop.time() - renewed_at <= LEASE_S * 5 / 3
-        with pytest.raises(LeaseLost, match=r"^r1: the gateway does not answer$"):
+        with pytest.raises(LeaseLost, match=r"^r1: the gateway does not answer$") as lost:
             await drive(forward=0.5)
+        assert lost.value.expired
     async with driving() as (world, _):
         await world.gateway.vanish()
         left_at = world.loop.time()

@@ -109,7 +109,8 @@ class Program:
     def _told(self, event: LeaseEvent) -> str:
         error = f": {type(event.error).__name__}: {event.error}" if event.error else ""
         by = f" by {event.holder} for {event.expires_in_s:g} s" if event.holder else ""
-        return f"{event.kind}{error}{by}{' unanswered' if event.unanswered else ''}"
+        expired = " expired" if event.expired else ""
+        return f"{event.kind}{error}{by}{' unanswered' if event.unanswered else ''}{expired}"
 
 
 ASK = "want -> acquire/ann; "
@@ -165,7 +166,12 @@ WAITING = [
         HOLD + "1 s -> renew; silence; 1 s -> renew; starting; 1 s -> renew; rubbish -> lost: BusError: no gateway*",
         "free",
     ),
-    ("the gateway's word ends it at once", CHECK + "ended -> lost: LeaseLost: *", "free"),
+    ("the gateway's word ends it at once", CHECK + "ended -> lost: LeaseLost: the lease has ended (stop)", "free"),
+    (
+        "a program that was paused for longer than the lease is told that it expired",
+        HOLD + "4 s -> renew; ended -> lost: LeaseLost: the lease has ended (stop) expired",
+        "free",
+    ),
     ("a repeated renewal loses nothing", CHECK + "out of order", "held"),
 ]
 

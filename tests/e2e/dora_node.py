@@ -3,7 +3,7 @@
 ``python -m tests.e2e.dora_node ENDPOINT FOLDER`` runs in an environment of its own (dora-rs 1.1.0, pyarrow, rosbags):
 writes types to FOLDER, listens to three robots, drives them by Twist, then by TwistStamped, calls a service of each,
 drives on, and ends while it does. What came is printed as one JSON object a line; monotonic seconds. It imports
-nothing of zbridge. :mod:`tests.e2e.dora_ros2` starts and judges it.
+nothing of zbridge. Each topic has a thread of its own. :mod:`tests.e2e.dora_ros2` starts and judges it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ import pyarrow as pa
 import rosbags.typesys.store as stores
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.e2e.lines import Lines
 
 LISTENED = {
     "/alf/scan": ("sensor_msgs/LaserScan", False),
@@ -46,9 +48,7 @@ SERVICES = {"std_srvs/srv/Trigger": ("", "bool success\nstring message")}
 PACKAGES = {"sensor_msgs", "nav_msgs", "tf2_msgs", "geometry_msgs", "std_msgs", "builtin_interfaces"}
 
 
-def say(**told: Any) -> None:
-    """Print one line."""
-    print(json.dumps(told), flush=True)
+say = Lines(sys.stdout)
 
 
 # Types

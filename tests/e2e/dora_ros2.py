@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from tests.e2e.processes import ROOT
 from tests.e2e.ros2_scene import FRAGILE, GRID, FragileInFleet, RosScene
 from tests.e2e.stalls import LIMIT_S, TOLERANCE
 
@@ -47,8 +48,8 @@ class Run:
 def run(python: str, scene: RosScene) -> Run:
     """Let dora's node run."""
     heard = Run()
-    command = [python, str(Path(__file__).with_name("dora_node.py")), scene.ros_at, str(scene.folder / "types")]
-    node = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    command = [python, "-m", "tests.e2e.dora_node", scene.ros_at, str(scene.folder / "types")]
+    node = subprocess.Popen(command, text=True, stdout=subprocess.PIPE, cwd=ROOT)  # warnings go to our own stderr
     scene.stack.callback(node.kill)
     alarm = threading.Timer(PATIENCE_S, node.kill)
     alarm.start()

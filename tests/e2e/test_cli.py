@@ -22,10 +22,10 @@ FILE = '[robot]\nname = "r1"\n' + device(1, options="gap = 1")
 NOBODY = "tcp://127.0.0.1:1"
 
 
-def zbridge(*arguments: str, module: str = "zbridge") -> subprocess.CompletedProcess[str]:
+def zbridge(*arguments: str, module: str = "zbridge", timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", module, *arguments]
     return subprocess.run(
-        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=30, cwd=ROOT, check=False
+        command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s, cwd=ROOT, check=False
     )
 
 
@@ -59,12 +59,16 @@ def test_a_bad_file_ends_run_and_the_error_names_file_key_and_value(module: str,
         ("stop r1 --all", 2, "--all"),
         ("stop a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
         ("drive a%b", 2, "ROBOT = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
-        ("simulate tcpudp", 2, "give either --listen"),
+        ("init tcpudp --name a%b", 2, "--name = 'a%b': expected letters, digits, '_', '.' and '-' only\n"),
+        ("echo /fleet/r1/pose", 2, "try 'fleet/r1/pose'\n"),
+        ("record --keys /fleet/** -o never.mcap", 2, "try 'fleet/**'\n"),
+        ("simulate tcpudp --listen tcp://127.0.0.1:0 --hq tcp://127.0.0.1:1", 2, "give either --listen"),
+        ("simulate tcpudp --drive 0.3", 2, "--drive is an HQ program's: expected with --hq"),
+        (f"simulate tcpudp --hq {NOBODY} --drive fast", 2, "drive = 'fast': expected FORWARD or FORWARD,TURN"),
         ("simulate tcpudp --listen udp://127.0.0.1:1", 1, "expected tcp://host:port"),
         ("simulate tcpudp --listen tcp://127.0.0.1:0 --camera 8000", 1, "expected tcp://host:port"),
         ("simulate tcpudp --hq tcp://127.0.0.1:1 --camera 127.0.0.1:8000", 2, "--camera is a robot's"),
         ("simulate tcpudp --listen tcp://127.0.0.1:0 --version 1.0", 2, "expected one of 1.1, 1.2, 1.3, 1.4"),
-        (f"simulate alf --hq {NOBODY}", 1, NOBODY),
         (f"probe tcpudp {NOBODY}", 2, "uses it up"),
     ],
 )
@@ -72,6 +76,14 @@ def test_what_cannot_be_done_is_said_without_a_traceback(command: str, code: int
     ran = zbridge(*command.split())
     assert (ran.returncode, ran.stdout) == (code, "")
     assert said in ran.stderr
+    assert "Traceback" not in ran.stderr
+    assert not (ROOT / "never.mcap").exists()
+
+
+def test_an_hq_program_that_finds_no_robot_says_so() -> None:
+    ran = zbridge("simulate", "alf", "--hq", NOBODY)
+    assert (ran.returncode, ran.stdout) == (1, "connecting to 127.0.0.1:1\n")
+    assert ran.stderr.startswith(f"zbridge: {NOBODY}: ")
     assert "Traceback" not in ran.stderr
 
 
@@ -131,7 +143,7 @@ def test_a_latched_robot_is_driven_by_nobody_before_it_is_unlatched(bench: Bench
 def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it(bench: Bench) -> None:
     port = free_port()
     bench.serve(bench.simulator(), listener("desk", "tcpudp", port))
-    program = bench.zbridge("simulate", "tcpudp", "--hq", f"tcp://127.0.0.1:{port}")
+    program = bench.zbridge("simulate", "tcpudp", "--hq", f"tcp://127.0.0.1:{port}", "--drive", "0.3")
 
     def listed(state: str) -> list[dict[str, Any]]:
         entries = zbridge("ls", "--json", "--sessions", "--connect", bench.endpoint).stdout.splitlines()
@@ -140,8 +152,14 @@ def test_a_program_to_play_with_is_listed_with_all_there_is_to_know_of_it(bench:
     (entry,) = until(lambda: listed("established"), what="the program")
     assert (entry["who"], entry["role"], entry["transport"]) == ("gateway", "robot", "udp")
     assert entry["version"] == "1.3"
-    assert end(program) == "", "it complained of nothing"
+    until(lambda: bench.fleet.last("r1/control").get("holder") == "hq.desk.2", what="its lease")
+    place = [bench.fleet.last("r1/pose")[axis] for axis in "xy"]
+    until(lambda: [bench.fleet.last("r1/pose")[axis] for axis in "xy"] != place, what="motion")
+    printed = end(program)
     assert program.returncode == 0
+    for line in ("established: client id 2, robot of ", "sends neutral", "drives: forward 0.3", "stops driving"):
+        assert line in printed
+    assert "violation" not in printed
     (gone,) = until(lambda: listed("closed"), what="its end")
     assert gone["reason"] == "closed by peer"
 
@@ -162,7 +180,7 @@ def test_probe_talks_to_a_robot_only_with_yes_and_asks_a_gateway_first(bench: Be
 
 
 def test_the_secure_demo_drives_its_robots_by_roles_and_ends_with_0() -> None:
-    shown = zbridge("demo", "--secure", "--seconds", "8")
+    shown = zbridge("demo", "--secure", "--seconds", "8", timeout_s=120.0)  # nine processes start, one by one
     assert (shown.returncode, shown.stderr) == (0, "")
     assert "router at tls/127.0.0.1:" in shown.stdout
     for protocol in protocol_names():

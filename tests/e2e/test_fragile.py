@@ -99,8 +99,8 @@ def test_a_poor_second_connection_is_named_and_not_driven(version: str, udp: boo
         assert fleet.reason() == ""
         robot.say("cut")
         until(lambda: fleet.state() == "offline", what="the loss")
-        until(lambda: fleet.reason().startswith("client id 3"), what="the hint")
         until(lambda: "no telemetry" in fleet.reason(), 20, what="the second sign")
+        assert fleet.reason().startswith("client id 3"), "the first sign"
         assert fleet.state() == "established"
         fleet.put("r1/@cmd/drive")
         fleet.put("r1/@cmd/drive", forward=0.9)

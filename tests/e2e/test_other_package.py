@@ -55,7 +55,20 @@ def test_every_protocol_holds_what_the_conformance_kit_asks(protocol: str) -> No
 
 
 def test_of_a_robot_that_has_no_hq_side_the_demo_says_so_and_a_listener_is_a_clear_error(tmp_path: Path) -> None:
+    """A package that cannot be imported, beside it, is one line, of the demo and of the check of its own file only."""
+    about = tmp_path / "site" / "torn-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: torn\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[zbridge.protocols]\ntorn = torn:PROTOCOL\n")
+    (tmp_path / "site" / "torn.py").write_text("import of_nothing\n")
+    why = "torn:PROTOCOL cannot be loaded: ModuleNotFoundError: No module named 'of_nothing' in <module> (torn.py:1)"
+    for protocol, code in (("torn", 2), ("alf", 0)):
+        file = tmp_path / f"{protocol}.toml"
+        file.write_text('[robot]\nname = "r1"\n' + device(1, protocol))
+        (line,) = run("zbridge", "check", str(file), code=code).splitlines()
+        assert (f"protocol = 'torn': {why}" in line) is bool(code)
     shown = run("zbridge", "demo", "--seconds", "8")
+    assert f"zbridge: protocol = 'torn': {why}; the demo goes on without it\n" in shown
     assert "  toy1: serves no HQ programs" in shown
     assert "  alf1: zbridge simulate alf --hq tcp://127.0.0.1:" in shown
     row = [line for line in shown.splitlines() if "toy1" in line and "│" in line][-1]

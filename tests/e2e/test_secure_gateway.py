@@ -19,18 +19,22 @@ from tests.ports import free_port
 from zbridge.app.roles import Member, Roles
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import folder_tls
+from zbridge.cli.restart import restart
 from zbridge.client import Fleet
-from zbridge.errors import BusError, Malformed
+from zbridge.errors import BusRefused, Malformed
 
 ROLES = Roles({**LAB.names, "op2": Member("operator")})
 DENIED_S = 0.7
 """How long the forbidden is tried."""
 
 
+def settings(bus: SecureBus, name: str) -> BusSettings:
+    return BusSettings(mode="client", connect=(bus.endpoint,), multicast=False, tls=folder_tls(bus.folders[name]))
+
+
 @contextlib.asynccontextmanager
 async def member(bus: SecureBus, name: str) -> AsyncIterator[Fleet]:
-    settings = BusSettings(mode="client", connect=(bus.endpoint,), multicast=False, tls=folder_tls(bus.folders[name]))
-    async with zbridge.connect(settings=settings) as fleet:
+    async with zbridge.connect(settings=settings(bus, name)) as fleet:
         yield fleet
 
 
@@ -40,8 +44,8 @@ async def established(fleet: Fleet) -> None:
             return
 
 
-async def refused(fleet: Fleet, who: str, name: str, *, takeover: bool = False) -> None:
-    with pytest.raises(BusError, match="no gateway answered"):
+async def refused(fleet: Fleet, who: str, name: str, may_not: str, *, takeover: bool = False) -> None:
+    with pytest.raises(BusRefused, match=f"r1: {may_not}"):
         async with fleet["r1"].control(who, name=name, takeover=takeover, wait_s=DENIED_S):
             raise AssertionError(f"{who} drives")
 
@@ -52,7 +56,9 @@ def tls(bus: SecureBus, name: str) -> str:
     return f'[bus.tls]\nca = "{files.ca}"\ncertificate = "{files.certificate}"\nkey = "{files.key}"\n'
 
 
-async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: Bench, tmp_path: Path) -> None:
+async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bus = SecureBus(tmp_path / "bus", ROLES)
     bench.stack.callback(bus.stop)
     port = free_port()
@@ -62,18 +68,22 @@ async def test_each_role_does_what_it_may_with_a_real_robot_and_no_more(bench: B
         await established(viewer)
         assert set(await viewer.robots()) == {"r1"}
         assert set(await viewer.sessions()) == {("r1", "gateway")}
-        await refused(viewer, "v1", "v1")
+        await refused(viewer, "v1", "v1", "viewer.v1 may not drive it: that takes the role operator or")
         async with operator["r1"].control("op1.laptop", name="op1") as drive:
             await drive.during(0.3, forward=0.3)
             await operator["r1"].ask_pose()
             with pytest.raises(Malformed, match="the certificate of this program says 'op2'"):
                 await another["r1"].control("op1.laptop", name="op1").__aenter__()
-            await refused(another, "op2", "op2", takeover=True)
+            await refused(another, "op2", "op2", "operator.op2 may not take it over: that takes", takeover=True)
             await drive(forward=0.1)
             assert drive.loss is None
             async with member(bus, "sup1") as supervisor, supervisor["r1"].control("sup1", takeover=True) as taken:
                 await taken.during(0.2, forward=0.2)
             assert drive.loss is not None
+        assert not await restart(settings(bus, "op1"), "fleet", "r1")
+        assert capsys.readouterr().err == (
+            "r1: operator.op1 may not restart its gateway: that takes the role supervisor in roles.toml of the router\n"
+        )
         await viewer["r1"].stop()
         with socket.create_connection((HOST, port)) as tcp:
             move = await asyncio.to_thread(tcpudp_by_tcp, tcp)

@@ -1,6 +1,7 @@
 """How protocols are found, and what every robot has by default."""
 
 import importlib.metadata
+import re
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 
@@ -57,6 +58,43 @@ def test_a_protocol_is_found_beside_others_of_its_distribution(tmp_path: Path, m
     for name, error in (("none", "math:pi is no zbridge protocol"), ("last", "expected one of .*tcpudp")):
         with pytest.raises(ConfigError, match=error):
             find_protocol(name)
+
+
+BROKEN = {
+    "absent": ("absent_module:PROTOCOL", r"ModuleNotFoundError: No module named 'absent_module'"),
+    "torn": ("broken_torn:PROTOCOL", r"SyntaxError: .*broken_torn\.py"),
+    "raises": ("broken_raises:PROTOCOL", r"ZeroDivisionError: division by zero in <module> \(broken_raises\.py:1\)$"),
+    "leaves": ("broken_leaves:PROTOCOL", r"SystemExit: 3 in <module> \(broken_leaves\.py:2\)$"),
+    "lacks": ("broken_lacks:PROTOCOL", r"AttributeError: module 'broken_lacks' has no attribute 'PROTOCOL'"),
+}
+SOURCES = {"torn": "def", "raises": "1 / 0", "leaves": "import sys\nsys.exit(3)", "lacks": "x = 1"}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_protocol_that_cannot_be_loaded_is_one_error_that_says_why(tmp_path: Path, monkeypatch, name: str) -> None:
+    where, why = BROKEN[name]
+    installed(tmp_path, f"[zbridge.protocols]\n{name} = {where}\n")
+    if name in SOURCES:
+        (tmp_path / f"broken_{name}.py").write_text(SOURCES[name])
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError) as error:
+        find_protocol(name)
+    assert re.match(f"protocol = '{name}': {where} cannot be loaded: {why}", str(error.value)), str(error.value)
+    assert "tcpudp" in protocol_names()
+
+
+@pytest.mark.parametrize("text", [b"\xff[zbridge.protocols]\n", b"[zbridge.protocols]\nno equals sign\n", b"[[\n="])
+def test_a_package_whose_entry_points_cannot_be_read_hides_no_protocol(
+    tmp_path: Path, monkeypatch, text: bytes
+) -> None:
+    installed(tmp_path, "")
+    (tmp_path / "other-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    (tmp_path / "other-1.0.dist-info" / "entry_points.txt").write_bytes(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert {"alf", "tcpudp", "wc2ec"} <= set(protocol_names())
+    assert find_protocol("alf").name == "alf"
+    with pytest.raises(ConfigError, match="'no equals sign': expected one of"):
+        find_protocol("no equals sign")
 
 
 def test_a_protocol_that_only_python_finds_is_found_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -726,8 +726,8 @@ def raise_key_error(*arguments: object) -> None:
     raise KeyError(1)
 
 
-KEY_ERROR = r"a fault of the protocol: KeyError: 1 \(test_device.py:\d+\)"
-NO_OUTCOME = r"a fault of the protocol: TypeError: Robot.command gave no Outcome \(commands.py:\d+\)"
+KEY_ERROR = r"a fault of the protocol: KeyError: 1 in \S+ \(test_device.py:\d+\)"
+NO_OUTCOME = r"a fault of the protocol: TypeError: Robot.command gave no Outcome in \S+ \(commands.py:\d+\)"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
@@ -85,6 +86,12 @@ def with_session(**methods: Any) -> Protocol:
 # The protocol object, and its messages
 
 
+class Listed(msgspec.Struct):
+    """A message with a field of which the kit knows no example."""
+
+    names: list[str]
+
+
 def breaks_on_noise(frame: bytes) -> Any:
     return {b"at": toy.read}[frame.split(b" ")[0]](frame)
 
@@ -107,7 +114,14 @@ TEMPLATE, SHOWN = "the template is a configuration of this protocol", "a session
         (broken(codecs=()), {"messages are declared": "codecs is empty"}),
         (with_codec(read=lambda frame: toy.At(toy.read(frame).x, 0.0, 0.0)), {ROUND_TRIP: "was read as"}),
         (with_codec(write=lambda message: 1 / 0), {ROUND_TRIP: "ZeroDivisionError"}),
-        (with_codec(messages=(object,)), {ROUND_TRIP: ""}),
+        (with_codec(messages=(object,)), {ROUND_TRIP: "object: the kit can make no example"}),
+        (
+            with_codec(messages=(Listed,)),
+            {
+                ROUND_TRIP: "Listed: the kit can make no example (Listed.names: list[str]: "
+                "expected one of int, float, bool, str, bytes, or a default): list an instance in Codec.messages"
+            },
+        ),
         (with_codec(frame_end=lambda data, start: start + 1000), {CUTS: "is cut to []"}),
         (with_codec(read=breaks_on_noise), {NOISE: "test_check.py:"}),
         (
@@ -143,15 +157,39 @@ ESTABLISHED = "the session with the simulated robot is established"
 @pytest.mark.parametrize(
     ("opened", "problem"),
     [
-        (lambda self, now: None, "handshaking after 0.3 s"),
-        (lambda self, now: self.fail("I do not like it"), "I do not like it"),
-        (lambda self, now: {}[1], "KeyError: 1 (test_check.py:"),
+        (
+            lambda self, now: None,
+            "link robot (BrokenSession): still handshaking after 0.3 s; expected Session.establish",
+        ),
+        (lambda self, now: self.fail("I do not like it"), "link robot (BrokenSession): ended: I do not like it"),
+        (lambda self, now: {}[1], "ended: a fault of the protocol: KeyError: 1 in <lambda> (test_check.py:"),
     ],
     ids=["never established", "ends at once", "raises"],
 )
 def test_a_session_that_is_not_established_is_found_with_its_reason(opened: Any, problem: str) -> None:
     protocol = with_session(opened=opened)
     assert_found(check_sessions(protocol, asyncio.run(record(protocol, 0.3))), {ESTABLISHED: problem})
+
+
+class Hasty(toy.ToySession):
+    """Reads a field that nobody has set."""
+
+    def opened(self, now: float) -> None:
+        self.establish({"y": "1.0"}["x"], ())
+
+
+def test_what_ends_a_session_names_class_field_and_expectation_and_no_time_that_nobody_waited() -> None:
+    protocol = with_session(opened=Hasty.opened)
+    (problem,) = failed(check_sessions(protocol, asyncio.run(record(protocol, 10.0)))).values()
+    assert re.sub(r":\d+", "", problem) == (
+        "link robot (BrokenSession): ended: a fault of the protocol: KeyError: 'x' in Hasty.opened (test_check.py); "
+        "expected ProtocolError for what a robot must not say, and no other exception"
+    )
+
+
+def test_a_robot_with_other_links_than_its_protocol_is_found() -> None:
+    expected = "ValueError: BrokenRobot.link_names: (), expected 1 of them (Protocol.links)"
+    assert_found(kit.check(with_robot(link_names=()), "toy"), {ESTABLISHED: expected})
 
 
 GARBAGE, SILENCE, END = "garbage at", "silence at", "the end of the connection at"
@@ -246,7 +284,7 @@ def only_drives(self: Any, topic: Any, command: Any, now: float) -> Outcome:
         ({"ask": lambda self, topic: None}, dict.fromkeys(QUESTIONS, "nothing is written for it")),
         (
             {"_go": lambda self, forward, turn, now: self._session.outbox.put({False: b"go"}[forward + turn == 2])},
-            {"drives at full scale": "KeyError: True (test_check.py:"},
+            {"drives at full scale": "KeyError: True in <lambda> (test_check.py:"},
         ),
     ],
     ids=claims,

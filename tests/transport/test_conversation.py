@@ -297,7 +297,7 @@ def raises(*arguments: object) -> None:
     raise KeyError(1)
 
 
-FAULT = r"a fault of the protocol: KeyError: 1 \(test_conversation.py:\d+\)"
+FAULT = r"a fault of the protocol: KeyError: 1 in \S+ \(test_conversation.py:\d+\)"
 
 
 @pytest.mark.parametrize("method", ["opened", "accept", "decode", "on_timer", "timers", "_deliver"])

@@ -6,7 +6,7 @@ Puts the rooms below together. Knows no protocol (they are found by their entry 
 
 from zbridge.app.config import Plan, load, plan
 from zbridge.app.gateway import Gateway
-from zbridge.app.tasks import together, until_signal
+from zbridge.app.tasks import until_signal
 from zbridge.app.templates import listener_template, robot_template
 
-__all__ = ["Gateway", "Plan", "listener_template", "load", "plan", "robot_template", "together", "until_signal"]
+__all__ = ["Gateway", "Plan", "listener_template", "load", "plan", "robot_template", "until_signal"]

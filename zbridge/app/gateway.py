@@ -196,7 +196,7 @@ class Gateway:
 
     def missing(self) -> tuple[str, ...]:
         """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
-        reasons = [] if self._on_the_bus else ["no bus"]
+        reasons = [] if self._on_the_bus or self._plan.config.bus.alone_is_normal else ["no bus"]
         if self._plan.device is not None:
             state = self._device_served.state if self._device_served is not None else "served by another gateway"
             reasons += [f"robot {state}"] * (state != "established")
@@ -302,7 +302,7 @@ class Gateway:
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
-            plan.protocol.robot(plan.options, len(plan.addresses), self.metrics),
+            plan.make_robot(self.metrics),
             plan.addresses,
             protocol=plan.protocol.name,
             keys=self._keys,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
@@ -20,12 +21,17 @@ log = logging.getLogger("zbridge.metrics")
 
 REQUEST_S = 2.0
 """Longest time a client may take to send its request and read the answer."""
-CLIENTS = 4
-"""Clients served at a time."""
+CLIENTS = 32
+"""Clients at a time; one more, and the oldest is closed: silent clients must not keep a scrape waiting."""
+PAUSE_S = 0.005
+"""Seconds from one accepted client to the next: a flood must not take the event loop's time."""
 _REQUEST_BYTES = 8192
 
 Missing = Callable[[], tuple[str, ...]]
 """``missing()``: why the gateway is of no use now; nothing if it is."""
+
+
+Clients = dict[asyncio.Task[None], socket.socket]
 
 
 @contextlib.asynccontextmanager
@@ -37,8 +43,8 @@ async def serve_metrics(
     Gives the sockets at which it listens; ``given``: those of another process, in place of new ones. An address in use
     is logged as an error and otherwise ignored.
 
-    Connections are accepted only while fewer than CLIENTS are served: a server of asyncio accepts all at once and
-    starves the rest of the process meanwhile.
+    Connections are accepted one by one, PAUSE_S apart: a server of asyncio accepts all at once and starves the rest of
+    the process meanwhile. Of more than CLIENTS the oldest is closed, so that whoever sends a request is answered.
     """
     try:
         sockets = list(given) or await waiting_sockets(address)
@@ -46,8 +52,8 @@ async def serve_metrics(
         log.error("metrics endpoint %s: %s", address, error.strerror or error)
         yield []
         return
-    room = asyncio.Semaphore(CLIENTS)
-    tasks = [asyncio.create_task(_accept(each, room, metrics, missing)) for each in sockets]
+    clients: Clients = {}
+    tasks = [asyncio.create_task(_accept(each, clients, metrics, missing)) for each in sockets]
     try:
         yield sockets
     finally:
@@ -58,31 +64,36 @@ async def serve_metrics(
             listening.close()
 
 
-async def _accept(listening: socket.socket, room: asyncio.Semaphore, metrics: Metrics, missing: Missing) -> None:
-    """Accept and serve clients, while there is room, until cancelled."""
-    loop, clients = asyncio.get_running_loop(), dict[asyncio.Task[None], socket.socket]()
-
-    def gone(task: asyncio.Task[None]) -> None:
-        clients.pop(task).close()
-        room.release()
-
+async def _accept(listening: socket.socket, clients: Clients, metrics: Metrics, missing: Missing) -> None:
+    """Accept and serve clients until cancelled. clients: of all sockets, the oldest first."""
+    loop = asyncio.get_running_loop()
     try:
         while True:
-            await room.acquire()
             try:
                 client, _ = await loop.sock_accept(listening)
             except OSError as error:  # no descriptor left: an immediate retry would use up the processor
                 log.debug("metrics endpoint: %s", error)
-                room.release()
                 await asyncio.sleep(REQUEST_S)
                 continue
+            if len(clients) >= CLIENTS:
+                _close(clients, next(iter(clients)))
             task = asyncio.create_task(_serve(client, metrics, missing))
             clients[task] = client
-            task.add_done_callback(gone)
+            task.add_done_callback(functools.partial(_close, clients))
+            await asyncio.sleep(PAUSE_S)
     finally:
-        for task in tuple(clients):
-            task.cancel()
-        await asyncio.gather(*clients, return_exceptions=True)
+        ending = tuple(clients)
+        for task in ending:
+            _close(clients, task)
+        await asyncio.gather(*ending, return_exceptions=True)
+
+
+def _close(clients: Clients, task: asyncio.Task[None]) -> None:
+    """End a client; idempotent."""
+    task.cancel()
+    client = clients.pop(task, None)
+    if client is not None:
+        client.close()
 
 
 async def _serve(client: socket.socket, metrics: Metrics, missing: Missing) -> None:

@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import signal
 from collections.abc import Callable, Coroutine, Mapping
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:
@@ -37,9 +39,12 @@ async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:
 
 
 async def until_signal(
-    work: Coroutine[Any, Any, None], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
-) -> None:
-    """Run a coroutine until it ends, or SIGTERM or SIGINT comes: then end it. ``on``: what other signals run beside."""
+    work: Coroutine[Any, Any, T], on: Mapping[int, Callable[[], Coroutine[Any, Any, None]]] | None = None
+) -> T | None:
+    """Run a coroutine until it ends, and return its result; or until SIGTERM or SIGINT: then end it, and return None.
+
+    ``on``: what other signals run beside.
+    """
     task = asyncio.ensure_future(work)
     loop = asyncio.get_running_loop()
     asked: list[int] = []
@@ -56,7 +61,8 @@ async def until_signal(
     for other, begin in (on or {}).items():
         loop.add_signal_handler(other, _start_beside, begin, beside)
     with contextlib.suppress(asyncio.CancelledError):
-        await task
+        return await task
+    return None
 
 
 def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:

@@ -25,6 +25,7 @@ from zbridge.bus.interface import (
     Sort,
     Tls,
 )
+from zbridge.errors import ConfigError
 from zbridge.fleet.topics import SizeBounds
 from zbridge.metrics import Metrics
 
@@ -49,6 +50,7 @@ __all__ = [
     "hear_zenoh",
     "open_bus",
     "open_router",
+    "read_key_expr",
 ]
 
 
@@ -108,3 +110,18 @@ def hear_zenoh(handler: Callable[[str], None]) -> None:
     from zbridge.bus.zenoh import hear_log
 
     hear_log(handler)
+
+
+def read_key_expr(option: str, text: str) -> str:
+    """Return a key expression in Zenoh's canonical form; raise ConfigError, which names the option and what is wrong.
+
+    Ask this before subscribing to what a person wrote: Zenoh's own error is no ZbridgeError.
+    """
+    from zbridge.bus.zenoh import canonical
+
+    try:
+        return canonical(text)
+    except ValueError as error:
+        chunks = "/".join(filter(None, text.split("/")))
+        hint = f"; keys neither begin nor end with '/': try {chunks!r}" if chunks and text.strip("/") != text else ""
+        raise ConfigError(f"{option} = {text!r}: {error}{hint}") from error

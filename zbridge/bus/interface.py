@@ -64,6 +64,11 @@ class BusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         alone = self.tls is not None or (self.connect and not self.listen)
         return self.mode or ("client" if alone else "peer")
 
+    @property
+    def alone_is_normal(self) -> bool:
+        """Whether a session may be healthy without any connection: it waits for others, and is told of nobody."""
+        return self.effective_mode != "client" and not self.connect
+
 
 class Neighbour(msgspec.Struct, frozen=True):
     """A process that is connected to a router. name: the common name of its certificate, None without one."""

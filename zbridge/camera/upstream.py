@@ -63,21 +63,27 @@ def _request(source: Source) -> bytes:
 
 
 async def _read(reader: asyncio.StreamReader, stall_s: float, took: Took) -> None:
+    """Read until the stream ends. What is read at once is not timed by ``timeout_at``: the deadline is checked too."""
     loop, mjpeg, budget = asyncio.get_running_loop(), MjpegReader(), Budget()
-    deadline = loop.time() + stall_s
+    deadline, stalled = loop.time() + stall_s, LinkError(f"no picture for {stall_s:g} s")
     while not mjpeg.ended:
         try:
             async with asyncio.timeout_at(deadline):
                 data = await reader.read(_READ_BYTES)
         except TimeoutError:
-            raise LinkError(f"no picture for {stall_s:g} s") from None
+            raise stalled from None
         if not data:
             break
         parts = mjpeg.receive(data)
-        rest_s = budget.rest_s(len(data), len(parts) + mjpeg.rejected, loop.time())
+        now = loop.time()
+        rest_s = budget.rest_s(len(data), len(parts) + mjpeg.rejected, now)
         took(mjpeg, parts)
         mjpeg.rejected = 0
-        await asyncio.sleep(min(rest_s, stall_s))
         if parts:
+            await asyncio.sleep(min(rest_s, stall_s))
             deadline = loop.time() + stall_s
+        else:
+            await asyncio.sleep(max(0.0, min(rest_s, deadline - now)))
+            if loop.time() >= deadline:
+                raise stalled
     raise LinkError("the stream ended")

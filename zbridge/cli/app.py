@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import logging
+import tomllib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from zbridge.app import listener_template, load, robot_template, together, until_signal
+from zbridge.app import listener_template, load, robot_template, until_signal
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
+from zbridge.app.tasks import together
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
 from zbridge.cli import certs, give_up, hand_on_tls, recordings, robots, run_gateway, run_loop, run_together, set_up_log
-from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder
+from zbridge.cli.options import Connect, FileTls, Realm, TlsFolder, check_name
 from zbridge.client import bus_settings
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import shown
+from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
 from zbridge.protocol.plugin import HqSimulation, Protocol, Simulation, find_protocol, protocol_names
 
@@ -82,6 +85,8 @@ def check(file: File, tls: FileTls = None) -> None:
     robot, parts = plan.config.robot, []
     try:
         certificate = check_member(plan)
+        if plan.device is not None:
+            plan.device.make_robot(Metrics())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
     if plan.device is not None:
@@ -109,6 +114,7 @@ def init(
     hq: Annotated[bool, typer.Option("--hq", help="for a process that only serves HQ programs")] = False,
 ) -> None:
     """Print a commented configuration to start from."""
+    check_name("--name", name)
     found = find_protocol(protocol)
     if hq and found.hq is None:
         give_up(2, f"{protocol} serves no HQ programs")
@@ -121,10 +127,16 @@ def simulate(
     protocol: Annotated[str, typer.Argument(help="one of: " + ", ".join(protocol_names()), show_default=False)],
     listen: Annotated[
         list[str],
-        typer.Option(help="address to listen at, tcp://host:port; port 0: any free one; once for each link"),
+        typer.Option(
+            help="address to listen at, tcp://host:port; port 0: any free one; once for each link. "
+            "By default where `zbridge init` expects a robot"
+        ),
     ] = [],
     hq: Annotated[
         str, typer.Option(help="be an HQ program instead, as fragile as deployed ones, and connect to this address")
+    ] = "",
+    drive: Annotated[
+        str, typer.Option(help="with --hq: drive FORWARD or FORWARD,TURN, fractions of full scale: 0.3 or 0.3,-0.2")
     ] = "",
     seed: Annotated[int, typer.Option(help="the same seed makes the same world")] = 1,
     version: Annotated[str, typer.Option(help="version of the protocol; the newest common one by default")] = "",
@@ -137,15 +149,18 @@ def simulate(
     """Simulate a robot, or an HQ program, until SIGTERM or SIGINT."""
     set_up_log(verbose=verbose)
     simulated = find_protocol(protocol)
-    if bool(listen) == bool(hq):
+    if listen and hq:
         give_up(2, "give either --listen, to be a robot, or --hq, to be an HQ program")
     if camera and hq:
         give_up(2, "--camera is a robot's: expected without --hq")
+    if drive and not hq:
+        give_up(2, "--drive is an HQ program's: expected with --hq")
     if hq:
-        simulate_hq(simulated, HqSimulation(Address.parse(hq), version or None, dialect or None, udp))
+        program = HqSimulation(Address.parse(hq), version or None, dialect or None, udp, read_drive(drive))
+        simulate_hq(simulated, program)
         return
     simulation = Simulation(
-        tuple(map(Address.parse, listen)),
+        tuple(map(Address.parse, listen or default_addresses(simulated))),
         seed,
         version or None,
         dialect or None,
@@ -154,6 +169,28 @@ def simulate(
         lambda addresses: print(f"listening on {' '.join(map(str, addresses))}", flush=True),  # noqa: T201
     )
     run_loop(until_signal(simulate_robot(simulated, simulation, camera)))
+
+
+def default_addresses(protocol: Protocol) -> list[str]:
+    """Return where the protocol's template expects a robot; raise ConfigError if it names no address of that kind."""
+    device = tomllib.loads(protocol.template).get("device", {})
+    addresses = [text for text in device.get("connect", []) if text.startswith("tcp://")]
+    if not addresses:
+        raise ConfigError(f"listen: missing, the template of {protocol.name} names no address tcp://host:port")
+    return addresses
+
+
+def read_drive(text: str) -> tuple[float, float] | None:
+    """Read ``FORWARD`` or ``FORWARD,TURN``; None for an empty text. Raises ConfigError."""
+    if not text:
+        return None
+    try:
+        forward, turn = (*map(float, text.split(",")), 0.0)[:2]
+        if text.count(",") < 2 and abs(forward) <= 1.0 and abs(turn) <= 1.0:
+            return forward, turn
+    except ValueError:
+        pass
+    raise ConfigError(f"drive = {text!r}: expected FORWARD or FORWARD,TURN, each -1 to 1")
 
 
 async def simulate_robot(simulated: Protocol, simulation: Simulation, camera: str) -> None:

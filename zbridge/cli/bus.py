@@ -7,25 +7,26 @@ import contextlib
 import json
 import math
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from zbridge.bus import Bus, BusSettings, Sample, open_bus
+from zbridge.bus import Bus, BusSettings, Sample, open_bus, read_key_expr
 from zbridge.bus.tls.refusal import why_not
 from zbridge.client import connect
-from zbridge.errors import PayloadError
+from zbridge.errors import ConfigError, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import FleetMessage, SessionEntry, Status
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
-from zbridge.fleet.topics import is_name, split_key
+from zbridge.fleet.topics import is_concrete, is_name, split_key
 from zbridge.metrics import Metrics
 
 _SHOWN = 8
@@ -123,6 +124,15 @@ def cell(text: str) -> Text:
     return Text(shown(text, _CELL))
 
 
+def print_columns(rows: Sequence[tuple[str, ...]]) -> None:
+    """Print rows of equal length in columns. A table of rich costs a millisecond a row: it is for fewer rows."""
+    cells = [[shown(text, _CELL) for text in row] for row in rows]
+    widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        padded = (text + " " * (width - cell_len(text)) for text, width in zip(row, widths, strict=True))
+        print(" ", "  ".join(padded).rstrip(), sep="")  # noqa: T201
+
+
 def _robot_table(robots: dict[str, Status | None]) -> Table:
     table = Table("robot", "state", "host", "protocol", "version", "features", "reason", box=None)
     for name, status in robots.items():
@@ -141,23 +151,56 @@ def _summary(robots: dict[str, Status | None]) -> str:
     return f"{len(robots)} robots: " + ", ".join(f"{count} {state}" for state, count in counts.most_common())
 
 
-async def echo(settings: BusSettings, key: str, *, as_json: bool, count: int) -> None:
-    """Print the messages on ``key``, the last value of each state first; count: end after so many, 0 = never."""
-    seen, done = 0, asyncio.Event()
+class EchoOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """What ``zbridge echo`` prints. realm: None takes that of the key. count, seconds: end after so many, 0 = never."""
+
+    key: str
+    realm: str | None = None
+    as_json: bool = False
+    count: int = 0
+    seconds: float = 0.0
+
+
+async def echo(settings: BusSettings, options: EchoOptions) -> bool:
+    """Print the messages on a key, the last value of each state first.
+
+    Return False if ``seconds`` passed with fewer messages than ``count``, or with none. Raise ConfigError for what is
+    no key expression, or none of the realm.
+    """
+    key = read_key_expr("KEY", options.key)
+    count, seen, done = options.count, 0, asyncio.Event()
+    realm = _realm_of(key, options.realm)
 
     def show(sample: Sample) -> None:
         nonlocal seen
         if count and seen >= count:
             return
         seen += 1
-        console.print(_line(sample, as_json=as_json))
+        console.print(_line(sample, as_json=options.as_json))
         if seen == count:
             done.set()
 
-    realm = key.partition("/")[0]
-    async with joined(settings, realm if is_name(realm) else None) as bus:
+    async with joined(settings, realm) as bus:
         bus.subscribe(key, show, history=True)
-        await done.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(options.seconds or None):
+                await done.wait()
+    if seen and seen >= count:
+        return True
+    errors.print(shown(f"{seen or 'no'} messages on {key} within {options.seconds:g} s"))
+    return False
+
+
+def _realm_of(key: str, realm: str | None) -> str | None:
+    """Return the realm of a key expression, None where it has several; raise ConfigError if it is not ``realm``."""
+    first = key.partition("/")[0]
+    if realm is None:
+        return first if is_name(first) else None
+    if not is_name(realm):
+        raise ConfigError(f"realm = {realm!r}: expected letters, digits, '_', '.' and '-' only")
+    if is_concrete(first) and first != realm:
+        raise ConfigError(f"KEY = {key!r}: expected a key of realm {realm}, as {realm + '/' + key!r}")
+    return realm
 
 
 def _line(sample: Sample, *, as_json: bool) -> str:

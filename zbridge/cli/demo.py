@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import math
 import sys
@@ -28,7 +29,7 @@ from zbridge.cli.bus import cell
 from zbridge.cli.processes import end, free_port, process
 from zbridge.cli.secure_demo import REALM, START_S, DemoBus, secure_bus
 from zbridge.client import LOCAL_ROUTER, Fleet, Robot
-from zbridge.errors import BusError, PayloadError, Refused, ZbridgeError
+from zbridge.errors import BusError, ConfigError, LeaseLost, NeutralFirst, NotReady, PayloadError, Refused, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Pose, Status
@@ -38,8 +39,9 @@ from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Protocol, find_protocol, protocol_names
 
 REFRESH_S = 0.5
+FIGURE: tuple[dict[str, float], ...] = ({"forward": 0.6}, {"turn": 0.5})
 FIGURE_S = 2.0
-"""Seconds that the robots drive straight on, then turn, and so on."""
+"""Seconds of each motion: the robots drive straight on, then turn, and so on."""
 PRIORITY = -1
 """Below the default of 0: anybody else who asks for a robot gets it."""
 _RATES = ("pose", "scan", "map", "sensor")
@@ -100,39 +102,56 @@ async def run_demo(seconds: float, *, secure: bool = False) -> None:
 
     secure: on mutual TLS, with roles; raises ConfigError where no certificates can be made.
     """
-    robots = {f"{name}1": name for name in protocol_names() if _is_whole(find_protocol(name))}
+    robots = {f"{name}1": name for name in protocol_names() if _is_whole(name)}
     watch = Watch(list(robots))
     async with contextlib.AsyncExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="zbridge-demo-")))
         log = stack.enter_context((folder / "log").open("w+b"))
         bus = await stack.enter_async_context(secure_bus(folder, log, list(robots)) if secure else _open_to_all())
         listeners = {robot: f"tcp://127.0.0.1:{free_port()}" for robot in robots}
-        processes = [
-            await stack.enter_async_context(_robot(folder, log, robot, protocol, listeners[robot], bus.table(robot)))
-            for robot, protocol in robots.items()
-        ]
+        processes, failed = [], list[str]()
+        for robot, protocol in robots.items():
+            starting = _robot(folder, log, robot, protocol, listeners[robot], bus.table(robot))
+            try:
+                processes.append(await stack.enter_async_context(starting))
+            except ZbridgeError as error:
+                failed.append(_left_out(error))
+                del watch.rows[robot]
         for key_expr in ("*", "sensor/*"):
             bus.looking.subscribe(f"{REALM}/*/{key_expr}", watch.take)
         how = [
             f"router at {bus.endpoint}; try, in another terminal:",
             *(f"  {line}" for line in bus.commands),
             "HQ programs connect to the robots here; to simulate one:",
-            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in robots),
+            *(f"  {name}: {_how_to_connect(find_protocol(robots[name]), listeners[name])}" for name in watch.rows),
         ]
         await until_signal(_show(bus.driving, watch, seconds, how))
-        simulators, gateways = zip(*processes, strict=True)
-        await end(gateways)  # all at once: each needs about a second to stop its robot
-        await end(simulators)
-        silent = [robot for robot, row in watch.rows.items() if not row.heard]
-        if seconds and silent:
-            for line in (folder / "log").read_text(errors="replace")[-2000:].splitlines():
-                print(shown(line), file=sys.stderr)  # noqa: T201
-            raise ZbridgeError(f"no data from {', '.join(silent)}; the end of the processes' log is above")
+        await end([gateway for _, gateway in processes])  # all at once: each needs about a second to stop its robot
+        await end([simulator for simulator, _ in processes])
+        failed += [f"no data from {robot}" for robot, row in watch.rows.items() if not row.heard]
+        if seconds and failed:
+            _print_end(folder / "log")
+            raise ZbridgeError(f"{'; '.join(failed)}; the end of the processes' log is above")
 
 
-def _is_whole(protocol: Protocol) -> bool:
-    """Tell whether what the protocol's robots need is installed."""
-    return all(find_spec(module) is not None for module in protocol.requires)
+def _left_out(error: ZbridgeError) -> str:
+    """Print why the demo goes on without a protocol; return it."""
+    print(shown(f"zbridge: {error}; the demo goes on without it"), file=sys.stderr)  # noqa: T201
+    return str(error)
+
+
+def _print_end(log: Path) -> None:
+    for line in log.read_text(errors="replace")[-2000:].splitlines():
+        print(shown(line), file=sys.stderr)  # noqa: T201
+
+
+def _is_whole(name: str) -> bool:
+    """Tell whether a protocol can be loaded, and what its robots need is installed; print why it cannot be loaded."""
+    try:
+        return all(find_spec(module) is not None for module in find_protocol(name).requires)
+    except ConfigError as error:
+        _left_out(error)
+        return False
 
 
 def _how_to_connect(protocol: Protocol, listener: str) -> str:
@@ -170,9 +189,11 @@ async def _robot(
     listen, options = found.links * ("--listen", "tcp://127.0.0.1:0"), found.simulated
     async with process(log, "simulate", protocol, *listen, read=True) as simulator:
         assert simulator.stdout is not None
-        async with asyncio.timeout(START_S):
-            line = (await simulator.stdout.readline()).decode()
-        addresses = [word for word in line.split() if word.startswith("tcp://")]
+        line = b""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(START_S):
+                line = await simulator.stdout.readline()
+        addresses = [word for word in line.decode().split() if word.startswith("tcp://")]
         if not addresses:
             raise ZbridgeError(f"the {protocol} simulator did not start")
         file = folder / f"{robot}.toml"
@@ -201,7 +222,7 @@ async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> N
         print(line, flush=True)  # noqa: T201
     loop = asyncio.get_running_loop()
     started = loop.time()
-    wandering = [asyncio.create_task(_wander(fleet[robot])) for robot in watch.rows]
+    wandering = [asyncio.create_task(wander(fleet[robot])) for robot in watch.rows]
     try:
         with Live(console=Console(), auto_refresh=False) as live:
             while not seconds or loop.time() - started < seconds:
@@ -213,10 +234,24 @@ async def _show(fleet: Fleet, watch: Watch, seconds: float, how: list[str]) -> N
         await asyncio.gather(*wandering, return_exceptions=True)
 
 
-async def _wander(robot: Robot) -> None:
-    """Drive straight on, turn, and so on, until somebody else takes the robot."""
+async def wander(robot: Robot) -> None:
+    """Drive straight on, turn, and so on, until somebody else takes the robot, or stops it.
+
+    If this program was paused meanwhile, the robot was stopped, and the program begins anew: with a neutral, or with a
+    new lease if the pause was longer than the lease. A robot that accepts no commands for now is waited for.
+    """
     with contextlib.suppress(Refused, BusError):
-        async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
-            while True:
-                await drive.during(FIGURE_S, forward=0.6)
-                await drive.during(FIGURE_S, turn=0.5)
+        while True:
+            try:
+                async with robot.control("demo", priority=PRIORITY, wait_s=START_S) as drive:
+                    for motion in itertools.cycle(FIGURE):
+                        try:
+                            await drive.during(FIGURE_S, **motion)
+                        except NeutralFirst:
+                            with contextlib.suppress(NotReady):
+                                await drive.neutral()
+                        except NotReady:
+                            await asyncio.sleep(REFRESH_S)
+            except LeaseLost as loss:
+                if not loss.expired:
+                    raise

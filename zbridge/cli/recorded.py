@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.table import Table
 
 import zbridge
 from zbridge.app import until_signal
-from zbridge.bus import BusSettings
+from zbridge.bus import BusSettings, read_key_expr
 from zbridge.bus.tls.member import own_name, own_role
-from zbridge.cli.bus import cell, console, errors, joined
+from zbridge.cli.bus import console, errors, joined, print_columns
 from zbridge.client.driver import default_who
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import as_json as to_json
@@ -37,8 +36,6 @@ _LOSSES = 20
 """Keys with losses that are printed."""
 _LEAST_BUFFER = 2**20
 _MARKS_NOT = ("viewer", "recorder")
-_TABLE = 180
-"""Characters of a line of a table, at least, also where the terminal has fewer."""
 
 
 class RecordOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -90,6 +87,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         raise ConfigError(f"only = {options.only!r}: expected 'fleet' or 'foxglove'")
     if not is_name(options.realm):
         raise ConfigError(f"realm = {options.realm!r}: expected letters, digits, '_', '.' and '-' only")
+    keys = read_key_expr("keys", options.keys) if options.keys else None
     duration_s = amounts.read_seconds("duration", options.duration) if options.duration else None
     tape = Tape(_tape_settings(options))
     buffer, _ = amounts.read_split(options.buffer)
@@ -104,7 +102,7 @@ async def run_record(settings: BusSettings, options: RecordOptions) -> bool:
         pictures=Pictures() if options.only != "fleet" else None,
         failed=lambda: loop.call_soon_threadsafe(full.set),
     )
-    plan = RecordPlan(options.realm, options.robots, options.keys, options.wire)
+    plan = RecordPlan(options.realm, options.robots, keys, options.wire)
     async with joined(settings, options.realm) as bus:
         recorder.start()
         recording = Recording(bus, plan, intake)
@@ -130,7 +128,8 @@ def _tell_end(recorder: Recorder, tape: Tape, seconds: float) -> None:
     if recorder.error is not None:
         errors.print(shown(recorder.error))
     files = ", ".join(map(str, tape.files[-3:]))
-    errors.print(shown(f"{recorder.messages} messages in {seconds:.1f} s, {tape.bytes_written} bytes: {files}"))
+    came = f"; {recorder.messages} came from the bus" if recorder.messages != tape.messages else ""
+    errors.print(shown(f"{tape.messages} messages in {seconds:.1f} s, {tape.bytes_written} bytes: {files}{came}"))
     losses = recorder.losses()
     for reason, by_key in losses.items():
         errors.print(shown(f"lost, {reason}: {sum(by_key.values())}"))
@@ -175,14 +174,11 @@ def _print_info(summary: Summary) -> None:
     console.print(shown(f"robots: {', '.join(summary.robots) or 'none'}"))
     for name, pairs in summary.metadata:
         console.print(shown(f"{name}: " + ", ".join(f"{key} {value}" for key, value in pairs.items() if value)))
-    console.width = max(console.width, _TABLE)
-    table = Table("key", "messages", "Hz", "longest pause s", "gaps", "bytes", "schema", box=None)
-    for column in table.columns:
-        column.no_wrap = True
+    rows: list[tuple[str, ...]] = [("key", "messages", "Hz", "longest pause s", "gaps", "bytes", "schema")]
     for key in summary.keys:
         numbers = (key.count, f"{key.rate_hz:.2f}", f"{key.gap_s:.3f}", key.gaps or "", key.bytes)
-        table.add_row(*map(cell, map(str, (key.topic, *numbers, key.schema or key.encoding))))
-    console.print(table, crop=False)
+        rows.append((key.topic, *map(str, numbers), key.schema or key.encoding))
+    print_columns(rows)
 
 
 def _day(stamp_ns: int) -> str:

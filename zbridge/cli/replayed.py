@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -20,7 +20,7 @@ from zbridge.fleet.printable import shown
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
-from zbridge.protocol.plugin import find_protocol
+from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.views.recording import amounts
 from zbridge.views.recording.export import first_ns
 from zbridge.views.recording.player import Player
@@ -73,7 +73,8 @@ async def run_replay(settings: BusSettings, options: ReplayOptions) -> None:
         with _keys(replay.player) if plan.paused else contextlib.nullcontext():
             errors.print(shown(", ".join(f"{recorded} as {name}" for recorded, name in plan.names.items())))
             await until_signal(replay.run())
-    errors.print(shown(f"{replay.player.played} messages played"))
+    others = f", {replay.left_out} left out (other robots, commands, queries, raw frames, pictures)"
+    errors.print(shown(f"{replay.played} messages played{others if replay.left_out else ''}"))
     if replay.fault is not None:
         errors.print(shown(f"the recording is not whole: {replay.fault}"))
 
@@ -117,14 +118,28 @@ async def run_wire(path: Path, protocol: str, listen: list[str], robots: list[st
     known = seen.robots
     if len(robots) > 1 or (len(known) > 1 and not robots) or (robots and robots[0] not in known):
         raise ConfigError(f"robot: the recording has {', '.join(known)}: name one by --robot")
-    names = found.robot(found.options(), len(addresses), Metrics()).link_names
     keys = KeySpace(realm, robots[0] if robots else known[0])
-    if missing := set(names) - set(seen.links.get(keys.robot, ())):
-        there = ", ".join(seen.links.get(keys.robot, ())) or "none: record it with --wire"
-        raise ConfigError(f"as-robot: no raw frames of link {', '.join(sorted(missing))}; the recording has {there}")
+    names = _links(found, len(addresses), seen.links.get(keys.robot, []))
     links = [WireLink(path, keys, name, speed, lambda text: errors.print(shown(text))) for name in names]
     ready = [lambda at, name=link.link: print(f"{name} listens at {at}", flush=True) for link in links]  # noqa: T201
     await until_signal(together(*(link.run(at, tell) for link, at, tell in zip(links, addresses, ready, strict=True))))
     for link in links:
         less = f"; in {link.unanswered} conversations the gateway said less than then" if link.unanswered else ""
         errors.print(shown(f"{link.link}: {link.frames} frames{less}"))
+
+
+def _links(protocol: Protocol, count: int, recorded: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the links of a robot with so many; raise ConfigError if the recording has other ones."""
+    names = {
+        number: protocol.robot(protocol.options(), number, Metrics()).link_names
+        for number in range(1, protocol.links + 1)
+    }
+    missing = set(names[count]) - set(recorded)
+    if not missing:
+        return names[count]
+    there = ", ".join(recorded) or "none: record it with --wire"
+    fitting = next((each for each in names.values() if set(each) <= set(recorded)), None)
+    if fitting is not None:
+        often = f"give {len(fitting)} --listen, in this order" if len(fitting) > 1 else "give one --listen"
+        raise ConfigError(f"listen: the recorded robot has the links {', '.join(fitting)}: {often}")
+    raise ConfigError(f"as-robot: no raw frames of link {', '.join(sorted(missing))}; the recording has {there}")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 from zbridge.bus import Bus, BusSettings
 from zbridge.bus.tls.member import own_name
+from zbridge.bus.tls.membership import Right, lacking
 from zbridge.cli.bus import console, errors, joined
 from zbridge.client.driver import default_who
 from zbridge.errors import BusError
@@ -15,6 +17,7 @@ from zbridge.fleet.topics import KeySpace, is_name, split_key
 
 ANSWER_S = 60.0
 """Longest wait for a gateway: a successor has 30 s to start."""
+_UNANSWERED = "no gateway answers"
 
 
 async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: str | None = None) -> bool:
@@ -27,6 +30,8 @@ async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: 
         names = [robot] if robot is not None else await _robots(bus, realm)
         keys = [KeySpace(realm, name) for name in names]
         refusals = await asyncio.gather(*(_restart_one(bus, each, who) for each in keys))
+        if _UNANSWERED in refusals:
+            refusals = await asyncio.gather(*map(partial(_explained, bus, who), keys, refusals))
     for name, refusal in zip(names, refusals, strict=True):
         if refusal is None:
             console.print(shown(f"{name}: restarted"))
@@ -35,6 +40,13 @@ async def restart(settings: BusSettings, realm: str, robot: str | None, *, who: 
     if not names:
         errors.print(f"no gateways on {realm}/")
     return bool(names) and not any(refusals)
+
+
+async def _explained(bus: Bus, who: str, keys: KeySpace, refusal: str | None) -> str | None:
+    """Return the refusal, or the role that this program lacks where nobody answered."""
+    if refusal != _UNANSWERED:
+        return refusal
+    return await lacking(bus.ask, keys.realm, who, keys.robot, Right.RESTART) or refusal
 
 
 async def _robots(bus: Bus, realm: str) -> list[str]:
@@ -49,5 +61,5 @@ async def _restart_one(bus: Bus, keys: KeySpace, who: str) -> str | None:
     except BusError as error:
         return str(error)
     if not answers:
-        return "no gateway answers"
+        return _UNANSWERED
     return next((str(answer.error) for answer in answers if answer.error is not None), None)

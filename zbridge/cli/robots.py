@@ -113,13 +113,22 @@ def echo(
     connect: Connect = [],
     tls: TlsFolder = None,
     json: Annotated[bool, typer.Option("--json", help="one JSON object a line, arrays in full")] = False,
-    count: Annotated[int, typer.Option(help="end after this many messages; 0: run until interrupted")] = 0,
+    count: Annotated[int, typer.Option(help="end after this many messages; 0: no limit", min=0)] = 0,
+    seconds: Annotated[float, typer.Option(help="end after this time; 0: no limit", min=0.0)] = 0.0,
+    realm: Annotated[
+        str, typer.Option(help="first chunk of all keys; that of KEY by default", show_default=False)
+    ] = "",
 ) -> None:
-    """Print the messages on a key, decoded."""
+    """Print the messages on a key, decoded, until SIGTERM or SIGINT, --count or --seconds.
+
+    Exit code 1: the time passed with fewer messages than --count, or with none.
+    """
     from zbridge.cli import bus
 
     set_up_log(verbose=False, level=logging.ERROR)
-    run_loop(until_signal(bus.echo(bus_settings(connect, tls), key, as_json=json, count=count)))
+    options = bus.EchoOptions(key=key, realm=realm or None, as_json=json, count=count, seconds=seconds)
+    if run_loop(until_signal(bus.echo(bus_settings(connect, tls), options))) is False:
+        raise typer.Exit(1)
 
 
 @app.command()

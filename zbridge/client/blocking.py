@@ -293,6 +293,10 @@ class Driver:
         """Drive for so many seconds, then send neutral."""
         self._loop.run(self._driver.during(seconds, forward, left, turn))
 
+    def neutral(self) -> None:
+        """Send neutral, which ends a NeutralFirst; see :meth:`zbridge.client.driver.Driver.neutral`."""
+        self._loop.run(self._driver.neutral())
+
     def motor(self, name: str, value: float) -> None:
         """Move one motor: rad/s, or metres for a linear motor."""
         self._loop.run(self._driver.motor(name, value))

@@ -10,12 +10,13 @@ from collections.abc import AsyncIterator, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
+from zbridge.bus.tls.membership import Right, lacking
 from zbridge.control.clocks import raw_ms
 from zbridge.control.lease_client import RETRY_S, LeaseClient
 from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.control.lease_holder import LeaseHolder
 from zbridge.control.wishes import NAMED
-from zbridge.errors import BusError, Held, LeaseLost, PayloadError, Refused
+from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -26,6 +27,8 @@ __all__ = ["RETRY_S", "Driver", "default_who", "holding"]
 
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
+SETTLED_S = 0.15
+"""Seconds until ``control`` has shown what was refused before a neutral; a gateway shows it within 0.05."""
 _MOVING = ("drive", "mode", "motor/", "raw/")
 """What the names of commands begin with that need the lease."""
 
@@ -43,7 +46,8 @@ class Driver:
     """The lease of one robot: ``await drive(forward=0.3)``, again and again, for motion lasts only ``deadman_s``.
 
     ``lost`` is set when the lease is lost; from then on every command raises LeaseLost, which says why, and who holds
-    the robot. A command that the gateway refused is raised as Refused by the next command.
+    the robot. A command that the gateway refused is raised as Refused by the next command: as NeutralFirst where the
+    robot was stopped, because the program was paused for example; then :meth:`neutral`, and begin anew.
     """
 
     def __init__(self, bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float) -> None:
@@ -53,6 +57,8 @@ class Driver:
         self.loss: LeaseLost | None = None
         self._bus = bus
         self._keys = keys
+        self._name = name
+        self._takeover = takeover
         self._wait_s = wait_s
         self._client = LeaseClient(
             keys, request, name, concerns=self._concerns, clock_ms=raw_ms, takeover=takeover, wait_s=wait_s
@@ -82,13 +88,29 @@ class Driver:
         await asyncio.sleep(0)  # a program that drives in a loop must leave time to notice a loss
 
     async def during(self, seconds: float, forward: float = 0.0, left: float = 0.0, turn: float = 0.0) -> None:
-        """Drive for so many seconds, then send neutral."""
+        """Drive for so many seconds, then send neutral; raise as a call does."""
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while (left_s := end - loop.time()) > 0:
             await self(forward, left, turn)
             await asyncio.sleep(min(REPEAT_S, left_s))
         await self()
+
+    async def neutral(self) -> None:
+        """Send neutral: the answer of a program to NeutralFirst, before it begins its motion anew.
+
+        The gateway stops a robot whose driver was paused for longer than ``deadman_s``, and refuses motion until a
+        neutral: nothing moves because a program wakes up, only because it decides to. Refusals that come of motion sent
+        before are dropped for :data:`SETTLED_S`; a later one is raised by the next motion: answer it likewise. A robot
+        that is driven by motors takes ``motor(name, 0.0)`` as neutral. Raises LeaseLost, or Refused as a call does.
+        """
+        for settled_s in (SETTLED_S, 0.0):  # twice: a bus that is full drops drives
+            if isinstance(self._refusal, NeutralFirst):
+                self._refusal = None
+            await self()
+            await asyncio.sleep(settled_s)
+        if isinstance(self._refusal, NeutralFirst):
+            self._refusal = None
 
     async def motor(self, name: str, value: float) -> None:
         """Move one motor: rad/s, or metres for a linear motor; must be repeated like a drive."""
@@ -131,8 +153,9 @@ class Driver:
         given_ms: the raw clock when the program gave it.
         """
         if self.loss is not None:
-            loss = self.loss  # raise a new one each time: the traceback of a raised exception grows
-            raise LeaseLost(str(loss), loss.code, holder=loss.holder)
+            loss = LeaseLost(str(self.loss), self.loss.code, holder=self.loss.holder)
+            loss.expired = self.loss.expired
+            raise loss  # a new one each time: the traceback of a raised exception grows
         refusal, self._refusal = self._refusal, None
         if refusal is not None and getattr(message, "moving", True):
             raise refusal
@@ -149,7 +172,8 @@ class Driver:
         """Get the lease.
 
         Raises Held if another program has it, Malformed if it cannot be asked for like this; after ``wait_s`` NotReady
-        or TooFast if the gateway went on saying so, BusError if none answered.
+        or TooFast if the gateway went on saying so, BusError if none answered; BusRefused where that is because a
+        router knows this program by a role that may not drive.
         """
         self._holder.announce()
         with contextlib.suppress(BusError, PayloadError):
@@ -159,7 +183,14 @@ class Driver:
                     break
         self._spawn(self._holder.keep())
         self._holder.want()
-        await self._granted
+        try:
+            await self._granted
+        except BusError:
+            right = Right.TAKE_OVER if self._takeover else Right.DRIVE
+            lacks = await lacking(self._bus.ask, self._keys.realm, self._name, self.robot, right)
+            if lacks is not None:
+                raise BusRefused(f"{self.robot}: {lacks}") from None
+            raise
 
     def look(self, sample: Sample) -> None:
         """Take news from ``control``: the holder of the lease, and refusals of this program's commands."""
@@ -194,7 +225,7 @@ class Driver:
 
     def _on_event(self, event: LeaseEvent) -> None:
         if event.kind is LeaseEventKind.LOST:
-            self._lose("the gateway does not answer" if event.unanswered else str(event.error), event.holder)
+            self._lose("the gateway does not answer" if event.unanswered else str(event.error), event)
         elif not self._granted.done():
             if event.kind is LeaseEventKind.GRANTED:
                 self._granted.set_result(None)
@@ -213,9 +244,11 @@ class Driver:
             return refused(error.code, f"{self.robot}: {error}")
         return error
 
-    def _lose(self, reason: str, holder: str | None = None) -> None:
+    def _lose(self, reason: str, event: LeaseEvent | None = None) -> None:
+        holder = event.holder if event is not None else None
         text = f"{self.robot}: {reason}" + (f"; held by {holder}" if holder else "")
         self.loss = LeaseLost(text, holder=holder)
+        self.loss.expired = event is not None and event.expired
         self.lost.set()
 
 

@@ -175,7 +175,7 @@ class ControlFeed(StateFeed[Control]):
         priority: a program with a higher priority is given the robot of one with a lower priority.
         deadman_s: motion that is not repeated within this time ends; the robot's configuration caps it.
         takeover: take the robot from its holder. wait_s: longest wait for the robot's gateway, seconds.
-        Raises Held with the holder's name, BusError if no gateway answers, or Refused as the gateway did.
+        Raises Held with the holder's name, BusError if nobody answers or the role lacks, or Refused as the gateway did.
         """
         who, name = _names(who, name, self._own)
         request = Acquire(

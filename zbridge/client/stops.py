@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 from zbridge.bus import Bus, Sample
-from zbridge.errors import BusError, NotReady, PayloadError, Refused, refusal
+from zbridge.bus.tls.membership import Right, lacking
+from zbridge.errors import BusError, BusRefused, NotReady, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, Latch, Refusal, Status, Stop, Unlatch
@@ -106,7 +107,7 @@ async def unlatch_robot(bus: Bus, keys: KeySpace, name: str) -> tuple[Latch, ...
     latches = await _latches(bus, keys)
     own = tuple(latch for latch in latches if not latch.fleet) or latches
     for latch in own:
-        await _release(bus, keys, topics.RPC_UNLATCH(name), latch.id)
+        await _release(bus, keys, name, latch.id, fleet=False)
     return own
 
 
@@ -128,8 +129,7 @@ async def unlatch_fleet(bus: Bus, realm: str, names: Iterable[str], name: str) -
         alone = {latch.id for latch in known if not latch.fleet}
         try:
             for stop_id in sorted(ids):
-                family = topics.RPC_UNLATCH if stop_id in alone else topics.RPC_UNLATCH_FLEET
-                await _release(bus, KeySpace(realm, robot), family(name), stop_id)
+                await _release(bus, KeySpace(realm, robot), name, stop_id, fleet=stop_id not in alone)
         except (Refused, BusError) as error:
             outcomes[robot] = error
     return outcomes
@@ -142,14 +142,18 @@ async def _latches(bus: Bus, keys: KeySpace) -> tuple[Latch, ...]:
     return control.latches
 
 
-async def _release(bus: Bus, keys: KeySpace, topic: Topic, stop_id: bytes) -> None:
+async def _release(bus: Bus, keys: KeySpace, name: str, stop_id: bytes, *, fleet: bool) -> None:
+    topic = (topics.RPC_UNLATCH_FLEET if fleet else topics.RPC_UNLATCH)(name)
     question = payloads.encode(Unlatch(id=stop_id))
     for answer in await bus.ask(keys.key(topic.path), question, timeout_s=ANSWER_S):
         if isinstance(answer.error, Refused):
             raise refusal(answer.error.code, f"{keys.robot}: {answer.error}")
         if answer.error is None:
             return
-    raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s, or the router's rules forbid it")
+    right = Right.UNLATCH_FLEET if fleet else Right.UNLATCH
+    if lacks := await lacking(bus.ask, keys.realm, name, keys.robot, right):
+        raise BusRefused(f"{keys.robot}: {lacks}")
+    raise BusError(f"{keys.robot}: no gateway answered within {ANSWER_S:g} s")
 
 
 async def _shown(

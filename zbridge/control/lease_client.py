@@ -211,9 +211,10 @@ class LeaseClient:
             expires_in_s = reply.expires_in_s if isinstance(reply, Lease) else None
             self._handle(Input.CONFIRMED, now, question.asked_at + (expires_in_s or self._lease_s))
         elif self._wait_s is None or (isinstance(reply, Lease) and not passes(reply)):
-            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, reply))
+            expired = now >= self._expires_at
+            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, reply, expired=expired))
         elif now >= self._expires_at:
-            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, None))
+            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, None, expired=True))
         else:
             self._handle(Input.UNANSWERED, now)
 

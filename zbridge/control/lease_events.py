@@ -64,7 +64,8 @@ class LeaseEventKind(StrEnum):
 class LeaseEvent(msgspec.Struct, frozen=True):
     """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if told.
 
-    unanswered: whether no gateway said so. expires_in_s: how long the holder's lease lasts at least.
+    unanswered: whether no gateway said so. expires_in_s: how long the holder's lease lasts at least. expired: whether a
+    lost lease was not renewed in time.
     """
 
     kind: LeaseEventKind
@@ -72,16 +73,17 @@ class LeaseEvent(msgspec.Struct, frozen=True):
     holder: str | None = None
     expires_in_s: float | None = None
     unanswered: bool = False
+    expired: bool = False
 
     @classmethod
-    def of(cls, kind: LeaseEventKind, reply: Reply) -> LeaseEvent:
+    def of(cls, kind: LeaseEventKind, reply: Reply, *, expired: bool = False) -> LeaseEvent:
         """Tell what was replied instead of a lease."""
         if reply is None:
-            return cls(kind, BusError(NO_ANSWER), unanswered=True)
+            return cls(kind, BusError(NO_ANSWER), unanswered=True, expired=expired)
         if isinstance(reply, Lease):
             error = refusal(reply.code or "", reply.reason or "no reason given", holder=reply.holder)
-            return cls(kind, error, reply.holder, reply.expires_in_s)
-        return cls(kind, reply)
+            return cls(kind, error, reply.holder, reply.expires_in_s, expired=expired)
+        return cls(kind, reply, expired=expired)
 
 
 def read(replied: Sequence[Answer] | BusError) -> Reply:

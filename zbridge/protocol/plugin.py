@@ -7,23 +7,22 @@ from __future__ import annotations
 
 import math
 import operator
-import sys
 import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
 from importlib import import_module
-from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
 
-from zbridge.errors import ConfigError, Unsupported
+from zbridge.errors import ConfigError, Unsupported, describe
 from zbridge.fleet.messages import Drive, FleetMessage, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address, DeviceAddress, ZenohAddress, parse_device_address
 from zbridge.protocol.codec import Codec
+from zbridge.protocol.entry_points import entry_points, find_entry_point
 from zbridge.protocol.kept import Kept
 from zbridge.protocol.session import Limits, Session, State
 from zbridge.protocol.session_table import ClientIds
@@ -223,12 +222,16 @@ class HqSide(Kept, ABC):
 
 
 class HqSimulation(msgspec.Struct, frozen=True):
-    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects."""
+    """How a simulated HQ program is started. It is as fragile as deployed ones. ``address``: where it connects.
+
+    ``drive``: forward and turn that it drives once it has sent neutral, fractions of full scale; None: none.
+    """
 
     address: Address
     version: str | None = None
     dialect: str | None = None
     udp: bool = False
+    drive: tuple[float, float] | None = None
 
 
 class Simulation(msgspec.Struct, frozen=True):
@@ -293,41 +296,20 @@ class Protocol(msgspec.Struct, frozen=True):
 
 
 def protocol_names() -> tuple[str, ...]:
-    """List the installed protocols."""
-    from importlib.metadata import entry_points  # here: it loads sockets and threads
-
-    return tuple(sorted(point.name for point in entry_points(group=GROUP)))
+    """List the installed protocols, those that cannot be loaded too."""
+    return tuple(sorted({point.name for point in entry_points(GROUP)}))
 
 
 def find_protocol(name: str) -> Protocol:
-    """Find an installed protocol; raise ConfigError that lists the installed ones."""
-    where = _entry_point(name) or _any_entry_point(name)
+    """Find an installed protocol; raise ConfigError that lists the installed ones, or says why it cannot be loaded."""
+    where = find_entry_point(GROUP, name)
     if where is None:
         raise ConfigError(f"protocol = {name!r}: expected one of {', '.join(protocol_names()) or '(none installed)'}")
     module, _, attributes = where.partition(":")
-    protocol = operator.attrgetter(attributes)(import_module(module))
+    try:
+        protocol = operator.attrgetter(attributes)(import_module(module))
+    except (Exception, SystemExit) as error:  # of a foreign package: it must not end what serves other protocols
+        raise ConfigError(f"protocol = {name!r}: {where} cannot be loaded: {describe(error)}") from error
     if isinstance(protocol, Protocol):
         return protocol
     raise ConfigError(f"protocol = {name!r}: {where} is no zbridge protocol")
-
-
-def _entry_point(name: str) -> str | None:
-    """Return ``module:attribute`` of a protocol's entry point, as installers write it beside the packages.
-
-    This saves a gateway 2 MB and 15 ms: :mod:`importlib.metadata` loads parsers of mails and archives.
-    """
-    for folder in sys.path:
-        for file in sorted(Path(folder).glob("*.dist-info/entry_points.txt")):
-            _, _, section = file.read_text("utf-8").partition(f"[{GROUP}]\n")
-            for line in section.partition("\n[")[0].splitlines():
-                key, _, where = line.partition("=")
-                if key.strip() == name:
-                    return where.partition("[")[0].strip()  # without the extras it may need
-    return None
-
-
-def _any_entry_point(name: str) -> str | None:
-    """Return it wherever Python finds it, in archives too."""
-    from importlib.metadata import entry_points
-
-    return next((point.value for point in entry_points(group=GROUP, name=name)), None)

@@ -6,8 +6,10 @@ from typing import Annotated, Any
 
 import msgspec
 
+from zbridge.errors import FAULT, ConfigError, describe
+from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
-from zbridge.protocol.plugin import Protocol
+from zbridge.protocol.plugin import Protocol, Robot
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -24,3 +26,10 @@ class DevicePlan(msgspec.Struct, frozen=True):
     protocol: Protocol
     options: Any
     addresses: tuple[DeviceAddress, ...]
+
+    def make_robot(self, metrics: Metrics) -> Robot:
+        """Make the device side; raise ConfigError where the protocol's own code cannot."""
+        try:
+            return self.protocol.robot(self.options, len(self.addresses), metrics)
+        except Exception as error:
+            raise ConfigError(f"device.protocol = {self.protocol.name!r}: {FAULT}{describe(error)}") from error

@@ -36,7 +36,9 @@ def check(protocol: Protocol, name: str, *, establish_s: float = ESTABLISH_S) ->
     try:
         recording = asyncio.run(record(protocol, establish_s))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken("the session with the simulated robot is established", error)
+        yield Finding.broken(
+            "the session with the simulated robot is established", error, "a simulated robot that listens"
+        )
         return
     yield from check_sessions(protocol, recording)
     if not recording.established:

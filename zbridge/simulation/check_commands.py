@@ -8,13 +8,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from zbridge.errors import EncodeError, Refused, describe
+from zbridge.errors import EncodeError, Refused
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw, Scan, SensorSetting, Switch, Text
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding
+from zbridge.simulation.check_report import Finding, raised
 from zbridge.simulation.check_stage import STEP_S, Recording, Rehearsal, robot_of
 
 STOP_S = 0.5
@@ -33,19 +33,19 @@ def check_stop(protocol: Protocol, recording: Recording) -> Iterator[Finding]:
     try:
         yield Finding.of(claim, _stop(protocol, recording))
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield Finding.broken(claim, error)
+        yield Finding.broken(claim, error, "a stop that is put into the outbox")
     claim = "a stop is repeated until its time is over"
     try:
         yield Finding(claim, _repeated(protocol, recording))
     except Exception as error:
-        yield Finding.broken(claim, error)
+        yield Finding.broken(claim, error, "a stop that is put into the outbox")
     claim = "a stop before the first connection is refused or ignored"
     try:
         robot_of(protocol).stop(0.0, 0.0)
     except Refused:
         pass
     except Exception as error:
-        yield Finding.broken(claim, error)
+        yield Finding.broken(claim, error, "nothing, or Refused")
         return
     yield Finding(claim)
 
@@ -107,7 +107,7 @@ def check_commands(protocol: Protocol, recording: Recording) -> Iterator[Finding
             rehearsal = _established(protocol, recording)
             results = [_carry_out(rehearsal, topic, command) for command in commands]
         except Exception as error:  # whatever the protocol's own code raises is a finding
-            yield Finding.broken(claim, error)
+            yield Finding.broken(claim, error, "an Outcome, or Refused")
             continue
         silent = None if any(results) else "accepted, but nothing is written, shown, refused or left out"
         yield Finding(claim, silent, next(filter(None, results), ""))
@@ -125,7 +125,7 @@ def _corners(protocol: Protocol, recording: Recording) -> Finding:
                 rehearsal.robot.command(topics.CMD_DRIVE, drive, rehearsal.now)
             rehearsal.run(STEP_S)
         except Exception as error:
-            problems.append(f"{drive}: {describe(error)}")
+            problems.append(f"{drive}: {raised(error, 'an Outcome, or Refused')}")
     return Finding.of(claim, problems)
 
 
@@ -146,7 +146,7 @@ def _question(protocol: Protocol, recording: Recording, topic: Topic) -> Finding
     except Refused as refusal:
         return Finding(claim, None, refusal.code)
     except Exception as error:
-        return Finding.broken(claim, error)
+        return Finding.broken(claim, error, "a question to the robot, or Refused")
 
 
 def _carry_out(rehearsal: Rehearsal, topic: Topic, command: FleetMessage) -> str:

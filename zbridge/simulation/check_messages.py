@@ -13,7 +13,7 @@ import numpy as np
 from zbridge.errors import EncodeError, ProtocolError, describe
 from zbridge.protocol.codec import Codec
 from zbridge.protocol.plugin import Protocol
-from zbridge.simulation.check_report import Finding
+from zbridge.simulation.check_report import Finding, raised
 from zbridge.wire import Whole
 from zbridge.wire.fields import CountedArray, Filling
 from zbridge.wire.frames import FrameBuffer, FramingFault
@@ -39,11 +39,23 @@ def check_messages(protocol: Protocol) -> Iterator[Finding]:
 def example(declared: type) -> Any:
     """Make an example of a message class: fields without a default get a value of their type."""
     values = {
-        field.name: _value(field.type)
+        field.name: _value_of(declared, field)
         for field in msgspec.structs.fields(declared)
         if field.required  # the default of another field is its example
     }
     return declared(**values)
+
+
+def _value_of(declared: type, field: msgspec.structs.FieldInfo) -> Any:
+    try:
+        return _value(field.type)
+    except (KeyError, TypeError) as error:
+        what = f"{declared.__qualname__}.{field.name}: {_name_of(field.type)}"
+        raise LookupError(f"{what}: expected one of {', '.join(map(_name_of, _VALUES))}, or a default") from error
+
+
+def _name_of(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint)
 
 
 def _value(hint: Any) -> Any:
@@ -66,8 +78,9 @@ def _examples(codec: Codec) -> tuple[list[Any], list[str]]:
     for declared in codec.messages:
         try:
             messages.append(example(declared) if isinstance(declared, type) else declared)
-        except (KeyError, TypeError) as error:
-            problems.append(f"no example of {declared} can be made ({error!r}): list an instance of it")
+        except (LookupError, TypeError, ValueError) as error:
+            name = getattr(declared, "__qualname__", declared)
+            problems.append(f"{name}: the kit can make no example ({error}): list an instance in Codec.messages")
     return messages, problems
 
 
@@ -84,7 +97,7 @@ def _frames(codec: Codec, messages: list[Any], problems: list[str]) -> list[byte
             elif codec.write(again) != frame:
                 problems.append(f"{message} is written as {frame!r}, and as {codec.write(again)!r} once read")
         except Exception as error:  # whatever the protocol's own code raises is a finding
-            problems.append(f"{message}: {describe(error)}")
+            problems.append(f"{message}: {raised(error, 'a frame, and the same message of it')}")
     return frames
 
 
@@ -115,7 +128,7 @@ def _try(problems: list[str], what: str, cut: Callable[[], list[bytes]], expecte
     try:
         found = cut()
     except Exception as error:
-        problems.append(f"{what}: {describe(error)}")
+        problems.append(f"{what}: {raised(error, 'frames or ProtocolError')}")
         return
     if found != expected:
         problems.append(f"{what} is cut to {found!r}, expected {expected!r}")
@@ -149,7 +162,7 @@ def _fed(codec: Codec, streams: list[bytes]) -> list[str]:
         except ProtocolError:
             pass
         except Exception as error:
-            problems.setdefault(describe(error), f"{stream!r}: {describe(error)}")
+            problems.setdefault(describe(error), f"{stream!r}: {raised(error, 'a message or ProtocolError')}")
     return list(problems.values())
 
 

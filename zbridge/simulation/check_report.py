@@ -23,15 +23,20 @@ class Finding(msgspec.Struct, frozen=True):
         return cls(claim, "; ".join(problems[:_SHOWN]) + more, note)
 
     @classmethod
-    def broken(cls, claim: str, error: BaseException) -> Finding:
-        """Make the finding of a claim whose check ended with an exception."""
-        return cls(claim, describe(error))
+    def broken(cls, claim: str, error: BaseException, expected: str = "") -> Finding:
+        """Make the finding of a claim whose check ended with an exception; ``expected``: what should have come."""
+        return cls(claim, raised(error, expected))
 
     def __str__(self) -> str:
         note = f" ({self.note})" if self.note else ""
         return (
             f"ok    {self.claim}{note}" if self.problem is None else f"FAIL  {self.claim}{note}\n      {self.problem}"
         )
+
+
+def raised(error: BaseException, expected: str) -> str:
+    """Say what the protocol's own code raised, in which class and line, and what was expected instead."""
+    return f"{describe(error)}; expected {expected}" if expected else describe(error)
 
 
 _SHOWN = 3

@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
-from zbridge.errors import ProtocolError, describe
+from zbridge.errors import ProtocolError
 from zbridge.fleet import payload as payloads
 from zbridge.protocol.plugin import Protocol
 from zbridge.protocol.session import State
-from zbridge.simulation.check_report import Finding
+from zbridge.simulation.check_report import Finding, raised
 from zbridge.simulation.check_stage import Recording, Rehearsal, robot_of
 
 STEPS = 12
@@ -34,7 +34,7 @@ def check_sessions(protocol: Protocol, recording: Recording) -> Iterator[Finding
     try:
         steps = _steps(protocol, recording)
     except Exception as error:
-        yield Finding.broken("what the robot said establishes a session again", error)
+        yield Finding.broken("what the robot said establishes a session again", error, "the same session again")
         return
     tried = f"each step of the handshake ({len(steps)})"
     for claim, go_wrong in (("garbage", _garbage), ("silence", _silence), ("the end of the connection", _lost)):
@@ -65,7 +65,7 @@ def _at(
             for problem in go_wrong(rehearsal, [noise, *recording.heard[step : step + 3]]):
                 yield f"after {step} frames: {problem}"
     except Exception as error:  # whatever the protocol's own code raises is a finding
-        yield f"after {step} frames: {describe(error)}"
+        yield f"after {step} frames: {raised(error, 'a session that goes on, or Session.fail with a reason')}"
 
 
 def _garbage(rehearsal: Rehearsal, frames: list[bytes]) -> Iterator[str]:
@@ -113,5 +113,5 @@ def _translated(protocol: Protocol, recording: Recording) -> list[str]:
         except ProtocolError:
             continue
         except Exception as error:
-            problems.append(f"{message}: {describe(error)}")
+            problems.append(f"{message}: {raised(error, 'telemetry of its topics, or ProtocolError')}")
     return problems

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any
 
 import msgspec
 
-from zbridge.errors import ProtocolError
+from zbridge.errors import FAULT, ProtocolError
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.metrics import Metrics
@@ -29,6 +29,7 @@ HANG_UP_S = 0.2
 """Seconds that the simulated robot is given to see that its peer is gone."""
 STEP_S = 0.01
 """Virtual seconds between two frames of a rehearsal."""
+_HANDLED = "ProtocolError for what a robot must not say, and no other exception"
 _MOST_WRITES = 10_000
 _MOST_FRAMES = 400
 _ANSWER_FRAMES = 8
@@ -66,8 +67,11 @@ class Live:
 
     async def connect(self, addresses: tuple[Address, ...]) -> None:
         """Begin a conversation with each link of the simulated robot."""
-        loop = asyncio.get_running_loop()
-        for name, address in zip(self.robot.link_names, addresses, strict=True):
+        loop, names = asyncio.get_running_loop(), self.robot.link_names
+        if len(names) != len(addresses):
+            kind = type(self.robot).__qualname__
+            raise ValueError(f"{kind}.link_names: {names}, expected {len(addresses)} of them (Protocol.links)")
+        for name, address in zip(names, addresses, strict=True):
             session = self.robot.session(name, str(address))
             if not self.sessions:
                 session.tap = lambda direction, frame: self.frames.append((direction, frame))
@@ -89,6 +93,17 @@ class Live:
                 return True
             await asyncio.sleep(STEP_S)
         return False
+
+    def lacking(self, within_s: float) -> Iterator[str]:
+        """Say of each link that is not established what it is, or why its session ended."""
+        for name, session in zip(self.robot.link_names, self.sessions, strict=True):
+            which = f"link {name} ({type(session).__qualname__})"
+            if session.over:
+                reason = session.reason or "no reason given"
+                expected = f"; expected {_HANDLED}" if reason.startswith(FAULT) else ""
+                yield f"{which}: ended: {reason}{expected}"
+            elif session.state is not State.ESTABLISHED:
+                yield f"{which}: still {session.state.value} after {within_s:g} s; expected Session.establish"
 
     def pump(self) -> None:
         """Write what may be written."""
@@ -130,13 +145,12 @@ async def record(protocol: Protocol, establish_s: float) -> Recording:
         established = await scene.established(establish_s)
         if established:
             await asyncio.sleep(SHOWN_S)
-        reasons = [session.reason or session.state.value for session in scene.sessions]
         return Recording(
             [frame for direction, frame in scene.frames if direction == "in"][:_MOST_FRAMES],
             _answers(scene.frames),
             list(scene.messages),
             established,
-            None if established else f"{'; '.join(reasons)} after {establish_s:g} s",
+            None if established else "; ".join(scene.lacking(establish_s)),
             sum(session.traffic.unanswered for session in scene.sessions),
         )
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import enum
-import logging
 import math
 import re
 import socket
@@ -23,7 +22,6 @@ import msgspec
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.parser import DRIVE, END, INFO, INIT, NO_ID, SCAN, Dialect, show
-from zbridge.simulation.fragile import log_violations, print_death
 from zbridge.simulation.judge import Ended, Judge
 from zbridge.simulation.sockets import connected
 from zbridge.simulation.ticker import Ticker
@@ -42,10 +40,9 @@ _SERVED = {"drive": (INFO, END), "laser": (INIT, SCAN, END), "both": (INIT, SCAN
 _BEARS = 10
 """Measurements after which the deployed driving program stops reading."""
 _NOT_POINTS, _LONGEST_NUMBER = 4, 12
-_ANGLES = {"text": (-90, 0, 90), "binary": (0, 90, 180)}
-_FULL = {"text": 255, "binary": 100}
+ANGLES = {"text": (-90, 0, 90), "binary": (0, 90, 180)}
+FULL = {"text": 255, "binary": 100}
 _READ_BYTES = 65536
-_log = logging.getLogger(__name__)
 
 
 class Told(msgspec.Struct, frozen=True):
@@ -208,7 +205,7 @@ class FragileHq(Judge):
         keep: int = 10_000,
         note: Callable[[str], None] | None = None,
     ) -> None:
-        if dialect not in _FULL or serves not in ("auto", *_SERVED):
+        if dialect not in FULL or serves not in ("auto", *_SERVED):
             raise ValueError(f"no such HQ: dialect {dialect!r}, serves {serves!r}")
         super().__init__(keep=keep, note=note)
         self.dialect: Dialect = dialect
@@ -252,9 +249,9 @@ class FragileHq(Judge):
 
         Raise ValueError for what no HQ program of the dialect sends.
         """
-        left, straight, right = _ANGLES[self.dialect]
+        left, straight, right = ANGLES[self.dialect]
         steering = straight if steering is None else steering
-        if not (0 <= speed <= _FULL[self.dialect] and direction in (0, 1) and left <= steering <= right):
+        if not (0 <= speed <= FULL[self.dialect] and direction in (0, 1) and left <= steering <= right):
             raise ValueError(f"{self.dialect}: speed {speed}, direction {direction}, steering {steering}")
         self._command = (speed, direction, steering, int(light))
 
@@ -431,25 +428,3 @@ class FragileHq(Judge):
         if not self._midway:
             with contextlib.suppress(OSError):
                 conn.send(wire.write(self.dialect, END, [1]))
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    points: int = wire.POINTS,
-) -> None:
-    """Run the fragile driving HQ until cancelled, dead or left by the vehicle; log violations, print what it died of.
-
-    Raise OSError if nobody listens.
-    """
-    hq = FragileHq(
-        dialect=dialect,
-        points=points,
-        serves="both",  # what the listener is configured to serve is not known here
-        deployed="driving",
-        note=log_violations(_log),
-    )
-    await hq.run(host, port)
-    print_death(hq)

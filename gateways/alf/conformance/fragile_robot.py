@@ -84,8 +84,8 @@ class FragileVehicle(FragileServer):
         self._sequence = 0
         self._booted_s = time.monotonic() - random.Random(f"{seed} clock").uniform(10, 3600)
         self._command: tuple[int, ...] | None = None
-        self._commands = self._idle_cycles = 0
-        self._waited_s = self._late_s = 0.0
+        self._commands = 0
+        self._idle_s = self._waited_s = self._late_s = 0.0
 
     def __repr__(self) -> str:
         roles = "+".join(["drive"] * self.drive + ["laser"] * self.laser)
@@ -211,7 +211,7 @@ class FragileVehicle(FragileServer):
             self._commands += 1
         if self._command is not None:
             self.machine.obey(self.dialect, self._command)
-            self._idle_cycles = 0
+            self._idle_s = 0.0
 
     def _leave(self) -> None:
         """Take the HQ's END: answer it unless it is an answer, close this side, wait for the other (255)."""
@@ -237,13 +237,13 @@ class FragileVehicle(FragileServer):
                 self._conn.shutdown(socket.SHUT_WR)
 
     def _move(self, dt: float) -> None:
-        """Move; stop the motor after some cycles without a command, connected or not."""
+        """Move; stop the motor after some time without a command, connected or not ("Dialect `text`", 3)."""
         if not self.drive:
             return
-        self._idle_cycles += 1
-        if self._command is not None and self._idle_cycles == self._times.motor_cycles + 1:
+        was_idle_s, self._idle_s = self._idle_s, self._idle_s + dt
+        if self._command is not None and was_idle_s <= self._times.motor_s < self._idle_s:
             moving = "moving" if self.machine.moving else "at rest"
-            self._event(f"{self._times.motor_cycles} cycles without a command: the motor stopped by itself, {moving}")
+            self._event(f"{self._times.motor_s:g} s without a command: the motor stopped by itself, {moving}")
             self.machine.stop()
         self.machine.step(dt)
 

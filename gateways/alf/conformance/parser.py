@@ -49,8 +49,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """From one read to the next."""
     scan_s: float = 0.1
     info_s: float = 1.0
-    motor_cycles: int = 20
-    """Cycles without a command after which the motor stops by itself."""
+    motor_s: float = 2.0
+    """Seconds without a command after which the motor stops by itself: 20 cycles of 20 ticks at 200 Hz."""
     first_s: float = 0.25
     """Longest time from the connection to the first command."""
     gap_s: float = 0.1

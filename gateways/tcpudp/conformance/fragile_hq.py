@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import enum
 import errno
-import logging
 import socket
 import struct
 import time
@@ -21,7 +20,6 @@ from typing import Literal
 
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.parser import Feature, HqTimes, Packet
-from zbridge.simulation.fragile import log_violations, print_death
 from zbridge.simulation.judge import Ended, Judge, show
 from zbridge.simulation.sockets import connected
 from zbridge.simulation.stream_reader import STAMPED, Read, StreamReader
@@ -33,7 +31,6 @@ _SMALLEST_READ = 6
 _WAITING = 1000
 DEPLOYED_PORT = 11000
 """The UDP port that deployed programs bind ("Handshake", Ports)."""
-_log = logging.getLogger(__name__)
 
 
 class _Phase(enum.Enum):
@@ -444,28 +441,3 @@ class FragileHq(Judge):
     def _start(self, work: Coroutine[None, None, None]) -> None:
         assert self._tasks is not None
         self._tasks.create_task(work)
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    version: str,
-    udp: bool,
-    lidar_sim: bool = False,
-    skips_map_flag: bool = False,
-    udp_port: int | None = None,
-    times: HqTimes = _DEPLOYED,
-) -> None:
-    """Run a fragile HQ with an idle stick until cancelled, dead or left; log violations, print what it died of."""
-    hq = FragileHq(
-        version=version,
-        udp=udp,
-        lidar_sim=lidar_sim,
-        skips_map_flag=skips_map_flag,
-        udp_port=udp_port,
-        times=times,
-        note=log_violations(_log),
-    )
-    await hq.run(host, port)
-    print_death(hq)

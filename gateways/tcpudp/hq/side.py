@@ -18,7 +18,7 @@ from gateways.tcpudp.messages import DebugMessage, Packet
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.translate import NAME
 from zbridge.fleet import topics
-from zbridge.fleet.messages import FleetMessage, Mode
+from zbridge.fleet.messages import FleetMessage, Map, Mode
 from zbridge.fleet.topics import Topic
 from zbridge.fleet.view import RobotView
 from zbridge.protocol import ClientIds, EncodeError, HqSide, Limits, Metrics, Send, Telemetry, newest
@@ -96,15 +96,19 @@ class TcpUdpHq(HqSide):
         return self._display.show(topic, message)
 
     def answer(self, session: HqClient, topic: Topic, message: FleetMessage | None, now: float) -> None:
+        missing = None
         if topic is topics.RPC_MAP:
-            send = self.show(topics.MAP, message or self.view.map or no_map())
+            grid = message or self.view.map or no_map()
+            missing = "map" if isinstance(grid, Map) and not grid.cells.size else None
+            send = self.show(topics.MAP, grid)
+        elif (known := message or self.view.pose) is not None:
+            send = self.show(topics.POSE, known)
         else:
-            known = message or self.view.pose
-            send = self.show(topics.POSE, known) if known is not None else None
-        if send is None:
-            self.tell(session, "the robot's position is not known", now)
-        else:
+            missing, send = "position", None
+        if send is not None:
             send(session, now)
+        if missing is not None:
+            self.tell(session, f"the robot's {missing} is not known", now)
 
     def tell(self, session: HqClient, text: str, now: float) -> None:
         session.send(DebugMessage(ascii_text(text)))

@@ -8,7 +8,6 @@ docstrings are those of that page.
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import socket
 import struct
@@ -28,7 +27,6 @@ from gateways.wc2ec.conformance.parser import (
     SET_VALUE,
     Dialect,
 )
-from zbridge.simulation.fragile import log_violations, print_death
 from zbridge.simulation.judge import Ended, Judge, show
 from zbridge.simulation.sockets import connected
 
@@ -41,7 +39,6 @@ _HEADER, _MEASUREMENT = 3, struct.Struct("<BBBd")
 _FIRST_OF_EC = 128
 _SPLIT_S = 0.002
 _READ_BYTES = 65536
-_log = logging.getLogger(__name__)
 
 
 class Told(msgspec.Struct, frozen=True):
@@ -314,13 +311,3 @@ class FragileController(Judge):
         disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
         if number not in self.enabled and disabled_s > self._flight_s:
             self._violate(f"data of sensor {number}, which is not enabled: {raw}")
-
-
-async def simulate_fragile_hq(host: str, port: int, *, dialect: Dialect, split: bool = False) -> None:
-    """Run a fragile external controller until cancelled, dead or left; log each violation, and print what it died of.
-
-    Raise OSError if nobody listens.
-    """
-    controller = FragileController(dialect=dialect, split=split, note=log_violations(_log))
-    await controller.run(host, port)
-    print_death(controller)

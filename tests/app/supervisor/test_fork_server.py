@@ -55,6 +55,20 @@ async def test_a_forked_gateway_is_a_child_of_ours_and_shows_its_end(tmp_path: P
     assert "Traceback" not in said
 
 
+async def test_a_protocol_that_cannot_be_loaded_stops_no_gateway_of_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "torn-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: torn\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[zbridge.protocols]\ntorn = torn:PROTOCOL\n")
+    (tmp_path / "torn.py").write_text("import sys\nsys.exit(5)\n")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH")))))
+    _become_reaper()
+    async with forks() as made:
+        assert await ended(await forked(made, tmp_path / "r1.toml")) == 2
+
+
 async def test_a_fork_server_whose_code_is_broken_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     async with forks(["false"]) as made:
         with pytest.raises(NotReady, match="did not start"):

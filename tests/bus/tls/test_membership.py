@@ -6,9 +6,10 @@ from datetime import UTC, datetime
 
 import pytest
 
+from zbridge.app.access import GRANTS, Keys, Kind
 from zbridge.bus import Answer
 from zbridge.bus.tls.certificate import Certificate
-from zbridge.bus.tls.membership import require_member, router_id
+from zbridge.bus.tls.membership import Right, lacking, require_member, router_id
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Membership
@@ -52,6 +53,57 @@ async def test_a_member_that_is_known_may_go_on() -> None:
 async def test_a_router_that_answers_nobody_and_a_certificate_that_names_nobody_tell_nothing() -> None:
     assert await asked([], "r1", "5b84f6e9c574a220128d52750df2335d") == 0
     assert await asked([], "r1", router_id(), "somebody") == 0
+
+
+V1, OP1 = Membership(name="v1", role="viewer"), Membership(name="op1", role="operator")
+SUP1, H1 = Membership(name="sup1", role="supervisor"), Membership(name="h1", role="hq", robots=("r1",))
+ROLES = "in roles.toml of the router"
+RIGHTS: list[tuple[Membership | None, Right, str | None]] = [
+    (V1, Right.DRIVE, f"viewer.v1 may not drive it: that takes the role operator or supervisor or hq {ROLES}"),
+    (V1, Right.TAKE_OVER, f"viewer.v1 may not take it over: that takes the role supervisor {ROLES}"),
+    (OP1, Right.DRIVE, None),
+    (OP1, Right.TAKE_OVER, f"operator.op1 may not take it over: that takes the role supervisor {ROLES}"),
+    (OP1, Right.RESTART, f"operator.op1 may not restart its gateway: that takes the role supervisor {ROLES}"),
+    (SUP1, Right.RESTART, None),
+    (H1, Right.DRIVE, "hq.h1 is for r1 only: roles.toml of the router says so"),
+    (OURS, Right.DRIVE, None),  # its process may have listeners
+    (None, Right.DRIVE, None),
+]
+
+
+@pytest.mark.parametrize(("member", "right", "said"), RIGHTS)
+async def test_the_role_that_a_program_lacks_is_named_as_the_router_knows_it(
+    member: Membership | None, right: Right, said: str | None
+) -> None:
+    keys: list[str] = []
+
+    async def ask(key: str) -> list[Answer]:
+        keys.append(key)
+        return [answer(member)] if member is not None else []
+
+    name = member.name if member is not None else "ann@here"
+    assert await lacking(ask, "lab", name, "r2", right) == said
+    assert keys == [f"lab/@bus/whoami/{name.replace('@', '%40')}"]
+
+
+@pytest.mark.parametrize(
+    ("right", "keys"),
+    [
+        (Right.DRIVE, Keys.ACQUIRE),
+        (Right.TAKE_OVER, Keys.TAKEOVER),
+        (Right.RESTART, Keys.RESTART),
+        (Right.UNLATCH, Keys.UNLATCH),
+        (Right.UNLATCH_FLEET, Keys.UNLATCH_FLEET),
+    ],
+)
+def test_the_rights_are_those_of_the_access_rules(right: Right, keys: Keys) -> None:
+    """A gateway with listeners holds leases for its HQ programs; its role does not tell whether it has some."""
+    granted = {
+        column
+        for column, grants in GRANTS.items()
+        if any(grant.keys is keys and Kind.QUERY in grant.kinds for grant in grants)
+    }
+    assert set(right.value[1]) == granted - {"gateway with listeners"}
 
 
 UNKNOWN = [

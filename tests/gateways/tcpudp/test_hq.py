@@ -439,7 +439,9 @@ def test_a_client_of_1_1_gets_map_and_position_from_when_it_asked_for_them(versi
 def test_questions_are_answered_with_what_the_robot_says_else_with_what_it_said_last_else_with_what_is() -> None:
     view = RobotView()
     client = joined("1.1", view)
-    assert client.answered(topics.RPC_MAP) == [EMPTY_MAP]
+    unknown = f.framed(1, 1, f.counted(b"the robot's map is not known"))
+    assert client.answered(topics.RPC_MAP) == [EMPTY_MAP, unknown]
+    assert client.answered(topics.RPC_MAP, NO_MAP) == [EMPTY_MAP, unknown]
     (text,) = client.answered(topics.RPC_POSE)
     assert text[4:6] == b"\x01\x01"
     assert b"position" in text

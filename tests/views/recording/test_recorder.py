@@ -28,6 +28,7 @@ from zbridge.views.recording.intake import Intake
 from zbridge.views.recording.pictures import Pictures
 from zbridge.views.recording.record import Recording, RecordPlan
 from zbridge.views.recording.recorder import Recorder
+from zbridge.views.recording.summary import summarize
 
 KEYS = KeySpace("fleet", "r1")
 LEASE, PROOF = bytes(range(8)), bytes(16)
@@ -195,6 +196,18 @@ async def test_pictures_stand_beside_the_messages_or_alone(tmp_path: Path) -> No
         assert ("fleet/r1/pose" in topics_read) is fleet
 
 
+async def test_the_messages_of_all_files_are_counted_as_their_readers_count_them(tmp_path: Path) -> None:
+    """Senders, pictures, and states that each file begins with, besides what came."""
+    scene = Scene(tmp_path / "a.mcap", pictures=Pictures(), tape={"split_bytes": 1})
+    async with scene.running():
+        scene.put("fleet/r1/status", STATUS)
+        scene.put("fleet/r1/pose", POSE)
+        scene.put("fleet/r1/@cmd/drive", files.packed(forward=0.5))
+        await soon(lambda: len(scene.tape.files) >= 3)
+    assert scene.tape.messages == sum(summarize(path).messages for path in scene.tape.files)
+    assert scene.tape.messages > scene.recorder.messages == 3
+
+
 async def test_what_exceeds_the_bound_is_dropped_and_counted_by_key(tmp_path: Path) -> None:
     scene = Scene(tmp_path / "a.mcap", bound=10_000)
     for _ in range(30):
@@ -229,7 +242,7 @@ async def test_a_full_disk_ends_the_recording_and_says_so(tmp_path: Path, monkey
     await asyncio.to_thread(scene.recorder.close)
     assert scene.recorder.error == "the recording ends: No space left on device"
     assert scene.recorder.losses() == {"not written": {"fleet/r1/scan": 1, "fleet/r1/pose": 1}}
-    assert scene.read() == []
+    assert (scene.read(), scene.tape.messages) == ([], 0)
 
 
 async def test_another_file_begins_with_the_last_states(tmp_path: Path) -> None:

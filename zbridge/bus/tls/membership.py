@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import secrets
 from collections.abc import Awaitable, Callable, Sequence
+from enum import Enum
 
 from zbridge.bus.interface import Answer
 from zbridge.bus.tls.certificate import Certificate
@@ -25,6 +26,16 @@ _APART_S = 0.3
 _ANSWER_S = 1.0
 
 Ask = Callable[[str], Awaitable[list[Answer]]]
+
+
+class Right(Enum):
+    """What a program may lack the role for: what it wants to do, and the roles that may."""
+
+    DRIVE = ("drive it", ("operator", "supervisor", "hq"))
+    TAKE_OVER = ("take it over", ("supervisor",))
+    RESTART = ("restart its gateway", ("supervisor",))
+    UNLATCH = ("release its latched stop", ("operator", "supervisor"))
+    UNLATCH_FLEET = ("release the fleet's latched stop", ("supervisor",))
 
 
 def router_id() -> str:
@@ -61,8 +72,26 @@ async def require_member(
         )
 
 
-async def _asked(ask: Ask, key: str) -> Membership | None:
-    for attempt in range(_ASKED):
+async def lacking(ask: Ask, realm: str, name: str, robot: str, right: Right) -> str | None:
+    """Say which role a program lacks; None where it has one, or nothing is known: no router answers, the bus is open.
+
+    Ask this when a query had no answer: what a role may not ask, a router drops without a word. name: in the
+    certificate.
+    """
+    member = await _asked(ask, topics.whoami(realm, topics.escape(name)), 1)
+    what, roles = right.value
+    if member is None or member.role == "gateway":  # which may have listeners
+        return None
+    who = f"{member.role}.{member.name}"
+    if member.role not in roles:
+        return f"{who} may not {what}: that takes the role {' or '.join(roles)} in roles.toml of the router"
+    if member.robots and robot not in member.robots:
+        return f"{who} is for {', '.join(member.robots)} only: roles.toml of the router says so"
+    return None
+
+
+async def _asked(ask: Ask, key: str, attempts: int = _ASKED) -> Membership | None:
+    for attempt in range(attempts):
         if attempt:
             await asyncio.sleep(_APART_S)
         for answer in await ask(key):

@@ -14,8 +14,8 @@ import os
 # One thread that receives instead of several that wake one another for each message; read when zenoh is imported.
 os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1), acc: (handover: rx))")
 
-from zbridge.bus.zenoh.opening import zenoh_config
+from zbridge.bus.zenoh.opening import canonical, zenoh_config
 from zbridge.bus.zenoh.router import hear_log, open_router
 from zbridge.bus.zenoh.session import ZenohBus, open_zenoh
 
-__all__ = ["ZenohBus", "hear_log", "open_router", "open_zenoh", "zenoh_config"]
+__all__ = ["ZenohBus", "canonical", "hear_log", "open_router", "open_zenoh", "zenoh_config"]

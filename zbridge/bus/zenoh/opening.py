@@ -112,6 +112,14 @@ def in_short(error: zenoh.ZError) -> str:
     return _ORIGIN.sub("", str(error))
 
 
+def canonical(key_expr: str) -> str:
+    """Return a key expression in Zenoh's canonical form; raise ValueError with Zenoh's reason where it is none."""
+    try:
+        return str(zenoh.KeyExpr.autocanonize(key_expr))
+    except zenoh.ZError as error:
+        raise ValueError(in_short(error).removeprefix(f"Invalid Key Expr `{key_expr}`: ")) from error
+
+
 async def open_or_say_why(config: zenoh.Config, settings: BusSettings, *, explain: bool = True) -> zenoh.Session:
     """Open a session; raise BusError, which says which case it is where that can be found.
 

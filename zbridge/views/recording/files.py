@@ -129,6 +129,8 @@ class Tape:
     def __init__(self, settings: TapeSettings) -> None:
         self.unwritten = Losses()
         """Messages that were in memory, or taken back from the disk, when the disk was full."""
+        self.messages = 0
+        """Messages in all files so far, as a reader of the files counts them."""
         self.number = 0
         """The number of the current file, from 1."""
         self.files: list[Path] = []
@@ -191,6 +193,7 @@ class Tape:
 
     def write(self, topic: str, channel: int, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
         """Write one message."""
+        self.messages += 1
         self._counts[topic] = self._counts.get(topic, 0) + 1
         self._writer.add_message(channel, log_ns, data, publish_ns, sequence)
 
@@ -250,6 +253,7 @@ class Tape:
 
     def _lose(self, counts: dict[str, int]) -> None:
         for topic, count in counts.items():
+            self.messages -= count
             self.unwritten.add(topic, count)
 
     def _flush_file(self, now: float) -> None:

@@ -131,6 +131,9 @@ class Replay:
     def __init__(self, bus: Bus, plan: ReplayPlan, told: Callable[[str], object] = lambda text: None) -> None:
         self.fault: str | None = None
         """What is wrong with the file."""
+        self.played = self.left_out = 0
+        """Messages of the selected part that were published, and those that were not: of other robots, commands,
+        queries, raw frames, pictures."""
         self.robots: dict[str, ReplayedRobot] = {}
         self._bus = bus
         self._plan = plan
@@ -208,7 +211,10 @@ class Replay:
             target = self._target(message)
         if target is not None:
             robot, path = cast("tuple[ReplayedRobot, str]", target)
-            robot.play(path, message)
+            if robot.play(path, message):
+                self.played += 1
+                return
+        self.left_out += 1
 
     def _target(self, message: Message) -> tuple[ReplayedRobot, str] | None:
         topic, target = message.channel.topic, None

@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import deque
 from collections.abc import Callable
 
 import msgspec
 
 from zbridge.bus import Bus, Handle, IncomingQuery, Lane, Look, Publisher, Sample
+from zbridge.control.latch import STOPS, read_stop
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.errors import NotReady, PayloadError, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Control, FleetMessage, Query, Status
+from zbridge.fleet.messages import Control, FleetMessage, Query, Refusal, Status
 from zbridge.fleet.topics import Delivery, KeySpace, Topic
 from zbridge.protocol.rate_limit import RateLimit
 from zbridge.views.recording.reader import Message
@@ -35,7 +37,7 @@ KEYS = 4096
 """Most keys that a replayed robot publishes."""
 _CONTROL_S = 0.05
 _REFUSED = Unsupported("a recording")
-_LEASE = ("acquire/*", "takeover/*", "renew", "release")
+_LEASE = ("acquire/*", "takeover/*", "renew", "release", "unlatch/*", "unlatch_fleet/*")
 
 
 class ReplayedRobot:
@@ -58,6 +60,7 @@ class ReplayedRobot:
         self._control = Control(state="free")
         self._told: dict[str, float] = {}
         self._refusals = RefusalCounts()
+        self._stops: deque[bytes] = deque(maxlen=STOPS)
         self._rate = RateLimit(REFUSALS_HZ)
         self._handles: list[Handle] = []
         self._beating: asyncio.Task[None] | None = None
@@ -98,21 +101,21 @@ class ReplayedRobot:
 
     # On the player's thread
 
-    def play(self, path: str, message: Message) -> None:
-        """Publish a message of the recording, whose key ends with ``path``."""
+    def play(self, path: str, message: Message) -> bool:
+        """Publish a message of the recording, whose key ends with ``path``; False: it is not published again."""
         topic = self._topic(path)
         if topic is None:
-            return
+            return False
         now_ns = self._clock_ns()
         payload = with_stamp(message.data, now_ns - max(0, message.log_ns - message.publish_ns))
         if topic is topics.STATUS or topic is topics.CONTROL:
-            self._play_state(topic, payload)
-            return
+            return self._play_state(topic, payload)
         if topic is topics.MAP or topic is topics.POSE:
             self._last[path] = payload
         self._put(topic, payload)
+        return True
 
-    def _play_state(self, topic: Topic, payload: bytes) -> None:
+    def _play_state(self, topic: Topic, payload: bytes) -> bool:
         try:
             if topic is topics.STATUS:
                 self._note_status(payloads.decode(Status, payload))
@@ -122,6 +125,8 @@ class ReplayedRobot:
                 self._publish_control()
         except PayloadError:
             self.unplayed += 1
+            return False
+        return True
 
     def _note_status(self, status: Status) -> None:
         if status.protocol not in (None, PROTOCOL):
@@ -157,8 +162,11 @@ class ReplayedRobot:
 
     def _publish_control(self) -> None:
         refusals = (*self._control.refusals, *self._refusals.shown())
-        shown = msgspec.structs.replace(self._control, stamp_ns=self._clock_ns(), lease=None, refusals=refusals)
-        self._tell(topics.CONTROL, shown)
+        self._tell_control(self._control, refusals)
+
+    def _tell_control(self, control: Control, refusals: tuple[Refusal, ...]) -> None:
+        own = {"stamp_ns": self._clock_ns(), "lease": None, "refusals": refusals, "stops": tuple(self._stops)}
+        self._tell(topics.CONTROL, msgspec.structs.replace(control, **own))
 
     def _tell(self, topic: Topic, message: FleetMessage) -> None:
         self._told[topic.path] = time.monotonic()
@@ -179,7 +187,10 @@ class ReplayedRobot:
         return Lane.OTHER if self._rate.take(time.monotonic()) else None
 
     def _on_command(self, sample: Sample) -> None:
-        self._refuse(sample.key.rpartition("@cmd/")[2])
+        command = sample.key.rpartition("@cmd/")[2]
+        if command == "stop" and isinstance(stop_id := read_stop(sample.payload).id, bytes):
+            self._stops.append(stop_id)
+        self._refuse(command)
 
     def _on_lease(self, query: IncomingQuery) -> None:
         query.refuse(_REFUSED)
@@ -197,8 +208,7 @@ class ReplayedRobot:
         """Count a refusal, and show it soon. A refused stop is shown as such at once: a recording is at rest."""
         self._refusals.add(command, _REFUSED, None, None, 1)
         if command == "stop":
-            control = msgspec.structs.replace(self._control, state="stopped", refusals=self._refusals.shown())
-            self._tell(topics.CONTROL, msgspec.structs.replace(control, stamp_ns=self._clock_ns(), lease=None))
+            self._tell_control(msgspec.structs.replace(self._control, state="stopped"), self._refusals.shown())
         if self._control_due is None:
             self._control_due = asyncio.get_running_loop().call_later(_CONTROL_S, self._show_refusals)
 

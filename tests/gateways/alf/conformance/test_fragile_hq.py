@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq, Reader, simulate_fragile_hq
+from gateways.alf.conformance.fragile_hq import FragileHq, Reader
+from gateways.alf.conformance.hq_program import simulate_fragile_hq
 from gateways.alf.conformance.parser import Dialect
 from tests.captures import stream
 from tests.conformance.scene import LONG_S, Listening, calling, until
@@ -220,7 +221,7 @@ async def test_the_program_logs_and_prints_what_it_died_of_and_nobody_listening_
         await vehicle.send_bytes(b"3|1;4|nan;")
         await task
     vehicle.close()
-    assert capsys.readouterr().out == "died: NaN: '4|nan;'\n"
+    assert capsys.readouterr().out.endswith("\ndied: NaN: '4|nan;'\n")
     assert [record.message for record in caplog.records] == [
         "violation: id 3, which no vehicle sends: '3|1;'",
         "violation: NaN: '4|nan;'",

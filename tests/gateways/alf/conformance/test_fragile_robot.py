@@ -23,7 +23,7 @@ from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, c
 
 QUICK = Times(
     cycle_s=0.005, scan_s=0.02, info_s=0.05, first_s=5, gap_s=5, window_commands=0, flight_s=0.05, answer_s=0.15,
-    close_s=0.15,
+    close_s=0.15, motor_s=0.1,
 )  # fmt: skip
 """As quick as a test, and patient where the rhythm is not what it is about."""
 LASER: dict[str, Any] = {"laser": True, "drive": False}
@@ -222,7 +222,7 @@ commands long after the vehicle's END: begin_end / kind 255 / send_until_noted G
 a close within a message: say 3|0|0| / close / ! the connection ended within a message:
 silence [eager]: ! no drive command for 0.
 a repetition that stops [deployed]: repeat GOOD 0.1 / ! no drive command for 0. / noted 1
-    / ? 20 cycles without a command: the motor stopped by itself, at rest
+    / ? 2 s without a command: the motor stopped by itself, at rest
 a gap, with the lateness of the process [strict]: > GOOD / heard 1 / stall 0.2 / ! s (this process woke
 an integer over 2^31-1: > GOOD / say 99999999999|1; / died an integer over 2^31-1, 99999999999: / ended / refused
 an unknown id in binary [binary]: > GOOD 00 / died id 0, of which this server knows nothing:
@@ -269,10 +269,18 @@ async def test_a_process_that_is_late_itself_reproaches_nobody() -> None:
         await hq.ok("")
 
 
-async def test_the_motor_stops_after_twenty_cycles_and_any_message_applies_the_stale_command() -> None:
+async def test_the_motor_stops_two_seconds_after_the_last_command_as_the_deployed_one_does() -> None:
+    """20 cycles of 20 ticks at 200 Hz ("Dialect `text`", 3)."""
+    vehicle = quick(times=Times(first_s=5, gap_s=5, window_commands=0))
+    async with connected(vehicle) as hq:
+        await hq.play(["> GOOD FORWARD", "? 2 s without a command: the motor stopped by itself, moving"])
+    assert time.monotonic() - vehicle.received[-1][0] > 1.9
+
+
+async def test_the_motor_stops_by_itself_and_any_message_applies_the_stale_command() -> None:
     vehicle = quick()
     async with connected(vehicle) as hq:
-        await hq.play(["> GOOD FORWARD", "? 20 cycles without a command: the motor stopped by itself, moving"])
+        await hq.play(["> GOOD FORWARD", "? 0.1 s without a command: the motor stopped by itself, moving"])
         assert not vehicle.machine.moving
         await hq.say("7|1;")
         await until(lambda: vehicle.machine.moving, vehicle)

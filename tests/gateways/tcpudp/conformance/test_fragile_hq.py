@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes, simulate_fragile_hq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes
+from gateways.tcpudp.conformance.hq_program import simulate_fragile_hq
 from gateways.tcpudp.conformance.parser import Feature
 from tests import captures
 from tests.conformance.scene import Listening, calling, until
@@ -362,4 +363,4 @@ async def test_the_command_logs_violations_and_prints_the_death(caplog, capsys) 
         await Robot(None, sockets, task).play(["shake 1.1", "< STOP", "> 02000000 01 3c", "over"])
     sockets.close()
     assert "violation: unknown packet id 60" in caplog.text
-    assert capsys.readouterr().out.startswith("died: unknown packet id 60")
+    assert "\ndied: unknown packet id 60" in capsys.readouterr().out

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_hq import FragileController, simulate_fragile_hq
+from gateways.wc2ec.conformance.fragile_hq import FragileController
+from gateways.wc2ec.conformance.hq_program import simulate_fragile_hq
 from tests.captures import stream
 from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
 from tests.conformance.script_table import table
@@ -185,7 +186,7 @@ async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> No
         await webots.send(bytes.fromhex(NAMES["DATA"]) + b"\x09")
         await task
     webots.close()
-    assert capsys.readouterr().out == "died: unknown command 9: 09\n"
+    assert capsys.readouterr().out.endswith("\ndied: unknown command 9: 09\n")
     assert [record.message.split(":")[1] for record in caplog.records] == [
         " data of number 6, which is not registered",
         " unknown command 9",

@@ -1,0 +1,113 @@
+"""An HQ program to play with: prints what it does and what it is shown, and pushes its stick if it is told to.
+
+Shares no code with the gateway. Knows no protocol: a protocol contributes a :class:`HqProgram`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from abc import ABC, abstractmethod
+from collections.abc import Coroutine
+from typing import Any
+
+from zbridge.simulation.fragile import print_death, print_line
+from zbridge.simulation.judge import Judge
+
+NEUTRAL_S = 1.0
+"""Seconds of neutral before motion: whoever connects must centre the stick first."""
+LET_GO_S = 0.3
+"""Seconds from the last neutral to the end of the connection."""
+SHOWN_S = 1.0
+"""Seconds between two lines of what it is shown, where that changes."""
+_LOOK_S = 0.05
+
+
+class HqProgram(ABC):
+    """One HQ program in a person's hands. judge: records what the robot does wrong."""
+
+    judge: Judge
+
+    @abstractmethod
+    def run(self, host: str, port: int) -> Coroutine[Any, Any, None]:
+        """Connect, and serve until cancelled, dead, or the robot closes; raise OSError if nobody listens."""
+
+    @property
+    @abstractmethod
+    def ready(self) -> str:
+        """Say what was agreed, once the program can drive; until then an empty text."""
+
+    @abstractmethod
+    def shown(self) -> str:
+        """Say what the robot shows it now."""
+
+    @abstractmethod
+    async def neutral(self) -> None:
+        """Centre the stick; the first time also say that it will drive."""
+
+    @abstractmethod
+    async def push(self, forward: float, turn: float) -> None:
+        """Push the stick: fractions of full scale, ``turn`` counter-clockwise."""
+
+
+async def run_hq_program(program: HqProgram, host: str, port: int, drive: tuple[float, float] | None) -> None:
+    """Run a program until cancelled, dead or left by the robot; print what happens.
+
+    drive: forward and turn that it drives, once it has sent neutral for a while; None: it does not drive. A cancelled
+    program sends neutral before it leaves. Raises OSError if nobody listens.
+    """
+    print_line(f"connecting to {host}:{port}")
+    running = asyncio.ensure_future(program.run(host, port))
+    ready = asyncio.Event()
+    beside = [asyncio.ensure_future(_print(program, ready))]
+    if drive is not None:
+        beside.append(asyncio.ensure_future(_drive(program, ready, *drive)))
+    try:
+        await asyncio.wait((running,))
+    except asyncio.CancelledError:
+        if drive is not None and program.ready:
+            await _let_go(program)
+        raise
+    finally:
+        for task in (running, *beside):
+            task.cancel()
+        await asyncio.gather(running, *beside, return_exceptions=True)
+        print_death(program.judge)
+    running.result()
+
+
+async def _let_go(program: HqProgram) -> None:
+    with contextlib.suppress(OSError, KeyError, TimeoutError):
+        async with asyncio.timeout(LET_GO_S):
+            await program.neutral()
+            print_line("stops driving")
+            await asyncio.sleep(LET_GO_S)
+
+
+async def _drive(program: HqProgram, ready: asyncio.Event, forward: float, turn: float) -> None:
+    """Send neutral for a while, then push the stick."""
+    await ready.wait()
+    with contextlib.suppress(OSError):  # the connection has ended, as is printed
+        print_line("sends neutral")
+        await program.neutral()
+        await asyncio.sleep(NEUTRAL_S)
+        print_line(f"drives: forward {forward:g}, turn {turn:g}")
+        await program.push(forward, turn)
+
+
+async def _print(program: HqProgram, is_ready: asyncio.Event) -> None:
+    """Print what happens when it happens, and what it is shown once a second at most."""
+    loop = asyncio.get_running_loop()
+    ready, shown, due, printed = "", "", 0.0, 0
+    while True:
+        if program.ready != ready:
+            ready = program.ready
+            print_line(ready)
+            is_ready.set()
+        for event in program.judge.events[printed:]:
+            printed += 1
+            print_line(event)
+        if ready and loop.time() >= due and (now := program.shown()) != shown:
+            shown, due = now, loop.time() + SHOWN_S
+            print_line(f"is shown {shown}")
+        await asyncio.sleep(_LOOK_S)

@@ -59,12 +59,21 @@ def ask(session: zenoh.Session, key: str, payload: bytes = b"", timeout_s: float
     return [msgpack.unpackb((reply.ok or reply.err).payload.to_bytes()) for reply in replies]
 
 
+ASKS_OTHERS = "the fleet's latched stops are asked for"
+"""Why a gateway that has just started grants no lease for a moment, as clients are told."""
+
+
 class Lease:
     """The lease of one robot by plain Zenoh and MessagePack, renewed on a thread until it is closed or has ended."""
 
     def __init__(self, session: zenoh.Session, robot: str, how: str, wishes: dict[str, Any]) -> None:
         self._session, self._key = session, f"fleet/{robot}/@rpc/control/"
-        self.answer = self.ask(f"{how}/{wishes['who']}", packed(wishes))
+        self.answer: dict[str, Any] = {}
+        for _ in range(15):
+            self.answer = self.ask(f"{how}/{wishes['who']}", packed(wishes))
+            if self.answer.get("reason") != ASKS_OTHERS:
+                break
+            time.sleep(0.1)
         assert self.answer.get("ok"), self.answer
         self.lost = False
         self.held = Holder.of(self.answer, robot)

@@ -203,7 +203,7 @@ async def _robot(
             f'[device]\nprotocol = "{protocol}"\nconnect = {json.dumps(addresses)}\noptions = {_inline(options)}\n'
             f"{serving}{bus}"
         )
-        async with process(log, "run", str(file)) as gateway:
+        async with process(log, "run", str(file), state=folder) as gateway:
             yield simulator, gateway
 
 

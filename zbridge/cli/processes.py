@@ -9,6 +9,7 @@ import random
 import socket
 import sys
 from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
 from typing import IO
 
 END_S = 3.0
@@ -26,15 +27,21 @@ def free_port() -> int:
 
 
 @contextlib.asynccontextmanager
-async def process(log: IO[bytes], *arguments: str, read: bool = False) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a command of ``zbridge`` while the context lasts. read: its standard output is a pipe."""
+async def process(
+    log: IO[bytes], *arguments: str, read: bool = False, state: Path | None = None
+) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a command of ``zbridge`` while the context lasts.
+
+    read: its standard output is a pipe. state: a folder of its own for what it keeps over a restart.
+    """
+    own = {"STATE_DIRECTORY": str(state)} if state is not None else {}
     started = await asyncio.create_subprocess_exec(
         sys.executable,
         *("-m", "zbridge", *arguments),
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.PIPE if read else asyncio.subprocess.DEVNULL,
         stderr=log,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+        env={**os.environ, "PYTHONUNBUFFERED": "1", **own},
     )
     try:
         yield started

@@ -17,6 +17,7 @@ from tests.e2e.conftest import Bench, device, end, repeated, start, until
 from tests.e2e.crashes import measure
 from tests.e2e.robots import MOVE, STOP, Robot
 from tests.e2e.supervised import Supervised
+from zbridge.app.supervisor.runner import KEPT_CRASHES
 
 ROBOTS = 8
 
@@ -94,11 +95,15 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     fleet, supervisor = host.bench.fleet, host.supervisor
     host.ready()
 
-    for count, words in enumerate((r"r3: process \d+ goes on with its connections", "r3: next process in"), 1):
-        os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # soon after the first crash what was kept is not trusted
-        until(lambda words=words: re.search(words, supervisor.log), 20, words)  # type: ignore[misc]
-        until(lambda count=count: host.robots[3].connections == count, what="its connections")  # type: ignore[misc]
-        until(lambda: fleet.state("r3") == "established", what="the robot")
+    goes_on = r"r3: process \d+ goes on with its connections"
+    for count in range(1, KEPT_CRASHES + 1):
+        os.kill(supervisor.gateway("r3"), signal.SIGKILL)
+        until(lambda count=count: len(re.findall(goes_on, supervisor.log)) == count, 20, goes_on)  # type: ignore[misc]
+    assert host.connections[3] == 1
+    os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # what was deposited may be what kills them
+    until(lambda: "r3: next process in" in supervisor.log, 20, "another connection")
+    until(lambda: host.robots[3].connections == 2, what="its connections")
+    until(lambda: fleet.state("r3") == "established", what="the robot")
     assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1]
 
     host.write(5, more="colour = 1\n")

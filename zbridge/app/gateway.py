@@ -42,12 +42,13 @@ from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
-from zbridge.transport import connect
+from zbridge.transport import Parcel, connect
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -74,9 +75,9 @@ class Neighbourhood(msgspec.Struct, frozen=True):
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this gateway, shared by all parts. observer: is told of the robot's links.
-    predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this one can
-    be handed over.
+    metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, told of the robot's
+    links. predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this
+    one can be handed over.
     """
 
     def __init__(
@@ -91,7 +92,9 @@ class Gateway:
         self._plan = plan
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
-        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self._incoming = (
+            Incoming(predecessor, plan.setup, supervised=observer is not None) if predecessor is not None else None
+        )
         self.restarts = Restarts(plan, self._keys, self._incoming, successor)
         """What a successor would be handed, and how."""
         self.left = True
@@ -179,7 +182,9 @@ class Gateway:
         plans, incoming = self._plan.listeners, self._incoming
         names = listener_names(plans, self._own, bus.zid)
         self._process = process_name(names, self._own, bus.zid) if names else "gateway"
-        given = [(each, incoming.parcel) for each in incoming.given.listeners] if incoming else [None] * len(plans)
+        given: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
+        if incoming is not None and incoming.given.listeners:  # a gateway that died leaves none: they are bound anew
+            given = [(each, incoming.parcel) for each in incoming.given.listeners]
         return [
             Listener(
                 plan,
@@ -215,7 +220,7 @@ class Gateway:
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
                     device = self._make_device(bus, audit, plan)
-                    device.take_over(given.device, incoming.parcel)
+                    device.take_over(given.device, incoming.parcel, given.partials)
                     await self._serve_shown(bus, ownership, device, incoming.taken)
                 elif not incoming.given.listeners:
                     await incoming.finish()

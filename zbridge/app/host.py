@@ -12,7 +12,7 @@ from typing import Annotated
 import msgspec
 
 from zbridge.app.config import Plan
-from zbridge.app.toml import convert, read_toml
+from zbridge.app.toml import FILE_BYTES, convert, read_toml
 from zbridge.errors import ConfigError
 
 HOST_FILE = "host.toml"
@@ -24,11 +24,13 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     together: all robots in one process and one session on the bus. stagger_s: seconds between the starts of two
     gateways, with jitter. share: the part of a processor that one robot of a shared process may use for long.
+    file_bytes: of the largest robot file that is read.
     """
 
     together: bool = False
     stagger_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 0.02
     share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.1
+    file_bytes: Annotated[int, msgspec.Meta(ge=1000, le=100_000_000)] = FILE_BYTES
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -75,16 +75,17 @@ def run_gateway(
     tls: Path | None = None,
     take_over: int | None = None,
     reporter: Reporter | None = None,
+    content: bytes | None = None,
 ) -> None:
     """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
 
-    tls: a folder, for a file without ``bus.tls``. take_over: the descriptor of the channel to the gateway that hands
-    everything over to this process. reporter: tells the supervisor, where there is one, which also starts the successor
-    then.
+    content: of the file, if it was read already. tls: a folder, for a file without ``bus.tls``. take_over: the
+    descriptor of the channel to the gateway that hands everything over to this process. reporter: tells the supervisor,
+    where there is one, which also starts the successor then.
     """
     if reporter is None:
         set_up_log(verbose=verbose)
-    plan = load(file, tls=tls)
+    plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
@@ -96,8 +97,7 @@ def run_gateway(
         raise ConfigError(f"{file}: {error}") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
-    spawn = Spawn(file, verbose=verbose)
-    successor = reporter.start_successor if reporter is not None else spawn
+    successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
     gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
 
     async def work() -> None:
@@ -110,11 +110,8 @@ def run_gateway(
         run_loop(work())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
-    if gateway.restarts.gone.is_set():
-        if reporter is not None:
-            reporter.succeeded()
-        else:
-            spawn.tell_systemd()
+    if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
+        successor.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)

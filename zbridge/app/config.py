@@ -149,7 +149,7 @@ def _device(settings: DeviceSettings) -> DevicePlan:
             f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
             f"{'s' if protocol.links > 1 else ''}"
         )
-    return DevicePlan(protocol, options, addresses)
+    return DevicePlan(protocol, options, addresses, settings.allow_shared_address or protocol.keyed)
 
 
 def _listener(settings: HqSettings, key: str) -> ListenerPlan:

@@ -14,13 +14,14 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from zbridge.app.addresses import hold_addresses
+from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
@@ -29,7 +30,7 @@ from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.member import own_name
-from zbridge.control.audit_log import Audit, AuditFile
+from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.motion_limits import MotionLimits
@@ -116,9 +117,10 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
 
-        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
+        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing, ConfigError
+        where a gateway of another robot name has the robot's address.
         """
-        with self._audit() as audit:
+        async with self._held() as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
                 try:
@@ -142,7 +144,7 @@ class Gateway:
         neighbourhood: None where the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
-        with self._audit() as audit:
+        async with self._held() as audit:
             await self._run(bus, audit, metrics=False)
 
     async def _run(self, bus: Bus, audit: Audit, *, metrics: bool = True) -> None:
@@ -312,35 +314,15 @@ class Gateway:
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
             share=FairShare(near.part) if near is not None else None,
+            shared_address=plan.shares,
             connect=partial(connect, buffer=near.buffer) if near is not None else connect,
             observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
 
-    @contextlib.contextmanager
-    def _audit(self) -> Iterator[Audit]:
-        """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
-        control, name = self._plan.config.control, self._plan.config.robot.name
-        if control.audit is None or self._plan.device is None:
-            yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
-            return
-        loop = asyncio.get_running_loop()
-
-        def tell(text: str | None) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self.conditions.set, "audit", text)
-
-        file = AuditFile(
-            Path(control.audit),
-            self.metrics,
-            file_bytes=control.audit_bytes,
-            files=control.audit_files,
-            days=control.audit_days,
-            tell=tell,
-        )
-        audit = Audit(name, file.write)
-        try:
-            yield audit
-        finally:
-            audit.close()
-            file.close()
+    @contextlib.asynccontextmanager
+    async def _held(self) -> AsyncIterator[Audit]:
+        """Hold the robot's addresses, and open the audit log; raise ConfigError."""
+        async with hold_addresses(self._plan):
+            with open_audit(self._plan, self.metrics, self.conditions) as audit:
+                yield audit

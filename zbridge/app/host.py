@@ -11,6 +11,7 @@ from typing import Annotated
 
 import msgspec
 
+from zbridge.app.addresses import Addresses, resolve
 from zbridge.app.config import Plan
 from zbridge.app.toml import FILE_BYTES, convert, read_toml
 from zbridge.errors import ConfigError
@@ -58,7 +59,11 @@ def robot_files(directory: Path) -> list[Path]:
 
 
 def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
-    """Raise ConfigError where two files name the same robot of one realm, or listen at the same address."""
+    """Raise ConfigError where two files name the same robot of one realm, or of one address, or listen at one address.
+
+    Resolves host names, which may take RESOLVE_S.
+    """
+    plans = list(plans)
     robots: dict[tuple[str, str], Path] = {}
     addresses: dict[object, Path] = {}
     for path, plan in plans:
@@ -71,6 +76,11 @@ def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
             if other is not path:
                 listen = plan.config.hq[number].listen
                 raise ConfigError(f"{path}: hq[{number}].listen = {listen!r}: expected another address than {other}'s")
+    devices = [(path, plan.device) for path, plan in plans if plan.device is not None]
+    forms = resolve(address for _, device in devices for address in device.addresses)
+    taken = Addresses()
+    for path, device in devices:
+        taken.add(path, frozenset[str]().union(*(forms[address] for address in device.addresses)), device.shares)
 
 
 def require_one_bus(plans: Sequence[tuple[Path, Plan]]) -> None:

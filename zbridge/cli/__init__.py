@@ -27,6 +27,7 @@ from zbridge.app.handover import Spawn
 from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
 from zbridge.app.member import check_member
 from zbridge.app.together import Together
+from zbridge.app.toml import read_file
 from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
@@ -132,7 +133,7 @@ def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = F
     plans, faults = [], []
     for file in files:
         try:
-            plans.append((file, load(file)))
+            plans.append((file, load(file, content=read_file(file, host.file_bytes))))
         except ConfigError as error:
             faults.append(error)
             logging.getLogger("zbridge.cli").error("%s", error)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, together, until_signal
+from zbridge.app.addresses import require_free
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.bus.tls.files import ends_soon, out_of_date, utc_now
@@ -81,6 +82,7 @@ def check(file: File, tls: FileTls = None) -> None:
     plan = load(file, tls=tls)
     robot, parts = plan.config.robot, []
     try:
+        require_free(plan)
         certificate = check_member(plan)
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error

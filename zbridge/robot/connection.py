@@ -61,6 +61,8 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called when a link is up (True), and when it is gone (False)."""
     read: Callable[[], object] = lambda: None
     """Called when the bytes of a read have been handled."""
+    shared: bool = False
+    """Whether gateways of other robots may connect to the same address."""
 
 
 class Links:
@@ -207,7 +209,8 @@ class Connection:
 
     def status(self) -> LinkStatus:
         """Return the entry of this link on ``status``."""
-        return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
+        peer, shared = str(self.address), self._hooks.shared or msgspec.UNSET
+        return LinkStatus(name=self.name, state=self.state, peer=peer, reason=self.reason, shared=shared)
 
     def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
         """Show the raw frames of one direction (``in`` or ``out``), those of the handshake first; None: show none."""

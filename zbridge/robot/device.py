@@ -74,12 +74,16 @@ class Device:
         conditions: Conditions | None = None,
         idle_stop_s: float = IDLE_STOP_S,
         share: FairShare | None = None,
+        shared_address: bool = False,
         connect: Connect = connect,
         observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Begin. share: of the processor, where the process serves other robots too."""
+        """Begin. share: of the processor, where the process serves other robots too.
+
+        shared_address: gateways of other robots may connect to the same addresses.
+        """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
         self._released = asyncio.Event()
@@ -87,6 +91,7 @@ class Device:
         self._declared: list[Handle] = []
         clock, conditions = clock or loop.time, conditions or Conditions()
         self._share = share
+        self._shared_address = shared_address
         self._observer = observer or Nobody()
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
@@ -121,6 +126,7 @@ class Device:
             clock=context.clock,
             before=self._enforcer.keep_time,
             share=self._share,
+            shared=self._shared_address,
             surplus=context.metrics.count("datagrams_over_share"),
             stalled=partial(presence.stalled, name),
             linked=partial(self._observer.linked, name),

@@ -11,9 +11,10 @@ from zbridge.app.toml import FILE_BYTES
 from zbridge.errors import ConfigError
 
 
-def write(folder: Path, name: str, robot: str = "", port: int = 11001, more: str = "") -> Path:
+def write(folder: Path, name: str, robot: str = "", port: int = 0, more: str = "", host: str = "127.0.0.1") -> Path:
+    """Write a robot's file; port 0: one of the name's own."""
     path = folder / f"{name}.toml"
-    connect = f'connect = ["tcp://127.0.0.1:{port}"]'
+    connect = f'connect = ["tcp://{host}:{port or 11000 + ord(name[0]) - 96}"]'
     path.write_text(f'[robot]\nname = "{robot or name}"\n[device]\nprotocol = "tcpudp"\n{connect}\n{more}')
     return path
 
@@ -98,6 +99,18 @@ def test_a_second_file_with_the_name_of_a_robot_is_faulty_until_the_first_is_gon
     assert "b.toml" in faulty.fault
     (scene.folder / "b.toml").unlink()
     assert scene.look() == {"came": ["aa"], "gone": ["b"]}
+
+
+def test_a_second_file_with_the_address_of_a_robot_is_faulty_until_the_first_has_another_one(scene: Scene) -> None:
+    write(scene.folder, "c", host="localhost", port=11002)
+    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    assert faulty.fault is not None
+    assert f"device.connect: expected another address than that of {scene.folder}/b.toml" in faulty.fault
+    write(scene.folder, "b", port=11009)
+    scene.look()
+    assert scene.look() == {"came": ["c"]}
+    write(scene.folder, "b", port=11001, more="[control]\n")
+    assert scene.look() == {"faulty": ["b"]}, "that of another one that runs"
 
 
 @pytest.mark.parametrize("twice", [False, True])

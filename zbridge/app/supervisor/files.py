@@ -17,11 +17,13 @@ from pathlib import Path
 
 import msgspec
 
+from zbridge.app.addresses import Addresses, resolve
 from zbridge.app.config import load
 from zbridge.app.host import robot_files
 from zbridge.app.toml import FILE_BYTES, read_file
 from zbridge.errors import ConfigError, describe
 from zbridge.fleet.printable import shown
+from zbridge.protocol.address import DeviceAddress
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -32,13 +34,17 @@ CHECK_AGAIN_S = 30.0
 class RobotFile(msgspec.Struct, frozen=True):
     """One file as it was read. fault: why nothing can run by it.
 
-    identity: realm and name of the robot; None of a faulty file.
+    identity: realm and name of the robot; None of a faulty file. connect: the robot's addresses; forms: the same,
+    resolved. shares: whether other files may have them too.
     """
 
     path: Path
     content: bytes
     identity: tuple[str, str] | None = None
     fault: str | None = None
+    connect: tuple[DeviceAddress, ...] = ()
+    forms: frozenset[str] = frozenset()
+    shares: bool = False
 
     @property
     def robot(self) -> str:
@@ -79,17 +85,36 @@ def check(path: Path, content: bytes) -> RobotFile:
     if not str(path).isprintable():  # so are bytes that are not UTF-8; processes tell each other the name
         return RobotFile(path, content, fault=f"{shown(str(path))}: expected a name of printable characters in UTF-8")
     try:
-        robot = load(path, content=content).config.robot
+        plan = load(path, content=content)
     except ConfigError as error:
         return RobotFile(path, content, fault=shown(str(error)))
     except Exception as error:  # whatever a check meets, the other files are followed
         log.exception("%s: not checked", path)
         return RobotFile(path, content, fault=f"{path}: {describe(error)}")
-    return RobotFile(path, content, (robot.realm, robot.name))
+    robot, device = plan.config.robot, plan.device
+    file = RobotFile(path, content, (robot.realm, robot.name))
+    if device is None:
+        return file
+    return msgspec.structs.replace(file, connect=device.addresses, shares=device.shares)
+
+
+def located(files: Iterable[RobotFile]) -> list[RobotFile]:
+    """Resolve the addresses of files that came or changed, all at once: host names may take RESOLVE_S."""
+    files = list(files)
+    found = resolve(address for file in files if not file.forms for address in file.connect)
+    return [
+        file
+        if file.forms
+        else msgspec.structs.replace(file, forms=frozenset[str]().union(*(found[each] for each in file.connect)))
+        for file in files
+    ]
 
 
 def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Changes:
-    """Compare what runs with what was read now; of two files with one robot name the one that came later is faulty."""
+    """Compare what runs with what was read now.
+
+    Of two files with one robot name, or with one address of a robot, the one that came later is faulty.
+    """
     now = {file.path: file for file in seen}
     gone = {path for path in running if path not in now}
     sound = {path: file for path, file in now.items() if file.fault is None}
@@ -104,28 +129,30 @@ def compare(running: Mapping[Path, RobotFile], seen: Iterable[RobotFile]) -> Cha
     settled = {file.path for _, file in moved}
     names = {file.identity: path for path, file in running.items() if path in now}
     names |= {file.identity: file.path for _, file in moved}
+    addresses = Addresses()
+    for file in (*(file for path, file in running.items() if path in now), *(file for _, file in moved)):
+        addresses.note(file.path, file.forms, file.shares)
     came, changed = list[RobotFile](), list[RobotFile]()
     faulty = [file for file in now.values() if file.fault is not None]
     for path, file in sound.items():
         before = running.get(path)
         if path in settled or (before is not None and before.content == file.content):
             continue
-        other = names.setdefault(file.identity, path)
-        if other != path:
-            faulty.append(_doubled(file, other))
+        try:
+            if (other := names.get(file.identity, path)) != path:
+                raise ConfigError(f"{path}: robot.name = {file.robot!r}: expected another name than that of {other}")
+            addresses.add(path, file.forms, file.shares)
+        except ConfigError as error:
+            faulty.append(msgspec.structs.replace(file, identity=None, fault=str(error)))
         else:
+            names[file.identity] = path
             (came if before is None else changed).append(file)
     return Changes(tuple(came), tuple(changed), tuple(sorted(gone)), tuple(moved), tuple(faulty))
 
 
-def _doubled(file: RobotFile, other: Path) -> RobotFile:
-    fault = f"{file.path}: robot.name = {file.robot!r}: expected another name than that of {other}"
-    return msgspec.structs.replace(file, identity=None, fault=fault)
-
-
 def first_look(sources: tuple[Path, ...], most_bytes: int = FILE_BYTES) -> list[RobotFile]:
-    """Read all robot files; raise ConfigError where two name one robot, or no file is sound."""
-    files = [read(path, most_bytes) for path in paths_of(sources)]
+    """Read all robot files; raise ConfigError where two name one robot or one address, or no file is sound."""
+    files = located(read(path, most_bytes) for path in paths_of(sources))
     if not files:
         raise ConfigError(f"{', '.join(map(str, sources))}: no robot file (*.toml)")
     sound = [file for file in files if file.fault is None]
@@ -173,7 +200,7 @@ class Follower:
         if twice:
             waiting |= {path: file for path, file in running.items() if path in self._shown and path not in shown}
         self._shown = shown
-        changes = compare(running, [*steady, *waiting.values()])
+        changes = compare(running, [*located(steady), *waiting.values()])
         return msgspec.structs.replace(changes, faulty=tuple(self._new_faults(changes.faulty)))
 
     def _again(self, path: Path, running: RobotFile | None) -> RobotFile:

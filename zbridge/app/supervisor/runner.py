@@ -128,14 +128,17 @@ class Runner:
     @property
     def kept(self) -> RunnerState:
         """What :meth:`resume` needs, of a calm runner."""
+        file = self.file
         return RunnerState(
-            str(self.file.path),
-            self.file.content,
-            self.file.identity,
+            str(file.path),
+            file.content,
+            file.identity,
             self.restarts,
             self._back_off.failures,
             self._next_at,
             self.process.state if self.process is not None else None,
+            tuple(file.forms),
+            file.shares,
         )
 
     def resume(self, state: RunnerState) -> None:

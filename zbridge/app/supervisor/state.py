@@ -54,7 +54,10 @@ class ProcessState(msgspec.Struct, frozen=True):
 
 
 class RunnerState(msgspec.Struct, frozen=True):
-    """One robot: the file as it runs, and its process. next_at: when the next one starts, if none runs."""
+    """One robot: the file as it runs, and its process. next_at: when the next one starts, if none runs.
+
+    forms, shares: of the robot's addresses.
+    """
 
     path: str
     content: bytes
@@ -63,6 +66,8 @@ class RunnerState(msgspec.Struct, frozen=True):
     failures: int = 0
     next_at: float | None = None
     process: ProcessState | None = None
+    forms: tuple[str, ...] = ()
+    shares: bool = False
 
 
 class ServerState(msgspec.Struct, frozen=True):

@@ -253,7 +253,8 @@ class Supervisor:
         self._forks.resume(state.server, state.leaving)
         self._is_ready, self._look_at = state.is_ready, state.look_at
         for each in state.runners:
-            file = RobotFile(Path(each.path), each.content, each.identity)
+            forms = frozenset(each.forms)
+            file = RobotFile(Path(each.path), each.content, each.identity, forms=forms, shares=each.shares)
             self._runners[file.path] = runner = self._runner(file)
             runner.resume(each)
             self._running.run(runner.run())

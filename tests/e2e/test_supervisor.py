@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, repeated, start, until
-from tests.e2e.crashes import measure
+from tests.e2e.crossings import Case, measure
 from tests.e2e.robots import MOVE, STOP, Robot
+from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
 from zbridge.app.supervisor.runner import KEPT_CRASHES
 
@@ -138,13 +139,18 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     assert all(count > 0 for count in stopped)
 
 
-def test_robots_rest_soon_after_their_gateway_hung_or_died_while_they_moved() -> None:
-    outcomes = measure([("tcpudp-1.3", "hung"), ("wc2ec", "frozen"), ("alf", "killed"), ("tcpudp-1.3-udp", "killed")])
-    assert len(outcomes) == 4
-    assert sum(outcome.kept for outcome in outcomes) >= 3, "one may have died within a packet"
-    for outcome in outcomes:
-        assert outcome.rest_s is not None, outcome
-        assert not outcome.faults, outcome
+def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whatever_step_of_a_restart() -> None:
+    plan = [
+        Case("tcpudp-1.3", "hung"),
+        Case("wc2ec", "frozen"),
+        Case("alf", "killed"),
+        Case("tcpudp-1.4", f"predecessor {AFTER_GIVEN}"),
+        Case("alf", f"successor {AFTER_GO}"),
+        Case("tcpudp-1.3-udp", f"again successor {FIRST_READ}"),
+    ]
+    outcomes = measure(plan, lanes=len(plan))
+    assert len(outcomes) == len(plan)
+    assert [outcome for outcome in outcomes if not outcome.good] == []
 
 
 def test_two_files_with_one_robot_are_refused_at_the_start(tmp_path: Path) -> None:

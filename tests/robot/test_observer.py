@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from tests.clock import scene_of
+from tests.proofs import packed
 from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, TimedLink, established, serving
 from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, Nobody, StopFrame
@@ -26,6 +27,8 @@ LEFT = COMMANDS["left"][2]
 AT_REST = LastStop(False, (StopFrame(STOP),), 0.01, "established")
 POSITION = bytes.fromhex("0e0000000137") + struct.pack("<3f", 100.0, 0.0, 0.0)
 """Packet 55 of the protocol page: 1 m to the right, in centimetres."""
+LIDAR_ON = bytes.fromhex("060000000133 01000000")
+"""Packet 51: the lidar is on."""
 rig = scene_of(established)
 
 
@@ -140,6 +143,30 @@ async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
         heir.command("drive", {"left": 1.0})
         await asyncio.sleep(0.2)
         assert heir.link.written[-1] == LEFT
+
+
+async def test_who_goes_on_publishes_again_what_the_dead_process_had_published_last(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.sends(LIDAR_ON)
+    lidar = rig.bus.values("fleet/r1/lidar")[-1]
+    async with heir_of(deposited(rig, Budget(1000)), monkeypatch) as heir:
+        assert heir.bus.values("fleet/r1/lidar") == [lidar], "a listener of the same process asked too early"
+
+
+async def test_nobody_is_given_the_lease_before_the_word_to_go(rig: Rig) -> None:
+    heir, go = Rig(), asyncio.Event()
+    heir.device.take_over(deposited(rig, Budget(1000)), Parcel())
+    task = asyncio.ensure_future(heir.device.run(go.wait))
+    await asyncio.sleep(0.1)
+    (reply,) = heir.ask("control/acquire/driver", packed({"who": "driver"})).replies
+    assert str(reply.error) == "another process takes the robot over"
+    go.set()
+    await asyncio.sleep(0.1)
+    assert heir.hold()["ok"]
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
 
 
 async def test_a_large_published_value_is_left_out_of_a_deposit_and_its_key_stays(

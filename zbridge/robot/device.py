@@ -51,6 +51,7 @@ FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
 _CRASHED = "crashed"
+_TAKING_OVER = "another process takes the robot over"
 _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
@@ -87,6 +88,8 @@ class Device:
         loop = asyncio.get_running_loop()
         self._protocol = protocol
         self._released = asyncio.Event()
+        self._crashed = False
+        """Whether the robot was taken over from a process that died."""
         self._commanded: list[Handle] = []
         self._declared: list[Handle] = []
         clock, conditions = clock or loop.time, conditions or Conditions()
@@ -149,6 +152,8 @@ class Device:
             await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
             await self.go_on()
+            if self._crashed:
+                self._publishers.repeat()
             self._show()
         self._standstill.begin()
         self._observer.began(self)
@@ -303,6 +308,9 @@ class Device:
 
         Call :meth:`run` with ``begin`` then. partials: with a deposit, the incomplete frames of the links that are up.
         """
+        self._commands.refuse_all(_TAKING_OVER)
+        self._leases.refuse_all(_TAKING_OVER)
+        self._crashed = bool(given.get(_CRASHED))
         for link, partial_frame in zip(filter(None, given["links"]), partials, strict=False):
             link["session"][PARTIAL] = list(partial_frame)
         for connection, link in zip(self._links, given["links"], strict=True):
@@ -313,7 +321,7 @@ class Device:
         session = self._context.robot.driving
         if session is not None and session.state is State.ESTABLISHED:
             self._presence.resume(session)
-            if given.get(_CRASHED):  # what waited then may have been written since, and may be motion
+            if self._crashed:  # what waited then may have been written since, and may be motion
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
                     self._standstill.stop()

@@ -60,6 +60,12 @@ class RobotPublishers:
             if topic is not None and (not _is_named(path) or self._names.admit(path, self._clock())):
                 self.known[path] = self._bus.publisher(self._keys.key(path), topic, last)
 
+    def repeat(self) -> None:
+        """Publish again the last values that are kept: who asked for them before they were restored got none."""
+        for publisher in self.known.values():
+            if publisher.last is not None:
+                publisher.put(publisher.last)
+
     def forget_names(self) -> None:
         """Give up the names of a connection that has ended."""
         for path in [path for path in self.known if _is_named(path)]:

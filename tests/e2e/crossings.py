@@ -35,6 +35,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -334,13 +335,13 @@ def measure(
     cases: Iterable[Case], *, lanes: int = LANES, took: Callable[[Outcome], object] = lambda _: None
 ) -> list[Outcome]:
     """Do every case once, so many at a time; give what came of them."""
-    waiting, taking, outcomes = iter(cases), threading.Lock(), list[Outcome]()
+    waiting, taking, outcomes = deque(cases), threading.Lock(), list[Outcome]()
 
     def lane() -> None:
-        while True:
-            with taking:
-                case = next(waiting, None)
-            if case is None:
+        while waiting:
+            try:
+                case = waiting.popleft()
+            except IndexError:  # another lane was quicker
                 return
             for _ in range(DISTURBED):
                 outcome = repeat(scene, case)
@@ -353,10 +354,15 @@ def measure(
     with contextlib.ExitStack() as stack:
         scene = Scene(stack)
         threads = [threading.Thread(target=lane) for _ in range(lanes)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        try:
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        except KeyboardInterrupt:  # what has begun comes to its end
+            waiting.clear()
+            for thread in threads:
+                thread.join()
         end(scene.supervisor.process)
         if "Traceback" in scene.supervisor.log:
             print(scene.supervisor.log, file=sys.stderr)
@@ -407,6 +413,8 @@ def main() -> None:
         print("\n".join(map(str, cases(wanted.only))))
         return
     out = wanted.out.open("a") if wanted.out else None
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell's script
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
 
     def took(outcome: Outcome) -> None:
         if out is not None:

@@ -7,15 +7,16 @@ import os
 import re
 import signal
 import socket
+import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, repeated, start, until
 from tests.e2e.crossings import Case, measure
-from tests.e2e.robots import MOVE, STOP, Robot
+from tests.e2e.robots import MOVE, STOP, Robot, position
 from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
 from zbridge.app.supervisor.runner import KEPT_CRASHES
@@ -26,7 +27,14 @@ ROBOTS = 8
 class Host:
     """A supervisor and its robots: scripted ones, in this process."""
 
-    def __init__(self, bench: Bench, systemd: socket.socket, robots: int = ROBOTS, more: str = "") -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        systemd: socket.socket,
+        robots: int = ROBOTS,
+        more: str = "",
+        before: Callable[[Path], object] = lambda folder: None,
+    ) -> None:
         self.bench = bench
         self.folder = bench.folder / "robots"
         self.folder.mkdir()
@@ -35,6 +43,7 @@ class Host:
             self.robots.append(bench.stack.enter_context(contextlib.closing(Robot())))
             self.write(number, more)
         self.systemd = systemd
+        before(self.folder)
         environment = {**os.environ, "NOTIFY_SOCKET": str(systemd.getsockname())}
         self.supervisor = Supervised(bench.stack, self.folder, environment=environment)
 
@@ -151,6 +160,54 @@ def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whate
     outcomes = measure(plan, lanes=len(plan))
     assert len(outcomes) == len(plan)
     assert [outcome for outcome in outcomes if not outcome.good] == []
+
+
+def test_a_map_of_which_half_was_read_when_the_gateway_died_is_skipped_and_what_follows_it_is_read(
+    bench: Bench, systemd: socket.socket
+) -> None:
+    host = Host(bench, systemd, 1)
+    (robot,), cells = host.robots, 2048 * 2048
+    host.ready()
+    grid = struct.pack("<iBBi", 2 + 4 + cells, 1, 53, cells) + bytes(cells)
+    robot.send(grid[:3_000_000])
+    time.sleep(1.0)  # it is deposited, and what was read since is only in the shared memory
+    robot.send(grid[3_000_000:3_500_000])
+    killed, pid = time.monotonic(), host.supervisor.gateway("r0")
+    os.kill(pid, signal.SIGKILL)
+    until(lambda: robot.packets(STOP, killed), what="the stop")
+    robot.send(grid[3_500_000:] + position(100.0, 0.0, 0.0))
+    host.supervisor.gateway("r0", not_pid=pid)
+    until(lambda: bench.fleet.last("r0/pose").get("x") == pytest.approx(1.0), 20, "what followed the map")
+    assert bench.fleet.state("r0") == "established"
+    assert robot.connections == 1
+
+
+def test_no_file_keeps_a_supervisor_from_starting_from_following_others_or_from_stopping_a_robot(
+    bench: Bench, systemd: socket.socket
+) -> None:
+    def strange(folder: Path) -> None:
+        os.mkfifo(folder / "fifo.toml")
+        (folder / "device.toml").symlink_to("/dev/zero")
+        (folder / "folder.toml").mkdir()
+        (folder / "brackets.toml").write_text("a = " + 20_000 * "[")
+        (folder / "digits.toml").write_text("a = " + 5_000 * "1")
+        Path(os.fsdecode(os.fsencode(folder) + b"/\xff.toml")).write_bytes((folder / "r0.toml").read_bytes())
+
+    host = Host(bench, systemd, 1, before=strange)
+    host.ready()
+    (robot,), supervisor = host.robots, host.supervisor
+    with host.driven():
+        until(lambda: robot.packets(MOVE), what="the robot drives")
+        (host.folder / "large.toml").write_text(f"a = [{450_000 * '1,'}]")
+        supervisor.reload()
+        killed = time.monotonic()
+        os.kill(supervisor.gateway("r0"), signal.SIGKILL)
+        stop = until(lambda: robot.packets(STOP, killed), what="the stop")[0]
+    assert stop.at - killed < 0.5
+    until(lambda: re.search(r"r0: process \d+ goes on with its connections", supervisor.log), 20, "the next process")
+    until(lambda: "large.toml" in supervisor.log, 20, "the fault of the large file")
+    assert robot.connections == 1
+    until(lambda: b"faulty files" in systemd.recv(1000), what="the status line")
 
 
 def test_two_files_with_one_robot_are_refused_at_the_start(tmp_path: Path) -> None:

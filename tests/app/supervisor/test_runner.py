@@ -353,6 +353,14 @@ async def test_a_restart_with_a_file_that_cannot_be_read_is_refused_with_the_rea
     assert len(scene.launcher.children) == 1
 
 
+async def test_a_successor_that_the_supervisor_has_no_descriptor_for_is_refused_at_once(scene: Scene) -> None:
+    first = await scene.child(0)
+    first.serves("first")
+    first.tell(WantSuccessor())  # the kernel drops what finds no room in the receiver's table
+    assert (await first.answer()).reason == "the supervisor has no free descriptor"
+    assert len(scene.launcher.children) == 1
+
+
 async def test_a_file_that_changes_while_its_process_dies_restarts_the_process_that_goes_on(scene: Scene) -> None:
     first = await scene.child(0)
     first.serves("first")

@@ -49,7 +49,7 @@ ANSWER_S = 10.0
 """Longest wait for the start of a successor."""
 KEEP_S = 0.9
 """Least seconds between two deposits of what a successor needs."""
-VALUE_BYTES = 64 * 1024
+VALUE_BYTES = 128 * 1024
 """Largest single value in a deposit: a map that came in parts, a published message; larger ones are left out."""
 TELL_S = 60.0
 """Least seconds between two log lines about what is not in a deposit."""
@@ -193,8 +193,9 @@ class Reporter:
         device = self._device
         streams = {number: device.boundary(name) for number, name, _ in self._links.values()} if device else {}
         if device is not None:
-            for name in self._at:  # the last read may have found nothing
-                self.read(name, partial(device.partial, name))
+            for name, number in self._at.items():  # the last read may have found nothing
+                if (found := device.partial(name, PARTIAL_BYTES)) is not None:
+                    self._memory.cut(number, found)
         last = device.last_stop() if device else LastStop()
         if self._loop.time() >= self._kept_at + KEEP_S or (last.state, last.frames) != (
             self._told.state,

@@ -22,8 +22,8 @@ from zbridge.wire.frames import Partial
 
 SLOTS = 16
 """Most links of one process at a time."""
-PARTIAL_BYTES = 32 * 1024
-"""Largest incomplete frame that is kept whole: a scan in text has 4 to 50 kB."""
+PARTIAL_BYTES = 64 * 1024
+"""Largest incomplete frame that is kept whole: a scan in text has 4 to 60 kB, and no length."""
 DEPOSIT_BYTES = 1024 * 1024
 """Largest deposit."""
 _HEAD = struct.Struct("<BxxxIQ")

@@ -21,6 +21,7 @@ from zbridge.app.supervisor.messages import (
     Kept,
     Opened,
     Shared,
+    Started,
     Succeeded,
     WantSuccessor,
 )
@@ -169,6 +170,8 @@ class GatewayProcess:
                 self.deposit.share(descriptors.pop(0))
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
+            case WantSuccessor():
+                self.post.send(Started("the supervisor has no free descriptor"))
             case Succeeded():
                 self.succeeded = True
                 self._left.set()

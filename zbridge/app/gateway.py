@@ -14,13 +14,12 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from functools import partial
 from typing import Any
 
 import msgspec
 
-from zbridge.app.addresses import hold_addresses
 from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
@@ -117,10 +116,9 @@ class Gateway:
     async def run(self) -> None:
         """Serve the robot and its HQ programs until cancelled; then stop the robot and close the bus.
 
-        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing, ConfigError
-        where a gateway of another robot name has the robot's address.
+        Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
         """
-        async with self._held() as audit:
+        with open_audit(self._plan, self.metrics, self.conditions) as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
                 try:
@@ -144,7 +142,7 @@ class Gateway:
         neighbourhood: None where the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
-        async with self._held() as audit:
+        with open_audit(self._plan, self.metrics, self.conditions) as audit:
             await self._run(bus, audit, metrics=False)
 
     async def _run(self, bus: Bus, audit: Audit, *, metrics: bool = True) -> None:
@@ -319,10 +317,3 @@ class Gateway:
             observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
         )
-
-    @contextlib.asynccontextmanager
-    async def _held(self) -> AsyncIterator[Audit]:
-        """Hold the robot's addresses, and open the audit log; raise ConfigError."""
-        async with hold_addresses(self._plan):
-            with open_audit(self._plan, self.metrics, self.conditions) as audit:
-                yield audit

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.addresses import hold_addresses
 from zbridge.app.handover import Spawn
 from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
 from zbridge.app.member import check_member
@@ -101,11 +102,15 @@ def run_gateway(
     successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
     gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
 
+    async def serve() -> None:
+        async with hold_addresses(plan):
+            await gateway.run()
+
     async def work() -> None:
         if reporter is not None:
             reporter.keep = gateway.restarts.keep
             reporter.begin()
-        await until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart})
+        await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 
     try:
         run_loop(work())

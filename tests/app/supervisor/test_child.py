@@ -307,7 +307,7 @@ async def test_what_is_left_out_of_a_deposit_is_told_once_a_minute_at_most(
         deposit(scene, state)
     (record,) = caplog.records
     assert record.getMessage() == (
-        "after a crash the next process would begin without Robot.map; more than 131072 bytes: 131073"
+        "after a crash the next process would begin without Robot.map: 131073 bytes, more than 131072"
     )
 
 

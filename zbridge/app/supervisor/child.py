@@ -1,9 +1,13 @@
-"""What a gateway process tells its supervisor: beats, its links, and the stop that its robot needs if it dies.
+"""What a gateway process tells its supervisor: beats, its links, and what is needed if it dies.
 
 Theory of operation. The reporter observes the robot's device (:class:`zbridge.robot.observer.Observer`). A timer of the
 event loop sends a beat: no beat comes from a loop that hangs. Whatever changes what the supervisor needs (the robot is
 driven or not, the state of the link, a link that is up or gone) sends a beat at once. The end of the post means that
 the supervisor is gone: then the process ends in order, as nobody looks after its robot.
+
+A beat has the stop of the robot. The state that a successor would need is deposited in shared memory, at most every
+:data:`KEEP_S` unless the state of the robot or its stop is another one; where each stream stands is noted there with
+every read (:mod:`zbridge.app.supervisor.memory`).
 """
 
 from __future__ import annotations
@@ -53,6 +57,7 @@ VALUE_BYTES = 128 * 1024
 """Largest single value in a deposit: a map that came in parts, a published message; larger ones are left out."""
 TELL_S = 60.0
 """Least seconds between two log lines about what is not in a deposit."""
+_LOST = "a crash would end the robot's connection"
 _NUMBERS = 16 * SLOTS
 """Links are numbered up to here, then again from the lowest free number."""
 _encode = msgspec.msgpack.Encoder().encode
@@ -209,7 +214,7 @@ class Reporter:
     def _keep(self, *, first: bool = False) -> None:
         """Deposit what a successor needs if this process dies. first: also that there is nothing."""
         self._kept_at, parcel = self._loop.time(), _Listed()
-        data, missing, sizes = self._exported(parcel)
+        data, missing, why = self._exported(parcel)
         known = {told: (number, at) for number, _, all_told in self._links.values() for at, told in enumerate(all_told)}
         kept = Kept()
         sockets = tuple(known[descriptor] for descriptor in parcel.descriptors if descriptor in known)
@@ -221,10 +226,10 @@ class Reporter:
             self._kept, self._deposited = kept, data
             if kept.sockets:
                 self._memory.told(kept.area)
-        self._tell_missing(missing, sizes, logging.INFO if data else logging.WARNING)
+        self._tell_missing(missing, why, logging.INFO if data else logging.WARNING)
 
     def _exported(self, parcel: Parcel) -> tuple[bytes, str, str]:
-        """Describe what a successor needs, b"" for nothing; say what is missing, and its size.
+        """Describe what a successor needs, b"" for nothing; say what is missing, and why.
 
         What a protocol raises here ends no beat.
         """
@@ -233,26 +238,19 @@ class Reporter:
             given = self.keep(parcel, budget) if self._device is not None else None
             data = _encode(given) if given is not None else b""
         except Exception as error:
-            return b"", f"a crash would end the robot's connection: {describe(error)}", ""
+            return b"", _LOST, describe(error)
         if len(data) > DEPOSIT_BYTES:
-            return (
-                b"",
-                f"a crash would end the robot's connection: its state exceeds {DEPOSIT_BYTES} bytes",
-                f"{len(data)}",
-            )
+            return b"", _LOST, f"its state has {len(data)} bytes, more than {DEPOSIT_BYTES}"
         names = sorted(budget.left_out)
         missing = f"after a crash the next process would begin without {', '.join(names)}" if names else ""
-        return (
-            data,
-            missing,
-            f"more than {VALUE_BYTES} bytes: {', '.join(str(budget.left_out[name]) for name in names)}",
-        )
+        sizes = ", ".join(str(budget.left_out[name]) for name in names)
+        return data, missing, f"{sizes} bytes, more than {VALUE_BYTES}"
 
-    def _tell_missing(self, text: str, sizes: str, level: int) -> None:
+    def _tell_missing(self, what: str, why: str, level: int) -> None:
         now, (told, at) = self._loop.time(), self._missing_told
-        if text and text != told and now >= at + TELL_S:
-            self._missing_told = (text, now)
-            log.log(level, "%s; %s", text, sizes)
+        if what and what != told and now >= at + TELL_S:
+            self._missing_told = (what, now)
+            log.log(level, "%s: %s", what, why)
 
     def _next_number(self) -> int:
         """Choose the number of a new link: one that was not given lately, with a slot of its own."""

@@ -250,19 +250,14 @@ class Crossing:
         pid, orders = scene.supervisor.gateway(self._name), scene.supervisor.orders
         if case.order is not None:
             case.order.write(orders, self._name)
-        at = time.monotonic()
+        at, logged = time.monotonic(), scene.supervisor.logged
         os.kill(pid, case.crash or signal.SIGUSR2)
         if case.order is not None:
             at = until(lambda: Order.carried_out(orders, self._name), STEP_S, f"the step: {case.way}")
         elif case.crash is None:
-            until(
-                lambda: f"{self._name}: process {self._now()} serves it now" in scene.supervisor.log, STEP_S, "restart"
-            )
+            served = re.compile(rf"{re.escape(self._name)}: process \d+ serves it now")
+            until(lambda: served.search(scene.supervisor.log_since(logged)), STEP_S, "the restart")
         return at
-
-    def _now(self) -> int:
-        found = re.findall(rf"{re.escape(self._name)}: process (\d+)", self._scene.supervisor.log)
-        return int(found[-1]) if found else 0
 
     def _rest(self, since: float, driver: Part) -> float | None:
         """Wait until the robot has been at rest for REST_S; give the seconds to rest.
@@ -317,7 +312,7 @@ class Crossing:
 
 def repeat(scene: Scene, case: Case) -> Outcome:
     """Do a case once; what does not come about is a fault."""
-    outcome = Outcome(case)
+    outcome, logged = Outcome(case), scene.supervisor.logged
     with contextlib.ExitStack() as stack:
         crossing = Crossing(scene, stack, outcome)
         try:
@@ -326,7 +321,7 @@ def repeat(scene: Scene, case: Case) -> Outcome:
             status = scene.fleet.last(f"{crossing._name}/status")
             outcome.faults.append(f"{type(error).__name__}: {error}; {status}")
         if not outcome.good and not outcome.disturbed:
-            lines = [line for line in scene.supervisor.log.splitlines() if f"{crossing._name}:" in line]
+            lines = [line for line in scene.supervisor.log_since(logged).splitlines() if f"{crossing._name}:" in line]
             print(outcome, *lines[-25:], sep="\n  ", file=sys.stderr, flush=True)
     return outcome
 

@@ -51,7 +51,18 @@ class Supervised:
     @property
     def log(self) -> str:
         """What the supervisor and its gateways have logged."""
-        return self._log.read_text()
+        return self.log_since(0)
+
+    def log_since(self, at: int) -> str:
+        """What they have logged since the log had so many bytes (:attr:`logged`)."""
+        with self._log.open("rb") as file:
+            file.seek(at)
+            return file.read().decode(errors="replace")
+
+    @property
+    def logged(self) -> int:
+        """How many bytes they have logged."""
+        return self._log.stat().st_size
 
     def gateway(self, robot: str, not_pid: int = 0) -> int:
         """Wait for the gateway process of a robot, another one than ``not_pid``; give its process id."""

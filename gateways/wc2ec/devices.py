@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import msgspec
 
 from zbridge.fleet.messages import Device, Devices
-from zbridge.protocol import Kept
+from zbridge.protocol import Exported, Form, Kept
 
 DISTANCE, LIGHT, ROTATIONAL, LINEAR = "distance", "light", "rotational", "linear"
 _SENSOR_KINDS = {37: DISTANCE, 38: DISTANCE}
@@ -37,8 +37,7 @@ class Table(Kept):
 
     kept: ClassVar[dict[str, Any]] = {
         "collisions": list[str],
-        "_by_number": dict[int, WebotsDevice],
-        "_by_name": dict[str, WebotsDevice],
+        "_by_number": Form(lambda table: [_written(device) for device in table.values()], lambda raw: _read(raw)),
     }
 
     def __init__(self) -> None:
@@ -48,6 +47,10 @@ class Table(Kept):
 
     def __repr__(self) -> str:
         return f"<Table of {len(self._by_number)} devices>"
+
+    def restore(self, state: Exported) -> None:
+        super().restore(state)
+        self._by_name = {device.name: device for device in self._by_number.values()}
 
     def add(self, device: WebotsDevice) -> WebotsDevice | None:
         """Enter a device; give it as entered (a number is added to a taken name). None: its number is taken."""
@@ -98,3 +101,18 @@ def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
         if kind_byte in types:
             return kind
     return _SENSOR_KINDS.get(kind_byte, f"type{kind_byte}")
+
+
+def _written(device: WebotsDevice) -> list[Any]:
+    """Write a device as MessagePack holds it: a name may have bytes that are not UTF-8."""
+    name = device.name.encode("utf-8", "surrogateescape")
+    shown = None if device.shown == device.name else device.shown
+    return [name, shown, device.number, device.type, device.kind]
+
+
+def _read(raw: Any) -> dict[int, WebotsDevice]:
+    devices = {}
+    for written, shown, number, kind_byte, kind in msgspec.convert(raw, list[tuple[bytes, str | None, int, int, str]]):
+        name = written.decode("utf-8", "surrogateescape")
+        devices[number] = WebotsDevice(name, name if shown is None else shown, number, kind_byte, kind)
+    return devices

@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import signal
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,14 @@ from tests.clock import jumping
 from tests.proofs import Holder
 from zbridge.app.config import plan
 from zbridge.app.gateway import Gateway
+from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle
 from zbridge.bus.fake import FakeBus
 from zbridge.errors import BusError, ConfigError
+from zbridge.fleet.topics import KeySpace
+from zbridge.hq import RobotSubscription
 from zbridge.metrics import Metrics
 
 SOON_S = 5.0
@@ -103,6 +107,22 @@ async def test_a_process_with_listeners_only_answers_for_its_sessions_under_its_
     async with serving(gateway, monkeypatch) as bus:
         (answer,) = await bus.ask("fleet/r1/@rpc/sessions/*")
         assert answer.key == f"fleet/r1/@rpc/sessions/hq.{name or 'desk'}.1"
+
+
+async def test_the_successor_of_a_gateway_that_died_binds_listeners_of_its_own() -> None:
+    listener = {"protocol": "tcpudp", "listen": "tcp://127.0.0.1:0", "name": "desk"}
+    near, far = socket.socketpair()
+    with near, far:
+        gateway = Gateway(plan({"robot": {"name": "r1"}, "device": NOWHERE, "hq": [listener]}), predecessor=far)
+        assert gateway._incoming is not None
+        gateway._incoming.given = Given(VERSION, {}, 0, claim={"since": 1.0}, device={"links": []})
+        bus = FakeBus("1")
+        (made,) = gateway._listeners(bus, RobotSubscription(bus, KeySpace("fleet", "r1"), Metrics()))
+        running = asyncio.create_task(made.run(gateway._incoming.taken))
+        async with asyncio.timeout(SOON_S):
+            await made.ready.wait()  # HQ programs are accepted: there is nothing to be taken over
+        running.cancel()
+        await asyncio.wait([running])
 
 
 @jumping

@@ -61,6 +61,20 @@ def test_two_files_with_one_robot_or_one_address_are_refused() -> None:
         require_different_robots([robot("r1", 1), robot("r2", 1)])
 
 
+def test_two_files_with_one_address_of_a_robot_are_refused_unless_both_share_it() -> None:
+    def at(host: str, **more: object) -> dict[str, object]:
+        return {"device": {"protocol": "tcpudp", "connect": [f"tcp://{host}:11001"], **more}}
+
+    shared = {"allow_shared_address": True}
+    require_different_robots([robot("r1", **at("127.0.0.1")), robot("r2", **at("127.0.0.2"))])
+    require_different_robots([robot("r1", **at("127.0.0.1", **shared)), robot("r2", **at("127.0.0.1", **shared))])
+    for more in ({}, shared):
+        with pytest.raises(
+            ConfigError, match=r"r2-0\.toml: device\.connect: expected another address than that of r1-0"
+        ):
+            require_different_robots([robot("r1", **at("127.0.0.1")), robot("r2", **at("localhost", **more))])
+
+
 def test_robots_that_share_a_session_have_one_bus() -> None:
     router = {"connect": ["tcp/127.0.0.1:7447"]}
     require_one_bus([robot("r1", bus=router), robot("r2", bus=router)])

@@ -69,7 +69,8 @@ async def together(monkeypatch: pytest.MonkeyPatch, host: HostSettings | None = 
         return bus
 
     monkeypatch.setattr("zbridge.app.joining.open_bus", open_bus)
-    served = Together({name: planned(name) for name in NAMES}, host or HostSettings(together=True))
+    plans = {name: planned(name) for name in NAMES}
+    served = Together(plans, host or HostSettings(together=True), lambda plan: contextlib.nullcontext())
     running = asyncio.create_task(served.run())
     await asyncio.sleep(0.5)
     try:

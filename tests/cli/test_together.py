@@ -11,7 +11,7 @@ from zbridge.app.host import HostSettings
 from zbridge.app.together import Together
 from zbridge.errors import ConfigError
 
-ROBOT = '[robot]\nname = "{}"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://127.0.0.1:1"]\n{}'
+ROBOT = '[robot]\nname = "{0}"\n[device]\nprotocol = "tcpudp"\nconnect = ["tcp://{0}.test:1"]\n{1}'
 HOST = HostSettings(together=True)
 
 
@@ -63,11 +63,15 @@ def test_a_faulty_file_is_reported_and_the_other_robots_run(tmp_path: Path, serv
             "b.toml: robot.name = 'r1': expected another name",
         ),
         (
+            {"a": ROBOT.format("r1", ""), "b": ROBOT.format("r2", "").replace("r2.test", "r1.test")},
+            "b.toml: device.connect: expected another address than that of",
+        ),
+        (
             {"a": ROBOT.format("r1", ""), "b": ROBOT.format("r2", '[bus]\nconnect = ["tcp/127.0.0.1:1"]')},
             "b.toml: bus: expected the same as in",
         ),
     ],
-    ids=["no robot is left", "one robot twice", "two buses"],
+    ids=["no robot is left", "one robot twice", "one address twice", "two buses"],
 )
 def test_what_cannot_run_together_is_refused(tmp_path: Path, served, files: dict[str, str], said: str) -> None:
     with pytest.raises(ConfigError) as error:

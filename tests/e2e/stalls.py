@@ -132,14 +132,16 @@ class Outcome:
 class MovingRobot:
     """A fragile robot's process, and what it tells of its motion."""
 
-    def __init__(self, stack: contextlib.ExitStack, name: str, host: str, enter: Sequence[str], seed: int) -> None:
+    def __init__(
+        self, stack: contextlib.ExitStack, name: str, host: str, enter: Sequence[str], seed: int, **options: Any
+    ) -> None:
         self.changes: list[tuple[float, float]] = [(0.0, 0.0)]
         """When it told a speed, and which."""
         self.report: dict[str, Any] = {}
         self.went_on = 0.0
         """When its program last went on after its own send held it up."""
         self._ports: queue.Queue[int] = queue.Queue()
-        told = json.dumps({"seed": seed, "tells": True})
+        told = json.dumps({"seed": seed, "tells": True, **options})
         self.part = Part(stack, *enter, *module("fragile", name, host, told), heard=self._hear)
         self.port = self._ports.get(timeout=LINE_S)
 

@@ -1,7 +1,7 @@
-"""A supervisor as a part of a scene, whose gateways hang when they are told to.
+"""A supervisor as a part of a scene, whose gateways hang, and die at a step of a restart, when they are told to.
 
 ``python -m tests.e2e.supervised FOLDER``: ``zbridge run FOLDER``; its fork server is this module too. A gateway that is
-sent SIGUSR1 blocks its event loop for good.
+sent SIGUSR1 blocks its event loop for good. Orders to die are written to the folder beside it (:mod:`.steps`).
 """
 
 import asyncio
@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 
+from tests.e2e import steps
 from tests.e2e.conftest import WAIT_S, end, until
 from tests.e2e.processes import ROOT, module
 from zbridge.app import until_signal
@@ -38,6 +39,7 @@ class Supervised:
         environment: dict[str, str] | None = None,
     ) -> None:
         self.folder = folder
+        self.orders = orders_of(folder)
         self._log = folder.with_suffix(".log")
         command = (
             module("supervised", folder) if hangs else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
@@ -49,7 +51,18 @@ class Supervised:
     @property
     def log(self) -> str:
         """What the supervisor and its gateways have logged."""
-        return self._log.read_text()
+        return self.log_since(0)
+
+    def log_since(self, at: int) -> str:
+        """What they have logged since the log had so many bytes (:attr:`logged`)."""
+        with self._log.open("rb") as file:
+            file.seek(at)
+            return file.read().decode(errors="replace")
+
+    @property
+    def logged(self) -> int:
+        """How many bytes they have logged."""
+        return self._log.stat().st_size
 
     def gateway(self, robot: str, not_pid: int = 0) -> int:
         """Wait for the gateway process of a robot, another one than ``not_pid``; give its process id."""
@@ -74,20 +87,28 @@ def children(pid: int) -> list[int]:
     return []
 
 
+def orders_of(folder: Path) -> Path:
+    """Give the folder for orders to the gateways of a folder."""
+    return folder.with_suffix(".orders")
+
+
 def hang(birth: Birth) -> int:
-    """Be a gateway that can be hung."""
+    """Be a gateway that can be hung, and ended at a step of a restart."""
     signal.signal(signal.SIGUSR1, lambda *_: time.sleep(3600))
+    steps.be(birth.request.robot)
     return run(birth)
 
 
 def main() -> None:
     if sys.argv[1] == FORKS:
-        serve(Post.inherited(int(sys.argv[2])), hang)
+        steps.watch(Path(sys.argv[2]))
+        serve(Post.inherited(int(sys.argv[3])), hang)
         return
     set_up_log(verbose=False)
-    supervisor = Supervisor(
-        (Path(sys.argv[1]),), HostSettings(), module("supervised", FORKS), watch=False, verbose=False
-    )
+    folder = Path(sys.argv[1])
+    orders_of(folder).mkdir(exist_ok=True)
+    forks = module("supervised", FORKS, orders_of(folder))
+    supervisor = Supervisor((folder,), HostSettings(), forks, watch=False, verbose=False)
     asyncio.run(until_signal(supervisor.run()))
 
 

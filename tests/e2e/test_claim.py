@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 import zenoh
 
-from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, until
+from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, start, until
 from tests.e2e.robots import Robot
 from tests.ports import free_port
 from tests.proofs import packed
@@ -44,6 +46,30 @@ def test_a_forged_claim_takes_the_robot_from_nobody_and_a_plausible_one_is_told(
             until(lambda: bench.fleet.refusal(who=zid, command="claim", code="held"), what="control that names it")
     until(lambda: bench.fleet.reason() == "", LOOK_S, what="status without the forger")
     bench.fleet.session.close()
+
+
+def test_another_robot_name_with_the_same_address_is_refused_on_one_machine_and_a_standby_is_not(
+    bench: Bench, robot: Robot
+) -> None:
+    bench.serve(robot.port)
+    other, file = device(robot.port).replace("127.0.0.1", "localhost"), bench.folder / "r2.toml"
+    file.write_text(f'[robot]\nname = "r2"\n{other}')
+    whose = f"r2.toml: device.connect = ['tcp://localhost:{robot.port}']: expected an address of its own: fleet/r1"
+    for command in ("check", "run"):
+        process = start(command, str(file))
+        said = end(process, signal.SIGCONT, 20)
+        assert process.returncode == 2, said
+        assert whose in said.splitlines()[-1]
+        assert "allow_shared_address" in said
+    (bench.folder / "two").mkdir()
+    for name in ("r3", "r4"):
+        (bench.folder / "two" / f"{name}.toml").write_text(f'[robot]\nname = "{name}"\n{device(1)}')
+    process = start("run", str(bench.folder / "two"))
+    assert "r4.toml: device.connect: expected another address than that of" in end(process, signal.SIGCONT, 20)
+    assert process.returncode == 2
+    standby = bench.gateway(device(robot.port), name="standby")
+    until(lambda: "another gateway serves r1: waiting until it goes" in standby.log, what="a standby")
+    assert robot.connections == 1
 
 
 # Two networks that know nothing of each other until they are joined

@@ -19,6 +19,7 @@ from tests.e2e.processes import ROOT
 from tests.e2e.restarts import MOST_GAP_S, ROBOTS, Restarted, restart
 from tests.e2e.robots import MOVE, STOP, Robot
 from tests.ports import free_port
+from zbridge.app.handover.messages import VERSION
 
 
 @pytest.mark.parametrize("protocol", ROBOTS)
@@ -150,7 +151,7 @@ time.sleep(60)
     ("how", "reason"),
     [
         ("silent", "says nothing"),
-        ("newer", "states of version 9, this gateway has 1"),
+        ("newer", f"states of version 9, this gateway has {VERSION}"),
         ("crash", "the other side has ended"),
         ("hangs", "says nothing for 0.5 s"),
     ],

@@ -7,16 +7,19 @@ import os
 import re
 import signal
 import socket
+import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, repeated, start, until
-from tests.e2e.crashes import measure
-from tests.e2e.robots import MOVE, STOP, Robot
+from tests.e2e.crossings import Case, measure
+from tests.e2e.robots import MOVE, STOP, Robot, position
+from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
+from zbridge.app.supervisor.runner import KEPT_CRASHES
 
 ROBOTS = 8
 
@@ -24,7 +27,14 @@ ROBOTS = 8
 class Host:
     """A supervisor and its robots: scripted ones, in this process."""
 
-    def __init__(self, bench: Bench, systemd: socket.socket, robots: int = ROBOTS, more: str = "") -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        systemd: socket.socket,
+        robots: int = ROBOTS,
+        more: str = "",
+        before: Callable[[Path], object] = lambda folder: None,
+    ) -> None:
         self.bench = bench
         self.folder = bench.folder / "robots"
         self.folder.mkdir()
@@ -33,6 +43,7 @@ class Host:
             self.robots.append(bench.stack.enter_context(contextlib.closing(Robot())))
             self.write(number, more)
         self.systemd = systemd
+        before(self.folder)
         environment = {**os.environ, "NOTIFY_SOCKET": str(systemd.getsockname())}
         self.supervisor = Supervised(bench.stack, self.folder, environment=environment)
 
@@ -94,11 +105,15 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     fleet, supervisor = host.bench.fleet, host.supervisor
     host.ready()
 
-    for count, words in enumerate((r"r3: process \d+ goes on with its connections", "r3: next process in"), 1):
-        os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # soon after the first crash what was kept is not trusted
-        until(lambda words=words: re.search(words, supervisor.log), 20, words)  # type: ignore[misc]
-        until(lambda count=count: host.robots[3].connections == count, what="its connections")  # type: ignore[misc]
-        until(lambda: fleet.state("r3") == "established", what="the robot")
+    goes_on = r"r3: process \d+ goes on with its connections"
+    for count in range(1, KEPT_CRASHES + 1):
+        os.kill(supervisor.gateway("r3"), signal.SIGKILL)
+        until(lambda count=count: len(re.findall(goes_on, supervisor.log)) == count, 20, goes_on)  # type: ignore[misc]
+    assert host.connections[3] == 1
+    os.kill(supervisor.gateway("r3"), signal.SIGKILL)  # what was deposited may be what kills them
+    until(lambda: "r3: next process in" in supervisor.log, 20, "another connection")
+    until(lambda: host.robots[3].connections == 2, what="its connections")
+    until(lambda: fleet.state("r3") == "established", what="the robot")
     assert host.connections == [1, 1, 1, 2, 1, 1, 1, 1]
 
     host.write(5, more="colour = 1\n")
@@ -133,13 +148,66 @@ def test_eight_robots_of_which_one_crashes_and_one_gets_a_faulty_file(host: Host
     assert all(count > 0 for count in stopped)
 
 
-def test_robots_rest_soon_after_their_gateway_hung_or_died_while_they_moved() -> None:
-    outcomes = measure([("tcpudp-1.3", "hung"), ("wc2ec", "frozen"), ("alf", "killed"), ("tcpudp-1.3-udp", "killed")])
-    assert len(outcomes) == 4
-    assert sum(outcome.kept for outcome in outcomes) >= 3, "one may have died within a packet"
-    for outcome in outcomes:
-        assert outcome.rest_s is not None, outcome
-        assert not outcome.faults, outcome
+def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whatever_step_of_a_restart() -> None:
+    plan = [
+        Case("tcpudp-1.3", "hung"),
+        Case("wc2ec", "frozen"),
+        Case("alf", "killed"),
+        Case("tcpudp-1.4", f"predecessor {AFTER_GIVEN}"),
+        Case("alf", f"successor {AFTER_GO}"),
+        Case("tcpudp-1.3-udp", f"again successor {FIRST_READ}"),
+    ]
+    outcomes = measure(plan, lanes=len(plan))
+    assert len(outcomes) == len(plan)
+    assert [outcome for outcome in outcomes if not outcome.good] == []
+
+
+def test_a_map_of_which_half_was_read_when_the_gateway_died_is_skipped_and_what_follows_it_is_read(
+    bench: Bench, systemd: socket.socket
+) -> None:
+    host = Host(bench, systemd, 1)
+    (robot,), cells = host.robots, 2048 * 2048
+    host.ready()
+    grid = struct.pack("<iBBi", 2 + 4 + cells, 1, 53, cells) + bytes(cells)
+    robot.send(grid[:3_000_000])
+    time.sleep(1.0)  # it is deposited, and what was read since is only in the shared memory
+    robot.send(grid[3_000_000:3_500_000])
+    killed, pid = time.monotonic(), host.supervisor.gateway("r0")
+    os.kill(pid, signal.SIGKILL)
+    until(lambda: robot.packets(STOP, killed), what="the stop")
+    robot.send(grid[3_500_000:] + position(100.0, 0.0, 0.0))
+    host.supervisor.gateway("r0", not_pid=pid)
+    until(lambda: bench.fleet.last("r0/pose").get("x") == pytest.approx(1.0), 20, "what followed the map")
+    assert bench.fleet.state("r0") == "established"
+    assert robot.connections == 1
+
+
+def test_no_file_keeps_a_supervisor_from_starting_from_following_others_or_from_stopping_a_robot(
+    bench: Bench, systemd: socket.socket
+) -> None:
+    def strange(folder: Path) -> None:
+        os.mkfifo(folder / "fifo.toml")
+        (folder / "device.toml").symlink_to("/dev/zero")
+        (folder / "folder.toml").mkdir()
+        (folder / "brackets.toml").write_text("a = " + 20_000 * "[")
+        (folder / "digits.toml").write_text("a = " + 5_000 * "1")
+        Path(os.fsdecode(os.fsencode(folder) + b"/\xff.toml")).write_bytes((folder / "r0.toml").read_bytes())
+
+    host = Host(bench, systemd, 1, before=strange)
+    host.ready()
+    (robot,), supervisor = host.robots, host.supervisor
+    with host.driven():
+        until(lambda: robot.packets(MOVE), what="the robot drives")
+        (host.folder / "large.toml").write_text(f"a = [{450_000 * '1,'}]")
+        supervisor.reload()
+        killed = time.monotonic()
+        os.kill(supervisor.gateway("r0"), signal.SIGKILL)
+        stop = until(lambda: robot.packets(STOP, killed), what="the stop")[0]
+    assert stop.at - killed < 0.5
+    until(lambda: re.search(r"r0: process \d+ goes on with its connections", supervisor.log), 20, "the next process")
+    until(lambda: "large.toml" in supervisor.log, 20, "the fault of the large file")
+    assert robot.connections == 1
+    until(lambda: b"faulty files" in systemd.recv(1000), what="the status line")
 
 
 def test_two_files_with_one_robot_are_refused_at_the_start(tmp_path: Path) -> None:

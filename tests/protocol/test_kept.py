@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import msgspec
@@ -12,10 +13,11 @@ from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive
 from zbridge.fleet.view import RobotView
 from zbridge.metrics import Metrics
-from zbridge.protocol.kept import Kept
+from zbridge.protocol.kept import Budget, Kept, Spare
 from zbridge.protocol.outbox import Outbox
 from zbridge.protocol.plugin import Protocol, find_protocol
 from zbridge.protocol.session import Limits, Session
+from zbridge.protocol.session_kept import PARTIAL, SKIPPED
 from zbridge.protocol.traffic import Datagram
 
 SETTINGS = bytes.fromhex("210000000102020b000000312e312c312e322c312e3300010101010101e803000064000000")
@@ -125,3 +127,92 @@ def test_a_step_or_a_kind_of_frame_that_this_version_lacks_is_refused() -> None:
     outbox = {**state["outbox"], "_queue": [["a.later.Kind", b""]]}
     with pytest.raises(ProtocolError, match=r"unknown kind 'a\.later\.Kind'"):
         session.restore({**state, "outbox": outbox})
+
+
+# A deposit, for the case that the process dies
+
+
+class _Thrifty(Kept):
+    kept = {"name": str, "large": Spare(bytes | None), "rows": Spare(list[int]), "inner": _Thing}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.name, self.large, self.rows, self.inner = "new", b"", [0], _Thing()
+
+
+def test_a_deposit_lacks_what_is_spare_and_large_and_the_rest_is_restored() -> None:
+    before, after, budget = _Thrifty(), _Thrifty(), Budget(100)
+    before.name, before.large, before.rows, before.inner.number = 200 * "n", bytes(101), [7], 5
+    after.restore(carried(before.export(budget)))
+    assert (after.name, after.large, after.rows, after.inner.number) == (200 * "n", b"", [7], 5)
+    assert budget.left_out == {"_Thrifty.large": 101}
+    whole = _Thrifty()
+    whole.restore(carried(before.export()))
+    assert whole.large == bytes(101)
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_a_robots_session_goes_on_from_a_deposit_wherever_its_stream_is_cut(name: str) -> None:
+    stream, protocol = STREAMS[name], find_protocol(name)
+    _, whole = robot(protocol)
+    whole.open(1.0)
+    expected = whole.receive(stream, 2.0)
+    for cut in range(len(stream) + 1):
+        _, before = robot(protocol)
+        before.open(1.0)
+        heard = before.receive(stream[:cut], 2.0)
+        _, after = robot(protocol)
+        after.restore(carried({**before.export(Budget(1000)), PARTIAL: before.partial(1000)}))
+        assert len(heard + after.receive(stream[cut:], 2.0)) == len(expected)
+
+
+def test_a_1_4_robot_leaves_its_map_of_4_mb_out_of_a_deposit_and_the_next_part_begins_it_anew() -> None:
+    body = bytes([2]) + struct.pack("<i", 7) + b"1.3,1.4" + bytes(7) + struct.pack("<ii", 20480, 10)
+    settings = struct.pack("<iBB", 2 + len(body), 1, 2) + body
+    part = struct.pack("<iBBii", 2 + 8 + 1024, 1, 56, 0, 1024) + bytes(1023) + b"\2"
+    made, session = robot(find_protocol("tcpudp"))
+    session.open(1.0)
+    session.receive(settings, 1.0)
+    assert session.settings is not None
+    for message in session.receive(part, 2.0):
+        made.translator(type(message))(message, 1)
+    assert made.known(topics.MAP) is not None
+    budget = Budget(64 * 1024)
+    state = carried(made.export(budget))
+    assert budget.left_out == {"TelemetryTranslator._parts": 2048 * 2048}
+    heir, other = robot(find_protocol("tcpudp"))
+    other.restore(carried(session.export(budget)))
+    heir.restore(state)
+    assert heir.known(topics.MAP) is None
+    for message in other.receive(part, 3.0):
+        heir.translator(type(message))(message, 1)
+    assert heir.known(topics.MAP).cells[0:1024, 0].tolist() == [0] * 1023 + [2]
+
+
+def test_a_frame_of_4_mb_that_was_cut_off_is_counted_where_its_rest_is_skipped() -> None:
+    _, before = robot(find_protocol("tcpudp"))
+    before.open(1.0)
+    before.receive(SETTINGS, 1.0)
+    cells = 2048 * 2048
+    grid = struct.pack("<iBBi", 2 + 4 + cells, 1, 53, cells) + bytes(cells)
+    assert before.receive(grid[:3_000_000], 2.0) == []
+    state = {**before.export(Budget(1000)), PARTIAL: before.partial(32_768)}
+    assert len(msgspec.msgpack.encode(state)) < 3000
+    _, after = robot(find_protocol("tcpudp"))
+    after.restore(carried(state))
+    assert after.snapshot().left_out == {SKIPPED: 1}
+    assert len(after.receive(grid[3_000_000:] + POSITION, 3.0)) == 1
+
+
+def test_a_robot_of_255_devices_fits_a_deposit_whatever_bytes_are_in_their_names() -> None:
+    made, session = robot(find_protocol("wc2ec"))
+    session.open(1.0)
+    for number in range(255):
+        name = b"sensor \xff %03d" % number + 243 * b"x"
+        for message in session.receive(bytes([0, 37, number, len(name)]) + name, 1.0):
+            made.translator(type(message))(message, 1)
+    state = carried(made.export(Budget(64 * 1024)))
+    assert len(msgspec.msgpack.encode(state)) < 256 * 1024
+    heir, _ = robot(find_protocol("wc2ec"))
+    heir.restore(state)
+    assert heir.export() == made.export()
+    assert len(state["_table"]["_by_number"]) == 255

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import struct
+from collections.abc import AsyncIterator
 from typing import Any
 
 import msgspec
 import pytest
 
 from tests.clock import scene_of
+from tests.proofs import packed
 from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, TimedLink, established, serving
+from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, Nobody, StopFrame
 from zbridge.transport import Parcel
 from zbridge.transport.conversation import Conversation
+from zbridge.wire.frames import Partial
 
 pytestmark = pytest.mark.jumping
 
 NONE = COMMANDS["none"][2]
 LEFT = COMMANDS["left"][2]
 AT_REST = LastStop(False, (StopFrame(STOP),), 0.01, "established")
+POSITION = bytes.fromhex("0e0000000137") + struct.pack("<3f", 100.0, 0.0, 0.0)
+"""Packet 55 of the protocol page: 1 m to the right, in centimetres."""
+LIDAR_ON = bytes.fromhex("060000000133 01000000")
+"""Packet 51: the lidar is on."""
 rig = scene_of(established)
 
 
@@ -40,8 +49,8 @@ class Notes(Nobody):
     def linked(self, name: str, link: Any, up: bool) -> None:
         self.told.append((name, up))
 
-    def read(self, name: str) -> None:
-        self.told.append(("read", self.device.boundary(name).incoming))
+    def read(self, name: str, resume: Any) -> None:
+        self.told.append(("read", resume(100)))
 
 
 async def test_the_stop_of_a_robot_is_known_once_it_is_established() -> None:
@@ -71,7 +80,8 @@ async def test_an_observer_is_told_of_the_link_and_of_every_read() -> None:
         rig.sends(SETTINGS[:7])
         rig.sends(SETTINGS[7:])
         rig.goes()
-    assert notes.told[:5] == ["began", ("robot", True), ("read", False), ("read", True), ("robot", False)]
+    part, whole = ("read", Partial(SETTINGS[:7])), ("read", Partial())
+    assert notes.told[:5] == ["began", ("robot", True), part, whole, ("robot", False)]
     assert notes.told[-1] == "ended"
 
 
@@ -79,22 +89,25 @@ async def test_a_link_that_holds_bytes_back_may_stand_within_a_frame(rig: Rig) -
     assert rig.device.boundary("robot") == Boundary()
     rig.link.ready = False
     assert rig.device.boundary("robot") == Boundary(outgoing=False)
-    assert rig.device.boundary("another") == Boundary(outgoing=False, incoming=False)
+    assert rig.device.boundary("another") == Boundary(outgoing=False)
+    assert rig.device.partial("another", 100) is None
 
 
 async def test_a_robot_that_is_not_established_leaves_nothing_to_go_on_with() -> None:
     async with serving(hold=False) as rig:
-        assert rig.device.keep(Parcel()) is None
+        assert rig.device.keep(Parcel(), Budget(1000)) is None
         await rig.establish()
-        assert rig.device.keep(Parcel()) is not None
+        assert rig.device.keep(Parcel(), Budget(1000)) is not None
 
 
-async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig.command("drive", {"left": 1.0})
-    rig.command("text", {"text": "hi"})
-    kept = msgspec.msgpack.decode(msgspec.msgpack.encode(rig.device.keep(Parcel())))
+def deposited(rig: Rig, budget: Budget) -> Any:
+    """Carry what a device deposits as it is carried to another process."""
+    return msgspec.msgpack.decode(msgspec.msgpack.encode(rig.device.keep(Parcel(), budget)))
+
+
+@contextlib.asynccontextmanager
+async def heir_of(deposit: Any, monkeypatch: pytest.MonkeyPatch, *partials: Partial) -> AsyncIterator[Rig]:
+    """Run the device of another process, which attaches a link when it has taken over."""
 
     async def take_over(address: object, given: object, parcel: Parcel, conversation: Conversation) -> None:
         link = TimedLink(heir.loop, str(address))
@@ -107,17 +120,70 @@ async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
 
     monkeypatch.setattr("zbridge.robot.connection.take_over", take_over)
     heir = Rig()
-    heir.device.take_over(kept, Parcel())
+    heir.device.take_over(deposit, Parcel(), partials)
     task = asyncio.ensure_future(heir.device.run(begin))
     await heir.settle()
-    await asyncio.sleep(5.0)
-    assert heir.last("status")["state"] == "established"
-    assert len(heir.link.written) >= 5
-    assert set(heir.link.written) == {STOP}
-    assert heir.hold()["ok"]
-    heir.command("drive", {"left": 1.0})
-    await asyncio.sleep(0.2)
-    assert heir.link.written[-1] == LEFT
+    yield heir
     task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await task
+
+
+async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.command("drive", {"left": 1.0})
+    rig.command("text", {"text": "hi"})
+    async with heir_of(deposited(rig, Budget(1000)), monkeypatch) as heir:
+        await asyncio.sleep(5.0)
+        assert heir.last("status")["state"] == "established"
+        assert len(heir.link.written) >= 5
+        assert set(heir.link.written) == {STOP}
+        assert heir.hold()["ok"]
+        heir.command("drive", {"left": 1.0})
+        await asyncio.sleep(0.2)
+        assert heir.link.written[-1] == LEFT
+
+
+async def test_who_goes_on_publishes_again_what_the_dead_process_had_published_last(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.sends(LIDAR_ON)
+    lidar = rig.bus.values("fleet/r1/lidar")[-1]
+    async with heir_of(deposited(rig, Budget(1000)), monkeypatch) as heir:
+        assert heir.bus.values("fleet/r1/lidar") == [lidar], "a listener of the same process asked too early"
+
+
+async def test_nobody_is_given_the_lease_before_the_word_to_go(rig: Rig) -> None:
+    heir, go = Rig(), asyncio.Event()
+    heir.device.take_over(deposited(rig, Budget(1000)), Parcel())
+    task = asyncio.ensure_future(heir.device.run(go.wait))
+    await asyncio.sleep(0.1)
+    (reply,) = heir.ask("control/acquire/driver", packed({"who": "driver"})).replies
+    assert str(reply.error) == "another process takes the robot over"
+    go.set()
+    await asyncio.sleep(0.1)
+    assert heir.hold()["ok"]
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
+async def test_a_large_published_value_is_left_out_of_a_deposit_and_its_key_stays(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = len(rig.bus.values("fleet/r1/status")[-1])
+    budget = Budget(size - 1)
+    async with heir_of(deposited(rig, budget), monkeypatch) as heir:
+        assert budget.left_out["status"] == size
+        assert "status" in heir.device._publishers.known
+    assert deposited(rig, Budget(size))["published"][0][1] is not None
+
+
+async def test_the_rest_of_a_frame_whose_beginning_was_lost_is_skipped_and_the_next_one_read(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with heir_of(deposited(rig, Budget(1000)), monkeypatch, Partial(skip=5)) as heir:
+        heir.sends(b"\0\0\0")
+        heir.sends(b"\0\0" + POSITION)
+        assert heir.last("pose")["x"] == pytest.approx(1.0)

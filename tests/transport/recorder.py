@@ -93,17 +93,19 @@ def socket_of(link: TcpLink) -> socket.socket:
 
 
 @contextlib.asynccontextmanager
-async def connected() -> AsyncIterator[Pair]:
-    near, far = Recorder(), Recorder()
+async def connected(near: Recorder | None = None, buffer: bytearray | None = None) -> AsyncIterator[Pair]:
+    near, far = near or Recorder(), Recorder()
     async with listen(LOCAL, lambda: far) as address:
-        here = await connect(address, near)
+        here = await connect(address, near, buffer)
         await far.until("attached")
         pair = Pair(address, here, near, far)
-        yield pair
-        here.abort()
-        pair.there.abort()
-        await near.until("lost")
-        await far.until("lost")
+        try:
+            yield pair
+        finally:
+            here.abort()
+            pair.there.abort()
+            await near.until("lost")
+            await far.until("lost")
 
 
 def udp_socket(address: tuple[str, int]) -> socket.socket:

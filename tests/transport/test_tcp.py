@@ -13,7 +13,7 @@ from tests.transport.recorder import LOCAL, SOON_S, Recorder, connected, socket_
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address
 from zbridge.transport import tcp, tcp_options
-from zbridge.transport.link import STALLED_S
+from zbridge.transport.link import STALLED_S, Link
 from zbridge.transport.tcp import TcpLink, connect, listen
 
 
@@ -36,6 +36,30 @@ async def test_both_ends_are_attached_first_know_their_peer_and_exchange_bytes()
             assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == give_up_ms
         with contextlib.suppress(OSError):  # a kernel before 6.15; what was lost is sent again within a second
             assert socket_of(pair.here).getsockopt(socket.IPPROTO_TCP, 44) == 1000
+
+
+class Watcher(Recorder):
+    """Watches the reads of its link: which began and brought nothing yet."""
+
+    reading = False
+
+    def attached(self, link: Link) -> None:
+        super().attached(link)
+        link.reads = lambda: setattr(self, "reading", True)
+
+    def received(self, data: bytes) -> None:
+        super().received(data)
+        self.reading = False
+
+
+@pytest.mark.both_loops
+async def test_who_watches_the_reads_learns_the_end_of_each_also_of_one_that_found_nothing() -> None:
+    watcher = Watcher()
+    async with connected(watcher, buffer=bytearray(64)) as pair:
+        for count in range(1, 4):
+            pair.there.write(bytes(64))  # fills the buffer, so the loop reads once more
+            await watcher.until("received", received=64 * count)
+            await until(lambda: not watcher.reading)
 
 
 async def test_what_was_written_before_closing_arrives_and_a_lost_link_takes_calls_without_effect() -> None:

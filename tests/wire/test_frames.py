@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.errors import ProtocolError
-from zbridge.wire.frames import FrameBuffer, FramingFault
+from zbridge.wire.frames import FrameBuffer, FramingFault, Partial
 
 LIMIT = 50
 
@@ -90,3 +90,62 @@ def test_a_framing_function_that_does_not_advance_is_an_error_with_its_name(
     assert list(buffer.feed(first)) == []
     with pytest.raises(FramingFault, match=rf"tests\.wire\.test_frames\..*stuck returned a frame of {end} bytes"):
         list(buffer.feed(read))
+
+
+# A frame that somebody else resumes
+
+
+def counted(data: bytes, start: int) -> int:
+    """A header of four bytes, the length of the body; as the packets of the TCP/UDP protocol page."""
+    if len(data) - start < 4:
+        return start + 4
+    return start + 4 + int.from_bytes(data[start : start + 4], "little")
+
+
+def text(data: bytes, start: int) -> int:
+    """Up to the next semicolon, as the text messages of the ALF protocol page."""
+    found = data.find(b";", start)
+    return found + 1 if found >= 0 else len(data) + 1
+
+
+LARGE = (10_000).to_bytes(4, "little") + bytes(10_000)
+SMALL = (2).to_bytes(4, "little") + b"ab"
+
+
+@pytest.mark.parametrize("cut", [0, 1, 3, 4, 64, 65, 66, 99, 100, 101, 5_000, 10_003, 10_004])
+def test_a_large_frame_is_resumed_by_the_bytes_to_skip_and_the_next_frame_is_whole(cut: int) -> None:
+    stream = LARGE + SMALL
+    before, after = FrameBuffer(counted, 20_000), FrameBuffer(counted, 20_000)
+    heard = len(list(before.feed(stream[:cut])))
+    partial = before.partial(most_bytes=100)
+    assert partial is not None
+    assert partial == (Partial(stream[:cut]) if cut <= 100 else Partial(skip=10_004 - cut))
+    after.resume(partial)
+    for byte in stream[cut:-1]:
+        heard += len(list(after.feed(bytes([byte]))))
+    assert list(after.feed(stream[-1:])) == [SMALL]
+    assert heard == (cut <= 100 or cut == 10_004), "the large frame is lost where its beginning is"
+
+
+def test_what_is_still_to_be_skipped_is_skipped_by_a_third_process() -> None:
+    first, second, third = (FrameBuffer(counted, 20_000) for _ in range(3))
+    assert list(first.feed(LARGE[:1_000])) == []
+    second.resume(first.partial(100) or Partial())
+    assert list(second.feed(LARGE[1_000:3_000])) == []
+    assert second.partial(100) == Partial(skip=7_004)
+    third.resume(second.partial(100) or Partial())
+    assert list(third.feed(LARGE[3_000:] + SMALL)) == [SMALL]
+
+
+def test_a_frame_whose_header_does_not_tell_its_end_is_kept_whole_or_not_at_all() -> None:
+    buffer = FrameBuffer(text, 20_000)
+    assert list(buffer.feed(b"1|" + 100 * b"10|")) == []
+    assert buffer.partial(302) == Partial(b"1|" + 100 * b"10|")
+    assert buffer.partial(301) is None
+    assert buffer.partial() == Partial(b"1|" + 100 * b"10|")
+
+
+@pytest.mark.parametrize("partial", [Partial(skip=-1), Partial(skip=51), Partial(b"\x01", 3), Partial(b"\x01\x00")])
+def test_what_is_no_incomplete_frame_cannot_be_resumed(partial: Partial) -> None:
+    with pytest.raises(ProtocolError):
+        FrameBuffer(frame_end, LIMIT).resume(partial)

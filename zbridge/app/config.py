@@ -17,7 +17,7 @@ from typing import Any
 
 import msgspec
 
-from zbridge.app.toml import convert, read_toml
+from zbridge.app.toml import convert, parse_toml, read_file
 from zbridge.bus import BusSettings
 from zbridge.bus.tls.files import TLS_VARIABLE, folder_settings, tls_beside
 from zbridge.camera import CameraPlan, CameraSettings, plan_camera
@@ -78,18 +78,26 @@ class Plan(msgspec.Struct, frozen=True):
         return common
 
 
-def load(path: Path, environment: Mapping[str, str] = os.environ, *, tls: Path | None = None) -> Plan:
+def load(
+    path: Path,
+    environment: Mapping[str, str] = os.environ,
+    *,
+    tls: Path | None = None,
+    content: bytes | None = None,
+) -> Plan:
     """Read and check a configuration file; raise ConfigError, which names the file as well.
 
     tls: a folder as ``zbridge certs bundle`` makes it, for a file without ``bus.tls``; so does ``ZBRIDGE_TLS``. Paths
-    in ``bus.tls`` are relative to the file.
+    in ``bus.tls`` are relative to the file. content: of the file, if it was read already.
     """
-    raw = read_toml(path)
+    raw = parse_toml(path, read_file(path, waits=True) if content is None else content)
     try:
         planned = plan(raw, environment)
         bus = _secured(planned.config.bus, path.absolute().parent, tls, environment.get(TLS_VARIABLE))
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: nested too deeply") from error
     return msgspec.structs.replace(planned, config=msgspec.structs.replace(planned.config, bus=bus))
 
 
@@ -141,7 +149,7 @@ def _device(settings: DeviceSettings) -> DevicePlan:
             f"device.connect = {list(settings.connect)}: a {protocol.name} robot has at most {protocol.links} link"
             f"{'s' if protocol.links > 1 else ''}"
         )
-    return DevicePlan(protocol, options, addresses)
+    return DevicePlan(protocol, options, addresses, settings.allow_shared_address or protocol.keyed)
 
 
 def _listener(settings: HqSettings, key: str) -> ListenerPlan:

@@ -14,13 +14,13 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
@@ -29,7 +29,7 @@ from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.member import own_name
-from zbridge.control.audit_log import Audit, AuditFile
+from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.latch_store import LatchStore
@@ -43,12 +43,13 @@ from zbridge.hq import Listener, RobotSubscription
 from zbridge.hq.names import listener_names, process_name
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import Address
+from zbridge.protocol.kept import Exported
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.device import Device
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
-from zbridge.transport import connect
+from zbridge.transport import Parcel, connect
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -75,9 +76,9 @@ class Neighbourhood(msgspec.Struct, frozen=True):
 class Gateway:
     """A gateway of one robot: its device side, its listeners, or both, as the plan says.
 
-    metrics, sessions, conditions: of this gateway, shared by all parts. observer: is told of the robot's links.
-    predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this one can
-    be handed over.
+    metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, told of the robot's
+    links. predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this
+    one can be handed over.
     """
 
     def __init__(
@@ -92,7 +93,9 @@ class Gateway:
         self._plan = plan
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
-        self._incoming = Incoming(predecessor, plan.setup) if predecessor is not None else None
+        self._incoming = (
+            Incoming(predecessor, plan.setup, supervised=observer is not None) if predecessor is not None else None
+        )
         self.restarts = Restarts(plan, self._keys, self._incoming, successor)
         """What a successor would be handed, and how."""
         self.left = True
@@ -116,7 +119,7 @@ class Gateway:
 
         Returns where a successor was handed everything. Raises HandoverError where this one gets nothing.
         """
-        with self._audit() as audit:
+        with open_audit(self._plan, self.metrics, self.conditions) as audit:
             while True:
                 bus = await join_bus(self._plan, self.metrics)
                 try:
@@ -140,7 +143,7 @@ class Gateway:
         neighbourhood: None where the process serves this robot only.
         """
         self._neighbourhood = neighbourhood
-        with self._audit() as audit:
+        with open_audit(self._plan, self.metrics, self.conditions) as audit:
             await self._run(bus, audit, metrics=False)
 
     async def _run(self, bus: Bus, audit: Audit, *, metrics: bool = True) -> None:
@@ -180,7 +183,9 @@ class Gateway:
         plans, incoming = self._plan.listeners, self._incoming
         names = listener_names(plans, self._own, bus.zid)
         self._process = process_name(names, self._own, bus.zid) if names else "gateway"
-        given = [(each, incoming.parcel) for each in incoming.given.listeners] if incoming else [None] * len(plans)
+        given: list[tuple[Exported, Parcel] | None] = [None] * len(plans)
+        if incoming is not None and incoming.given.listeners:  # a gateway that died leaves none: they are bound anew
+            given = [(each, incoming.parcel) for each in incoming.given.listeners]
         return [
             Listener(
                 plan,
@@ -217,7 +222,7 @@ class Gateway:
                 if given.device is not None and given.claim:
                     ownership.inherit(given.claim)
                     device = self._make_device(bus, audit, plan, store)
-                    device.take_over(given.device, incoming.parcel)
+                    device.take_over(given.device, incoming.parcel, given.partials)
 
                     async def begin(incoming: Incoming = incoming, device: Device = device) -> None:
                         await incoming.taken()
@@ -317,36 +322,9 @@ class Gateway:
             conditions=self.conditions,
             idle_stop_s=control.idle_stop_s,
             share=FairShare(near.part) if near is not None else None,
+            shared_address=plan.shares,
             connect=partial(connect, buffer=near.buffer) if near is not None else connect,
             observer=self._observer,
             clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
             keep_latches=store.save,
         )
-
-    @contextlib.contextmanager
-    def _audit(self) -> Iterator[Audit]:
-        """Open the audit log: the file that the configuration names, else the process's log at DEBUG."""
-        control, name = self._plan.config.control, self._plan.config.robot.name
-        if control.audit is None or self._plan.device is None:
-            yield Audit(name, logging.getLogger("zbridge.control.audit_log").debug)
-            return
-        loop = asyncio.get_running_loop()
-
-        def tell(text: str | None) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self.conditions.set, "audit", text)
-
-        file = AuditFile(
-            Path(control.audit),
-            self.metrics,
-            file_bytes=control.audit_bytes,
-            files=control.audit_files,
-            days=control.audit_days,
-            tell=tell,
-        )
-        audit = Audit(name, file.write)
-        try:
-            yield audit
-        finally:
-            audit.close()
-            file.close()

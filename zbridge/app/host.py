@@ -11,8 +11,9 @@ from typing import Annotated
 
 import msgspec
 
+from zbridge.app.addresses import Addresses, resolve
 from zbridge.app.config import Plan
-from zbridge.app.toml import convert, read_toml
+from zbridge.app.toml import FILE_BYTES, convert, read_toml
 from zbridge.errors import ConfigError
 
 HOST_FILE = "host.toml"
@@ -24,11 +25,13 @@ class HostSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     together: all robots in one process and one session on the bus. stagger_s: seconds between the starts of two
     gateways, with jitter. share: the part of a processor that one robot of a shared process may use for long.
+    file_bytes: of the largest robot file that is read.
     """
 
     together: bool = False
     stagger_s: Annotated[float, msgspec.Meta(ge=0.0, le=60.0)] = 0.02
     share: Annotated[float, msgspec.Meta(gt=0.0, le=1.0)] = 0.1
+    file_bytes: Annotated[int, msgspec.Meta(ge=1000, le=100_000_000)] = FILE_BYTES
 
 
 class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -56,7 +59,11 @@ def robot_files(directory: Path) -> list[Path]:
 
 
 def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
-    """Raise ConfigError where two files name the same robot of one realm, or listen at the same address."""
+    """Raise ConfigError where two files name the same robot of one realm, or of one address, or listen at one address.
+
+    Resolves host names, which may take RESOLVE_S.
+    """
+    plans = list(plans)
     robots: dict[tuple[str, str], Path] = {}
     addresses: dict[object, Path] = {}
     for path, plan in plans:
@@ -69,6 +76,11 @@ def require_different_robots(plans: Iterable[tuple[Path, Plan]]) -> None:
             if other is not path:
                 listen = plan.config.hq[number].listen
                 raise ConfigError(f"{path}: hq[{number}].listen = {listen!r}: expected another address than {other}'s")
+    devices = [(path, plan.device) for path, plan in plans if plan.device is not None]
+    forms = resolve(address for _, device in devices for address in device.addresses)
+    taken = Addresses()
+    for path, device in devices:
+        taken.add(path, frozenset[str]().union(*(forms[address] for address in device.addresses)), device.shares)
 
 
 def require_one_bus(plans: Sequence[tuple[Path, Plan]]) -> None:

@@ -23,6 +23,8 @@ ROLES: tuple[Role, ...] = get_args(Role)
 OF_ROBOTS: tuple[Role, ...] = ("gateway", "hq")
 """Roles whose members name their robots; all other roles are for the whole fleet."""
 
+ROLES_BYTES = 16_000_000
+"""Largest file of roles: a fleet's members have some 100 bytes each."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
 """With the longest role it fits the 64 characters of a common name."""
 _RESERVED = ("hq",)
@@ -75,7 +77,7 @@ def common_name(name: str, role: Role) -> str:
 
 def load_roles(path: Path) -> Roles:
     """Read ``roles.toml``; raise ConfigError, which names file, key, value and what was expected."""
-    raw = read_toml(path)
+    raw = read_toml(path, ROLES_BYTES)
     try:
         file = convert(raw, _File)
         names = {name: convert(table, Member, f"names.{name}.") for name, table in file.names.items()}

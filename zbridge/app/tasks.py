@@ -4,11 +4,44 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import signal
 from collections.abc import Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+log = logging.getLogger("zbridge.app")
+
+
+class Background:
+    """Tasks that run beside what their owner does. What one raises is logged."""
+
+    def __init__(self) -> None:
+        self._running: set[asyncio.Task[None]] = set()
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def __repr__(self) -> str:
+        return f"<Background of {len(self)} tasks>"
+
+    def run(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine from now on."""
+        task = asyncio.ensure_future(work)
+        self._running.add(task)
+        task.add_done_callback(self._done)
+
+    async def cancel(self) -> None:
+        """End all tasks."""
+        for task in self._running:
+            task.cancel()
+        await asyncio.gather(*self._running, return_exceptions=True)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._running.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            log.error("%s", error, exc_info=error)
 
 
 async def together(*work: Coroutine[Any, Any, None]) -> None:
@@ -55,17 +88,15 @@ async def until_signal(
             task.cancel()
         asked.append(number)
 
-    beside: set[asyncio.Task[None]] = set()
+    beside = Background()
+
+    def start(begin: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        beside.run(begin())
+
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, end, number)
     for other, begin in (on or {}).items():
-        loop.add_signal_handler(other, _start_beside, begin, beside)
+        loop.add_signal_handler(other, start, begin)
     with contextlib.suppress(asyncio.CancelledError):
         return await task
     return None
-
-
-def _start_beside(begin: Callable[[], Coroutine[Any, Any, None]], tasks: set[asyncio.Task[None]]) -> None:
-    task = asyncio.ensure_future(begin())
-    tasks.add(task)
-    task.add_done_callback(tasks.discard)

@@ -8,7 +8,9 @@ from zbridge.protocol.plugin import Protocol
 def robot_template(protocol: Protocol) -> str:
     """Return the commented configuration of a gateway; the caller replaces ``{name}`` by the robot's name."""
     head = f"# A gateway for one robot. {protocol.summary}. Start it with: zbridge run FILE\n\n"
-    return f"{head}{ROBOT_TEMPLATE}{protocol.template}\n{COMMON_TEMPLATE}"
+    device, heading, options = protocol.template.partition("[device.options]")
+    shared = "" if protocol.keyed else SHARED_TEMPLATE
+    return f"{head}{ROBOT_TEMPLATE}{device.rstrip()}\n{shared}\n{heading}{options}\n{COMMON_TEMPLATE}"
 
 
 def listener_template(protocol: Protocol) -> str:
@@ -20,6 +22,9 @@ def listener_template(protocol: Protocol) -> str:
     )
 
 
+SHARED_TEMPLATE = """\
+# allow_shared_address = true           # gateways of other names may use this address too; all of them must say so
+"""
 METRICS_TEMPLATE = """\
 # [metrics]
 # listen = "127.0.0.1:9100"             # counters for Prometheus

@@ -14,8 +14,9 @@ import contextlib
 import logging
 import random
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
+from zbridge.app.addresses import hold_addresses
 from zbridge.app.config import Plan
 from zbridge.app.gateway import Gateway, Neighbourhood
 from zbridge.app.host import HostSettings
@@ -36,20 +37,24 @@ FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 60.0
 HEALTHY_S = 60.0
 """A gateway that ran for so long begins with the first pause again."""
 
+Hold = Callable[[Plan], contextlib.AbstractAsyncContextManager[None]]
+
 
 class Together:
     """The gateways of one process, by name: the robot's, or its file's.
 
     plans: all with the same ``[bus]`` and different robots (:mod:`zbridge.app.host` checks that). The counters of a
-    gateway have the label ``robot``; every ``[metrics]`` address shows those of all.
+    gateway have the label ``robot``; every ``[metrics]`` address shows those of all. hold: holds the robot's addresses
+    while its gateway runs.
     """
 
-    def __init__(self, plans: Mapping[str, Plan], host: HostSettings) -> None:
+    def __init__(self, plans: Mapping[str, Plan], host: HostSettings, hold: Hold = hold_addresses) -> None:
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
         self.metrics = Metrics()
         self._plans = plans
         self._host = host
+        self._hold = hold
         self._bus: Bus | None = None
         self._failed = self.metrics.count("gateways_failed")
         self._neighbourhood = Neighbourhood(host.share, bytearray(SHARED_READ_BYTES))
@@ -130,7 +135,8 @@ class Together:
         assert self._bus is not None, "run() opens the bus"
         bus = self._bus.share(metrics)
         try:
-            await Gateway(plan, metrics).run_on(bus, self._neighbourhood)
+            async with self._hold(plan):
+                await Gateway(plan, metrics).run_on(bus, self._neighbourhood)
         finally:
             await bus.close()
 

@@ -1,8 +1,13 @@
-"""TOML files as structs: what is wrong in a file is told with its key, its value and what was expected."""
+"""TOML files as structs: what is wrong in a file is told with its key, its value and what was expected.
+
+Reading never waits for somebody else: only regular files of a bounded size are read.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 import tomllib
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,17 +19,48 @@ from zbridge.errors import ConfigError
 
 T = TypeVar("T")
 
+FILE_BYTES = 1_000_000
+"""Largest file that is read, unless a host allows more for its robot files."""
+_SHOWN = 200
+"""Characters of a wrong value that an error shows."""
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; raise ConfigError, which names the file."""
+def read_file(path: Path, most_bytes: int = FILE_BYTES, *, waits: bool = False) -> bytes:
+    """Read a regular file of ``most_bytes`` at most; raise ConfigError, which names the file.
+
+    waits: read a pipe too, which may take as long as its writer wants. Without it nothing is waited for but the disk.
+    """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from error
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY | (0 if waits else os.O_NONBLOCK))
+        try:
+            state = os.fstat(descriptor)
+            if not (stat.S_ISREG(state.st_mode) or (waits and stat.S_ISFIFO(state.st_mode))):
+                raise ConfigError(f"{path}: expected a regular file")
+            with os.fdopen(descriptor, "rb", closefd=False) as file:
+                content = file.read(most_bytes + 1)
+        finally:
+            os.close(descriptor)
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
+        raise ConfigError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    if len(content) > most_bytes:
+        raise ConfigError(f"{path}: {max(state.st_size, len(content))} bytes, expected {most_bytes} at most")
+    return content
+
+
+def read_toml(path: Path, most_bytes: int = FILE_BYTES) -> dict[str, Any]:
+    """Read a TOML file of ``most_bytes`` at most; raise ConfigError, which names the file."""
+    return parse_toml(path, read_file(path, most_bytes))
+
+
+def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
+    """Read the content of a TOML file; raise ConfigError, which names the file."""
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except ValueError as error:  # also of numbers with thousands of digits, and of bytes that are not UTF-8
+        raise ConfigError(f"{path}: not TOML: {_short(str(error))}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: not TOML: nested too deeply") from error
 
 
 def convert(raw: Any, kind: type[T], prefix: str = "") -> T:
@@ -48,7 +84,7 @@ def _explain(raw: Any, kind: type[Any], text: str) -> str:
     if unknown := re.match(r"Object contains unknown field `(.+)`", what):
         known = ", ".join(_field_names(_type_at(kind, path)))
         key = f"{path}.{unknown[1]}" if path else unknown[1]
-        return f"{key} = {_value(raw, key)!r}: unknown key; expected one of {known}"
+        return f"{_short(key)} = {_shown(raw, key)}: unknown key; expected one of {known}"
     if missing := re.match(r"Object missing required field `(.+)`", what):
         return f"{path}.{missing[1]}: missing, it is required" if path else f"{missing[1]}: missing, it is required"
     if what.startswith("Invalid enum value"):
@@ -56,7 +92,15 @@ def _explain(raw: Any, kind: type[Any], text: str) -> str:
         members = at.types if isinstance(at, inspect.UnionType) else (at,)
         literals = [value for member in members if isinstance(member, inspect.LiteralType) for value in member.values]
         what = f"expected one of {', '.join(map(repr, literals))}"
-    return f"{path} = {_value(raw, path)!r}: {what[:1].lower()}{what[1:]}"
+    return f"{path} = {_shown(raw, path)}: {what[:1].lower()}{what[1:]}"
+
+
+def _shown(raw: Any, path: str) -> str:
+    return _short(repr(_value(raw, path)))
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def _parts(path: str) -> list[str]:

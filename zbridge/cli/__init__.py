@@ -23,10 +23,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from zbridge.app import Gateway, load, until_signal
+from zbridge.app.addresses import hold_addresses
 from zbridge.app.handover import Spawn
 from zbridge.app.host import HostSettings, require_different_robots, require_one_bus
 from zbridge.app.member import check_member
 from zbridge.app.together import Together
+from zbridge.app.toml import read_file
 from zbridge.bus.tls.files import TLS_VARIABLE
 from zbridge.errors import ConfigError, ZbridgeError
 from zbridge.fleet.printable import shown
@@ -75,16 +77,17 @@ def run_gateway(
     tls: Path | None = None,
     take_over: int | None = None,
     reporter: Reporter | None = None,
+    content: bytes | None = None,
 ) -> None:
     """Run the gateway of a configuration until SIGTERM or SIGINT, or until a successor has taken it over.
 
-    tls: a folder, for a file without ``bus.tls``. take_over: the descriptor of the channel to the gateway that hands
-    everything over to this process. reporter: tells the supervisor, where there is one, which also starts the successor
-    then.
+    content: of the file, if it was read already. tls: a folder, for a file without ``bus.tls``. take_over: the
+    descriptor of the channel to the gateway that hands everything over to this process. reporter: tells the supervisor,
+    where there is one, which also starts the successor then.
     """
     if reporter is None:
         set_up_log(verbose=verbose)
-    plan = load(file, tls=tls)
+    plan = load(file, tls=tls, content=content)
     hand_on_tls(tls)
     parts = {"device": plan.device} if plan.device else {f"hq[{n}]": part for n, part in enumerate(plan.listeners)}
     for key, part in parts.items():
@@ -96,25 +99,25 @@ def run_gateway(
         raise ConfigError(f"{file}: {error}") from error
     gc.freeze()  # objects made at start-up live as long as the process; the collector skips them
     predecessor = socket.socket(fileno=take_over) if take_over is not None else None
-    spawn = Spawn(file, verbose=verbose)
-    successor = reporter.start_successor if reporter is not None else spawn
+    successor = reporter if reporter is not None else Spawn(file, verbose=verbose)
     gateway = Gateway(plan, observer=reporter, predecessor=predecessor, successor=successor)
+
+    async def serve() -> None:
+        async with hold_addresses(plan):
+            await gateway.run()
 
     async def work() -> None:
         if reporter is not None:
             reporter.keep = gateway.restarts.keep
             reporter.begin()
-        await until_signal(gateway.run(), {signal.SIGUSR2: gateway.restarts.restart})
+        await until_signal(serve(), {signal.SIGUSR2: gateway.restarts.restart})
 
     try:
         run_loop(work())
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from error
-    if gateway.restarts.gone.is_set():
-        if reporter is not None:
-            reporter.succeeded()
-        else:
-            spawn.tell_systemd()
+    if gateway.restarts.gone.is_set() and isinstance(successor, Spawn):
+        successor.tell_systemd()
     if not gateway.left:  # a thread of the bus hangs and would keep the process alive
         logging.shutdown()
         os._exit(0)
@@ -135,7 +138,7 @@ def run_together(files: Sequence[Path], host: HostSettings, *, verbose: bool = F
     plans, faults = [], []
     for file in files:
         try:
-            plans.append((file, load(file)))
+            plans.append((file, load(file, content=read_file(file, host.file_bytes))))
         except ConfigError as error:
             faults.append(error)
             logging.getLogger("zbridge.cli").error("%s", error)

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from zbridge.app import listener_template, load, robot_template, until_signal
+from zbridge.app.addresses import require_free
 from zbridge.app.host import HostSettings, load_host, robot_files
 from zbridge.app.member import check_member, not_checked
 from zbridge.app.tasks import together
@@ -84,6 +85,7 @@ def check(file: File, tls: FileTls = None) -> None:
     plan = load(file, tls=tls)
     robot, parts = plan.config.robot, []
     try:
+        require_free(plan)
         certificate = check_member(plan)
         if plan.device is not None:
             plan.device.make_robot(Metrics())

@@ -24,6 +24,7 @@ def run(birth: Birth) -> int:
     try:
         run_gateway(
             Path(request.file),
+            content=birth.read(),
             verbose=request.verbose,
             take_over=birth.take_over if birth.take_over >= 0 else None,
             reporter=Reporter(Post.inherited(birth.post), hands_over=True),

@@ -36,7 +36,7 @@ def resume(descriptor: int, *, only_check: bool) -> None:
     paths = tuple(map(Path, state.sources))
     supervisor = Supervisor(
         paths,
-        HostSettings(stagger_s=state.stagger_s),
+        HostSettings(stagger_s=state.stagger_s, file_bytes=state.file_bytes),
         fork_server_command(),
         watch=state.watch,
         verbose=state.verbose,

@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Mapping
 from enum import IntEnum
 
 import msgspec
 
 from zbridge.client.fleet import Fleet
-from zbridge.fleet.messages import Status
+from zbridge.fleet.messages import LinkStatus, Status
+from zbridge.fleet.printable import shown
 
 LISTEN_S = 3.0
 """Seconds in which a gateway must publish its status: it does so once a second."""
+_NAMED = 3
+"""Other robots that a reason names."""
+_PEER = 80
+"""Characters of an address that a reason shows."""
 
 
 class Level(IntEnum):
@@ -48,6 +54,30 @@ def judge(status: Status | None, *, heard: bool) -> Health:
     return Health(level, status.state, reason, status.host)
 
 
+def same_addresses(statuses: Mapping[str, Status]) -> dict[str, str]:
+    """Say of each robot which other ones name the same address of a robot, and do not say that they share it.
+
+    Addresses of one machine only (loopback, serial lines) are left out. In two networks one address may be two robots.
+    """
+    named: dict[str, list[str]] = {}
+    for robot, status in sorted(statuses.items()):
+        for link in status.links:
+            if _is_of_the_network(link) and robot not in (robots := named.setdefault(link.peer, [])):
+                robots.append(robot)
+    found: dict[str, str] = {}
+    for peer, robots in named.items():
+        for robot in robots if len(robots) > 1 else ():
+            others = ", ".join(each for each in robots[: _NAMED + 1] if each != robot)
+            found[robot] = f"{shown(peer, _PEER)} is the address of {others} too"
+    return found
+
+
+def _is_of_the_network(link: LinkStatus) -> bool:
+    host = link.peer.partition("://")[2].rpartition(":")[0].strip("[]")
+    here = host in ("", "localhost", "::1") or host.startswith("127.")
+    return link.peer.startswith("tcp://") and not here and link.shared is not True
+
+
 async def health(fleet: Fleet, robot: str | None = None) -> dict[str, Health]:
     """Judge one robot, or all that have a gateway or a status, by name. Takes 1 s, up to LISTEN_S if one is silent."""
     heard: dict[str, Status] = {}
@@ -71,7 +101,13 @@ async def health(fleet: Fleet, robot: str | None = None) -> dict[str, Health]:
         hearing.cancel()
         await asyncio.gather(hearing, return_exceptions=True)
     names = wanted if robot is not None else wanted | set(heard)
-    return {name: judge(heard.get(name) or known.get(name), heard=name in heard) for name in sorted(names)}
+    statuses = {name: status for name, status in {**known, **heard}.items() if status is not None}
+    judged = {name: judge(statuses.get(name), heard=name in heard) for name in sorted(names)}
+    for name, text in same_addresses(statuses).items():
+        if (each := judged.get(name)) is not None:
+            reason = "; ".join(filter(None, (each.reason, text)))
+            judged[name] = msgspec.structs.replace(each, level=max(each.level, Level.WARNING), reason=reason)
+    return judged
 
 
 _LEVELS: dict[str, Level] = {

@@ -160,12 +160,15 @@ class Raw(FleetMessage, frozen=True):
 
 
 class LinkStatus(msgspec.Struct, frozen=True):
-    """One transport connection to the robot."""
+    """One transport connection to the robot. shared: gateways of other robots may connect to the same address; left out
+    where they may not.
+    """
 
     name: str
     state: str
     peer: str
     reason: str | None = None
+    shared: bool | UnsetType = UNSET
 
 
 RobotState = Literal["offline", "connecting", "handshaking", "established", "closing"]

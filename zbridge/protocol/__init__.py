@@ -18,7 +18,8 @@ exchange        :class:`ExchangeSession`, :class:`Exchange`: a session that asks
 codec           :class:`Codec`: the messages, for the conformance kit.
 kinematics      :class:`Differential`, :class:`Factors`: from drives to wheels, and back; :data:`Positive` for options.
 kept            :class:`Kept`: what survives a restart of the gateway, as :class:`Exported`; :class:`Form`, ``FRAME``,
-                ``FRAMES`` for what no type describes; :class:`Frame`: a frame of a kind of its own.
+                ``FRAMES`` for what no type describes; :class:`Spare`: what may be left out where it is large;
+                :class:`Frame`: a frame of a kind of its own.
 odometry        :class:`Odometry`: from what the wheels have turned to a pose.
 bearings        :class:`BearingScan`, :class:`Sectors`: from distance sensors to scans, and back.
 errors          :class:`ProtocolError` for bytes that are no message, :class:`EncodeError` for values that no message
@@ -49,7 +50,7 @@ from zbridge.protocol.codec import Codec
 from zbridge.protocol.device_clock import DeviceClock
 from zbridge.protocol.exchange import Exchange, ExchangeSession
 from zbridge.protocol.handshake import Handshake
-from zbridge.protocol.kept import FRAME, FRAMES, Exported, Form, Frame, Kept
+from zbridge.protocol.kept import FRAME, FRAMES, Exported, Form, Frame, Kept, Spare
 from zbridge.protocol.kinematics import Differential, Factors, Positive
 from zbridge.protocol.negotiation import agree, newest, parse_versions
 from zbridge.protocol.odometry import Odometry
@@ -128,6 +129,7 @@ __all__ = [
     "Send",
     "Session",
     "Simulation",
+    "Spare",
     "State",
     "Telemetry",
     "Traffic",

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 from zbridge.errors import ProtocolError
-from zbridge.protocol.kept import Exported, Kept
+from zbridge.protocol.kept import Budget, Exported, Kept
 
 Step = TypeVar("Step", bound=Hashable)
 Event = TypeVar("Event", bound=Hashable)
@@ -45,9 +45,9 @@ class Handshake(Kept, Generic[Step, Event]):
     def __repr__(self) -> str:
         return f"<Handshake {self.step}>"
 
-    def export(self) -> Exported:
+    def export(self, budget: Budget | None = None) -> Exported:
         """Write the step, and how long it may last."""
-        return super().export() | {"step": getattr(self.step, "name", self.step)}
+        return super().export(budget) | {"step": getattr(self.step, "name", self.step)}
 
     def restore(self, state: Exported) -> None:
         """Go on from a step; raise ProtocolError if the table has none of that name."""

@@ -6,6 +6,10 @@ constructor makes anew. An attribute that is :class:`Kept` itself is restored in
 processes of a machine share the clock of their event loops.
 
 A state of another form (a field too few, another type, a name that an enumeration lacks) is refused whole.
+
+A gateway also deposits its state every second, for a successor if the process dies. Such a deposit has a
+:class:`Budget`: what a class names as :class:`Spare` is left out where it is large, and the successor's object keeps
+what its constructor made.
 """
 
 from __future__ import annotations
@@ -27,6 +31,32 @@ class Form(NamedTuple):
 
     write: Callable[[Any], Any]
     read: Callable[[Any], Any]
+
+
+class Spare(NamedTuple):
+    """An attribute that a deposit may lack where its value is large. form: its type, or a :class:`Form`."""
+
+    form: Any
+
+
+class Budget:
+    """Bounds each spare value of a deposit to ``most_bytes`` as MessagePack; collects what was left out."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes = most_bytes
+        self.left_out: dict[str, int] = {}
+        """The bytes of each value that was left out, by its name."""
+
+    def __repr__(self) -> str:
+        return f"<Budget {self.most_bytes}, {len(self.left_out)} left out>"
+
+    def admits(self, name: str, value: Any) -> bool:
+        """Tell whether a value is written; note it if not."""
+        flat = isinstance(value, bytes | bytearray | None)
+        size = len(value or b"") if flat else len(msgspec.msgpack.encode(value))
+        if size > self.most_bytes:
+            self.left_out[name] = size
+        return size <= self.most_bytes
 
 
 class Frame(bytes):
@@ -64,15 +94,25 @@ class Kept:
     """An object whose state another process can take over."""
 
     kept: ClassVar[Mapping[str, Any]] = {}
-    """Attributes and their types (or a :class:`Form`); those of the base classes are kept too."""
+    """Attributes and their types, or a :class:`Form` or :class:`Spare`; those of the base classes are kept too."""
 
-    def export(self) -> Exported:
-        """Write the state."""
-        return {name: _write(getattr(self, name), form) for name, form in _attributes(type(self)).items()}
+    def export(self, budget: Budget | None = None) -> Exported:
+        """Write the state. budget: of a deposit; None: write everything."""
+        state: Exported = {}
+        for name, form in _attributes(type(self)).items():
+            spare, form = isinstance(form, Spare), form.form if isinstance(form, Spare) else form
+            value = _write(getattr(self, name), form, budget)
+            if budget is None or not spare or budget.admits(f"{type(self).__name__}.{name}", value):
+                state[name] = value
+        return state
 
     def restore(self, state: Exported) -> None:
         """Take a state over; raise ProtocolError if it has another form. The object must not be used then."""
         for name, form in _attributes(type(self)).items():
+            if isinstance(form, Spare):
+                if name not in state:
+                    continue
+                form = form.form
             try:
                 _restore(self, name, form, state[name])
             except (KeyError, TypeError, ValueError, msgspec.MsgspecError) as error:
@@ -86,9 +126,9 @@ def _attributes(kind: type) -> dict[str, Any]:
     return found
 
 
-def _write(value: Any, form: Any) -> Any:
+def _write(value: Any, form: Any, budget: Budget | None) -> Any:
     if isinstance(value, Kept):
-        return value.export()
+        return value.export(budget)
     if isinstance(form, Form):
         return form.write(value)
     return msgspec.to_builtins(list(value) if isinstance(value, deque) else value, builtin_types=(bytes, bytearray))

@@ -30,7 +30,7 @@ from collections import deque
 from typing import Any, ClassVar
 
 from zbridge.errors import Code, NotReady
-from zbridge.protocol.kept import FRAMES, Form, Kept
+from zbridge.protocol.kept import FRAMES, Form, Kept, Spare
 
 URGENT = 256
 """Frames of stops that may wait: one for each motor that a robot can have."""
@@ -74,10 +74,10 @@ class Outbox(Kept):
     """Frames on their way out. ``gap_s``: least time between two writes, seconds."""
 
     kept: ClassVar[dict[str, Any]] = {
-        "_queue": FRAMES,
-        "_urgent": FRAMES,
-        "_exempt": FRAMES,
-        "_slots": Form(lambda slots: _write_slots(slots), lambda raw: _read_slots(raw)),
+        "_queue": Spare(FRAMES),
+        "_urgent": Spare(FRAMES),
+        "_exempt": Spare(FRAMES),
+        "_slots": Spare(Form(lambda slots: _write_slots(slots), lambda raw: _read_slots(raw))),
         "_free_at": float,
         "_turn_of_queue": bool,
         "_quiet_until": float,

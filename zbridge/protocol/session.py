@@ -269,11 +269,6 @@ class Session(KeptSession, ABC, Generic[M]):
         return self.state is _CLOSED or self.state is _CLOSING
 
     @property
-    def between_frames(self) -> bool:
-        """Whether no part of a frame waits for the rest of it."""
-        return not len(self._frames)
-
-    @property
     def doubtful(self) -> str | None:
         """Why the peer must not be moved by this connection: ``DOUBTS`` doubts or more; else None."""
         return f"connection in doubt: {'; '.join(self.doubts)}" if len(self.doubts) >= DOUBTS else None

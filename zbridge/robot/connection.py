@@ -16,7 +16,7 @@ from zbridge.errors import LinkError, ProtocolError
 from zbridge.fleet.messages import LinkStatus, RobotState
 from zbridge.metrics import Count
 from zbridge.protocol.address import DeviceAddress
-from zbridge.protocol.kept import Exported
+from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Session, State
 from zbridge.protocol.session_table import Backoff, SessionTable
 from zbridge.robot.wire_tap import WireTap
@@ -61,6 +61,8 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called when a link is up (True), and when it is gone (False)."""
     read: Callable[[], object] = lambda: None
     """Called when the bytes of a read have been handled."""
+    shared: bool = False
+    """Whether gateways of other robots may connect to the same address."""
 
 
 class Links:
@@ -83,6 +85,10 @@ class Links:
     def add(self, connection: Connection) -> None:
         """Add the next connection of the configuration."""
         self._connections.append(connection)
+
+    def conversation(self, name: str) -> Conversation | None:
+        """Return the conversation over the link of this name; None where there is none."""
+        return next((each.conversation for each in self._connections if each.name == name), None)
 
     def pump(self) -> None:
         """Write what may be written."""
@@ -180,9 +186,9 @@ class Connection:
             except (OSError, ProtocolError) as error:
                 self.conversation.lost(str(error))
 
-    def hand_over(self, parcel: Parcel) -> Exported | None:
+    def hand_over(self, parcel: Parcel, budget: Budget | None = None) -> Exported | None:
         """Put the connection into a parcel, and describe its conversation; None where there is none."""
-        return self.conversation.hand_over(parcel) if self.conversation is not None else None
+        return self.conversation.hand_over(parcel, budget) if self.conversation is not None else None
 
     def take_over(self, given: Exported | None, parcel: Parcel) -> None:
         """Restore the conversation of another process, which :meth:`go_on` attaches; raise ProtocolError."""
@@ -203,7 +209,8 @@ class Connection:
 
     def status(self) -> LinkStatus:
         """Return the entry of this link on ``status``."""
-        return LinkStatus(name=self.name, state=self.state, peer=str(self.address), reason=self.reason)
+        peer, shared = str(self.address), self._hooks.shared or msgspec.UNSET
+        return LinkStatus(name=self.name, state=self.state, peer=peer, reason=self.reason, shared=shared)
 
     def watch(self, direction: str, show: Callable[[bytes], object] | None) -> None:
         """Show the raw frames of one direction (``in`` or ``out``), those of the handshake first; None: show none."""

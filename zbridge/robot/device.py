@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -29,9 +29,10 @@ from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
-from zbridge.protocol.kept import Exported
+from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.plugin import Robot
 from zbridge.protocol.session import Datagram, Session, State
+from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connect, Connection, Hooks, Links
@@ -43,6 +44,7 @@ from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
 from zbridge.transport import Parcel, connect
 from zbridge.transport.fair_share import FairShare
+from zbridge.wire.frames import Partial
 
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
@@ -50,10 +52,9 @@ LEAVE_S = 0.7
 """Longest time the robot is given to hear that the gateway leaves."""
 FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
-KEPT_BYTES = 2048
-"""Largest published value that is kept for the case that this process dies."""
 _LEAVING = "gateway stopped"
 _CRASHED = "crashed"
+_TAKING_OVER = "another process takes the robot over"
 _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
 
@@ -77,6 +78,7 @@ class Device:
         conditions: Conditions | None = None,
         idle_stop_s: float = IDLE_STOP_S,
         share: FairShare | None = None,
+        shared_address: bool = False,
         connect: Connect = connect,
         observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
@@ -87,16 +89,20 @@ class Device:
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 
-        clock: seconds on the event loop's time line. clock_ns: Unix time. raw_ms, suspended_s: see
-        :mod:`zbridge.control.clocks`. keep_latches: writes the latched stops down.
+        shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
+        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.clocks`. keep_latches: writes
+        the latched stops down.
         """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
         self._released = asyncio.Event()
+        self._crashed = False
+        """Whether the robot was taken over from a process that died."""
         self._commanded: list[Handle] = []
         self._declared: list[Handle] = []
         clock, conditions = clock or loop.time, conditions or Conditions()
         self._share = share
+        self._shared_address = shared_address
         self._observer = observer or Nobody()
         self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
         self._links = links = Links()
@@ -143,10 +149,11 @@ class Device:
             clock=context.clock,
             before=self._enforcer.keep_time,
             share=self._share,
+            shared=self._shared_address,
             surplus=context.metrics.count("datagrams_over_share"),
             stalled=partial(presence.stalled, name),
             linked=partial(self._observer.linked, name),
-            read=partial(self._observer.read, name),
+            read=partial(self._observer.read, name, partial(self.partial, name)),
         )
 
     def __repr__(self) -> str:
@@ -165,6 +172,8 @@ class Device:
             await self._context.bus.alive(self._context.keys.alive("gateway"))  # by its answer the bus knows our keys
             await begin()
             await self.go_on()
+            if self._crashed:
+                self._publishers.repeat()
             self._show()
         self._standstill.begin()
         self._observer.began(self)
@@ -227,11 +236,14 @@ class Device:
         return LastStop(driven, stop, session.outbox.gap_s, state)
 
     def boundary(self, name: str) -> Boundary:
-        """Give where the stream of a link stands; see :class:`Boundary`."""
-        conversation = next((each.conversation for each in self._links if each.name == name), None)
-        if conversation is None:
-            return Boundary(outgoing=False, incoming=False)
-        return Boundary(not conversation.stalled, conversation.session.between_frames)
+        """Give where the outgoing stream of a link stands; see :class:`Boundary`."""
+        conversation = self._links.conversation(name)
+        return Boundary(conversation is not None and not conversation.stalled)
+
+    def partial(self, name: str, most_bytes: int) -> Partial | None:
+        """Give the incomplete frame that came by a link; see :meth:`Session.partial`."""
+        conversation = self._links.conversation(name)
+        return conversation.session.partial(most_bytes) if conversation is not None else None
 
     def _state_changed(self) -> None:
         self._presence.publish_status()
@@ -290,17 +302,21 @@ class Device:
 
     def hand_over(self, parcel: Parcel) -> Exported:
         """Put the links into a parcel; describe them, the robot, and what was published. To be called while held."""
-        return {**self._describe(parcel), "published": self._publishers.export()}
+        return self._describe(parcel)
 
-    def _describe(self, parcel: Parcel) -> Exported:
-        links = [connection.hand_over(parcel) for connection in self._links]
-        latches = self._enforcer.authority.latches.export()
-        return {"links": links, "robot": self._context.robot.export(), "latches": latches}
+    def _describe(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
+        links = [connection.hand_over(parcel, budget) for connection in self._links]
+        return {
+            "links": links,
+            "robot": self._context.robot.export(budget),
+            "published": self._publishers.export(budget),
+            "latches": self._enforcer.authority.latches.export(),
+        }
 
-    def keep(self, parcel: Parcel) -> Exported | None:
-        """Describe what another process needs to go on if this one dies; None where it could not.
+    def keep(self, parcel: Parcel, budget: Budget) -> Exported | None:
+        """Describe what another process needs to resume if this one dies; None where it could not.
 
-        Large values that were published are left out.
+        The incomplete frames are not described: :meth:`partial` tells them after each read.
         """
         session = self._context.robot.driving
         if not self._context.robot.hands_over or session is None or session.state is not State.ESTABLISHED:
@@ -308,12 +324,19 @@ class Device:
         talks = (connection.conversation for connection in self._links)
         if any(talk is not None and talk.link is None for talk in talks):  # a link that is not up yet
             return None
-        published = self._publishers.export(most_bytes=KEPT_BYTES)
-        return {**self._describe(parcel), "published": published, _CRASHED: True}
+        return {**self._describe(parcel, budget), _CRASHED: True}
 
-    def take_over(self, given: Exported, parcel: Parcel) -> None:
-        """Restore what another process handed over; raise ProtocolError. Call :meth:`run` with ``begin`` then."""
+    def take_over(self, given: Exported, parcel: Parcel, partials: Sequence[Partial] = ()) -> None:
+        """Restore what another process handed over, or deposited; raise ProtocolError.
+
+        Call :meth:`run` with ``begin`` then. partials: with a deposit, the incomplete frames of the links that are up.
+        """
+        self._commands.refuse_all(_TAKING_OVER)
+        self._leases.refuse_all(_TAKING_OVER)
+        self._crashed = bool(given.get(_CRASHED))
         self._enforcer.authority.restore_latches(given["latches"])
+        for link, partial_frame in zip(filter(None, given["links"]), partials, strict=False):
+            link["session"][PARTIAL] = list(partial_frame)
         for connection, link in zip(self._links, given["links"], strict=True):
             connection.take_over(link, parcel)
         self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
@@ -322,7 +345,7 @@ class Device:
         session = self._context.robot.driving
         if session is not None and session.state is State.ESTABLISHED:
             self._presence.resume(session)
-            if given.get(_CRASHED):  # what waited then may have been written since, and may be motion
+            if self._crashed:  # what waited then may have been written since, and may be motion
                 session.outbox.forget()
                 with contextlib.suppress(Refused):
                     self._standstill.stop()

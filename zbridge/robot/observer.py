@@ -5,11 +5,16 @@ An observer is told of every change; it asks the device for the rest. Knows no p
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import msgspec
 
 from zbridge.transport import Link
+from zbridge.wire.frames import Partial
+
+Resume = Callable[[int], Partial | None]
+"""``resume(most_bytes)``: the incomplete frame of a stream, by :meth:`zbridge.wire.frames.FrameBuffer.partial`."""
 
 
 class StopFrame(msgspec.Struct, frozen=True, array_like=True):
@@ -33,13 +38,9 @@ class LastStop(msgspec.Struct, frozen=True):
 
 
 class Boundary(msgspec.Struct, frozen=True):
-    """Where the stream of a link stands. outgoing: every frame that was begun is with the kernel whole.
-
-    incoming: no part of a frame was read without the rest of it.
-    """
+    """Where the outgoing stream of a link stands. outgoing: every frame that was begun is with the kernel whole."""
 
     outgoing: bool = True
-    incoming: bool = True
 
 
 class Observed(Protocol):
@@ -57,7 +58,10 @@ class Observed(Protocol):
         """Give what stops the robot now."""
 
     def boundary(self, name: str) -> Boundary:
-        """Give where the stream of the link of this name stands."""
+        """Give where the outgoing stream of the link of this name stands."""
+
+    def partial(self, name: str, most_bytes: int) -> Partial | None:
+        """Give the incomplete frame that came by the link of this name; see :data:`Resume`."""
 
 
 class Observer(Protocol):
@@ -72,8 +76,8 @@ class Observer(Protocol):
     def linked(self, name: str, link: Link, up: bool) -> None:
         """Note that the link of this name is up, or that it is being closed."""
 
-    def read(self, name: str) -> None:
-        """Note that the bytes of a read of this link have been handled."""
+    def read(self, name: str, resume: Resume) -> None:
+        """Note that the bytes of a read of this link have been cut into frames."""
 
     def changed(self) -> None:
         """Note that :meth:`Observed.last_stop` may give something else from now on. Called for every command."""
@@ -91,7 +95,7 @@ class Nobody:
     def linked(self, name: str, link: Link, up: bool) -> None:
         """Do nothing."""
 
-    def read(self, name: str) -> None:
+    def read(self, name: str, resume: Resume) -> None:
         """Do nothing."""
 
     def changed(self) -> None:

@@ -9,6 +9,7 @@ from zbridge.control.conditions import Conditions
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, find
+from zbridge.protocol.kept import Budget
 from zbridge.robot.names import NAMES, NameBudget
 
 
@@ -47,10 +48,10 @@ class RobotPublishers:
             publisher = self.known[path] = self._bus.publisher(self._keys.key(path), topic)
         return publisher
 
-    def export(self, most_bytes: int | None = None) -> list[list[object]]:
-        """List the keys, each with the last value that it keeps; without values of more than ``most_bytes``."""
+    def export(self, budget: Budget | None = None) -> list[list[object]]:
+        """List the keys, each with the last value that it keeps. budget: of a deposit, which lacks large values."""
         known = [(path, publisher.last) for path, publisher in self.known.items()]
-        return [[path, last] for path, last in known if most_bytes is None or len(last or b"") <= most_bytes]
+        return [[path, last if budget is None or budget.admits(path, last) else None] for path, last in known]
 
     def restore(self, known: Iterable[tuple[str, bytes | None]]) -> None:
         """Declare the keys of another process, which answer for their last values; nothing is published."""
@@ -58,6 +59,12 @@ class RobotPublishers:
             topic = find(path)
             if topic is not None and (not _is_named(path) or self._names.admit(path, self._clock())):
                 self.known[path] = self._bus.publisher(self._keys.key(path), topic, last)
+
+    def repeat(self) -> None:
+        """Publish again the last values that are kept: who asked for them before they were restored got none."""
+        for publisher in self.known.values():
+            if publisher.last is not None:
+                publisher.put(publisher.last)
 
     def forget_names(self) -> None:
         """Give up the names of a connection that has ended."""

@@ -13,19 +13,27 @@ from zbridge.protocol.plugin import Protocol, Robot
 
 
 class DeviceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[device]``: the robot itself. ``connect`` has one address for each of its links."""
+    """``[device]``: the robot itself. ``connect`` has one address for each of its links.
+
+    allow_shared_address: gateways of other robot names may connect to the same address; both must say so.
+    """
 
     protocol: str
     connect: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
     options: dict[str, Any] = {}
+    allow_shared_address: bool = False
 
 
 class DevicePlan(msgspec.Struct, frozen=True):
-    """How to reach one robot: its protocol, the protocol's options, an address for each link."""
+    """How to reach one robot: its protocol, the protocol's options, an address for each link.
+
+    shares: whether gateways of other robot names may connect to the same addresses.
+    """
 
     protocol: Protocol
     options: Any
     addresses: tuple[DeviceAddress, ...]
+    shares: bool = False
 
     def make_robot(self, metrics: Metrics) -> Robot:
         """Make the device side; raise ConfigError where the protocol's own code cannot."""

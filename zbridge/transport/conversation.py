@@ -20,7 +20,7 @@ from typing import Any, Concatenate, ParamSpec
 
 from zbridge.errors import FAULT, Refused, describe
 from zbridge.metrics import Count
-from zbridge.protocol.kept import Exported
+from zbridge.protocol.kept import Budget, Exported
 from zbridge.protocol.session import Datagram, Session, State
 from zbridge.transport.fair_share import FairShare
 from zbridge.transport.link import Link
@@ -315,10 +315,13 @@ class Conversation:
             self._link.go_on()
         self.pump()
 
-    def hand_over(self, parcel: Parcel) -> Exported:
-        """Put the connection of a held conversation into a parcel; describe it and the session."""
+    def hand_over(self, parcel: Parcel, budget: Budget | None = None) -> Exported:
+        """Put the connection of a held conversation into a parcel; describe it and the session.
+
+        budget: of a deposit; the conversation need not be held then.
+        """
         assert self._link is not None
-        return {"session": self.session.export(), "link": self._link.hand_over(parcel)}
+        return {"session": self.session.export(budget), "link": self._link.hand_over(parcel)}
 
     def release(self) -> None:
         """Forget the connection, which another process has now: the peer notices nothing."""

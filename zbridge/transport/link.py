@@ -52,7 +52,8 @@ class Link(Protocol):
 
     peer: str
     reads: Callable[[], object]
-    """Called before bytes are taken from the kernel; set by who watches the link."""
+    """Called before bytes are taken from the kernel; set by who watches the link. :meth:`Receiver.received` follows,
+    with b"" where there were none."""
 
     @property
     def descriptors(self) -> tuple[int, ...]:

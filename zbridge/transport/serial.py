@@ -164,6 +164,7 @@ class SerialLink:
         try:
             data = os.read(self._fd, READ_BYTES)
         except (BlockingIOError, InterruptedError):
+            self._receiver.received(b"")  # who watches the reads learns that nothing was taken
             return
         except OSError as error:
             self._end(f"connection lost: {error.strerror or error}")

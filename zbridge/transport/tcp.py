@@ -47,6 +47,10 @@ CONNECT_S = 5.0
 """Seconds that a connection attempt may take."""
 
 
+def _unwatched() -> None:
+    """Do nothing: nobody watches the reads of the link."""
+
+
 class TcpLink(asyncio.BufferedProtocol):
     """A TCP connection. ``hub``: the listener's UDP socket, if the peer was accepted there.
 
@@ -65,7 +69,7 @@ class TcpLink(asyncio.BufferedProtocol):
         given_udp: socket.socket | None = None,
     ) -> None:
         self.peer = ""
-        self.reads: Callable[[], object] = lambda: None
+        self.reads: Callable[[], object] = _unwatched
         self._given_udp = given_udp
         self._backlog: Backlog | None = None
         self._hub = hub
@@ -235,6 +239,12 @@ class TcpLink(asyncio.BufferedProtocol):
         if self._hub is not None:
             self._hub.drain()  # datagrams that wait are older: an old drive must not follow a newer stop
         self._receiver.received(data)
+        if nbytes == len(self._view) and self.reads is not _unwatched:
+            # libuv reads once more, often in vain: who watches the reads must learn that nothing was taken.
+            asyncio.get_running_loop().call_soon(self._read_in_vain)
+
+    def _read_in_vain(self) -> None:
+        self._receiver.received(b"")
 
     def eof_received(self) -> bool:
         return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from zbridge.errors import ProtocolError
 
@@ -16,6 +17,18 @@ begin a frame.
 
 _JOINED = 1024
 """Least bytes that are joined to an incomplete frame while its end is unknown."""
+_HEADER = 64
+"""Bytes of a frame from which its end is known, where a protocol has a length field."""
+
+
+class Partial(NamedTuple):
+    """The incomplete frame of a stream, as somebody else can resume it.
+
+    rest: the bytes that came. skip: bytes that are still to come and are dropped, because those before them are lost.
+    """
+
+    rest: bytes = b""
+    skip: int = 0
 
 
 class FramingFault(ProtocolError):
@@ -25,13 +38,15 @@ class FramingFault(ProtocolError):
 class FrameBuffer:
     """Keeps the incomplete frame between reads: at most ``limit`` bytes."""
 
-    __slots__ = ("_frame_end", "_limit", "_needed", "_rest")
+    __slots__ = ("_frame_end", "_limit", "_needed", "_rest", "_skip")
 
     def __init__(self, frame_end: FrameEnd, limit: int) -> None:
         self._frame_end = frame_end
         self._limit = limit
         self._rest = bytearray()
         self._needed = 0
+        self._skip = 0
+        """Bytes that are dropped before the next frame."""
 
     def __len__(self) -> int:
         return len(self._rest)
@@ -39,10 +54,25 @@ class FrameBuffer:
     def __repr__(self) -> str:
         return f"<FrameBuffer {len(self._rest)} of {self._needed} bytes, limit {self._limit}>"
 
-    @property
-    def rest(self) -> bytes:
-        """The incomplete frame."""
-        return bytes(self._rest)
+    def partial(self, most_bytes: int | None = None) -> Partial | None:
+        """Describe the incomplete frame for :meth:`resume`.
+
+        A frame of which more than ``most_bytes`` came is described by the bytes that are still to come; None where its
+        first bytes do not tell how many.
+        """
+        rest = self._rest
+        if self._skip or most_bytes is None or len(rest) <= most_bytes:
+            return Partial(bytes(rest), self._skip)
+        end = self._frame_end(bytes(rest[:_HEADER]), 0)
+        return Partial(skip=end - len(rest)) if end == self._needed > _HEADER + 1 else None
+
+    def resume(self, partial: Partial) -> None:
+        """Resume an incomplete frame in a buffer that was just made; raise ProtocolError for one that is none."""
+        self._skip = partial.skip
+        if not 0 <= partial.skip <= self._limit or (partial.skip and partial.rest):
+            raise ProtocolError(f"{partial.skip} bytes to skip after {len(partial.rest)}, limit {self._limit}")
+        for frame in self.feed(partial.rest):
+            raise ProtocolError(f"a whole frame of {len(frame)} bytes was left over")
 
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Yield every frame that ``data`` completes; raise ProtocolError at a broken or too large frame.
@@ -51,6 +81,9 @@ class FrameBuffer:
         Raises FramingFault, a ProtocolError, where the framing function does not advance.
         """
         start = 0
+        if self._skip:
+            start = min(self._skip, len(data))
+            self._skip -= start
         while self._rest:
             # Only what the incomplete frame needs is joined to it: the rest of a large read is not copied.
             more = data[start : start + max(self._needed - len(self._rest), _JOINED)]

@@ -75,11 +75,11 @@ class FragileRobot(FragileServer):
     """A robot of one version: serves one connection, records every violation and dies of the deadly ones.
 
     ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
-    announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``misnamed``: the
-    fraction of positions sent as id 53; ``misread``: the fraction of packets dropped after the handshake, chosen
-    for each packet id by itself; ``again``: serve a connection after the first, which loses half of all packets in
-    both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of every list; ``note``:
-    called with each violation.
+    announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``side``: cells along a
+    side of the map; ``misnamed``: the fraction of positions sent as id 53; ``misread``: the fraction of packets dropped
+    after the handshake, chosen for each packet id by itself; ``again``: serve a connection after the first, which loses
+    half of all packets in both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of
+    every list; ``note``: called with each violation.
     """
 
     def __init__(
@@ -94,6 +94,7 @@ class FragileRobot(FragileServer):
         times: Times = _DEPLOYED,
         loss: Loss = Loss.NOTHING,
         parts: int = 4096,
+        side: int = wire.SIDE,
         misnamed: float = 0.25,
         misread: float = 0.0,
         again: bool = False,
@@ -110,11 +111,12 @@ class FragileRobot(FragileServer):
         """What was lost in a read that this process itself joined, because it was late."""
         self.ignored: list[tuple[float, Channel, int, bytes]] = []
         """What robots of 1.1 and 1.2 ignored: the first packet read alone after they lost what had piled up."""
-        self.machine = Machine(random.Random(f"{seed} talk"))
+        self.machine = Machine(random.Random(f"{seed} talk"), side)
         self._registered = wire.registered(version, self.features | frozenset(obeys))
         self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
         self._chance = _Chances(seed)
         self._misread, self._again, self._poor = misread, again, False
+        self._side = side
         self._phase = _Phase.LISTENING
         self._conn: socket.socket | None = None
         self._broken: ConnectionResetError | None = None
@@ -176,7 +178,7 @@ class FragileRobot(FragileServer):
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
         try:
-            settings = wire.server_settings(self.version, self.client_id, self.features)
+            settings = wire.server_settings(self.version, self.client_id, self.features, self._side)
             await self._send(wire.SERVER_SETTINGS, settings)
             self._empty_at = time.monotonic()
             while data := await self._next(conn):

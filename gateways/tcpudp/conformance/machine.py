@@ -20,8 +20,8 @@ from gateways.tcpudp.conformance.parser import (
     GET_SCAN,
     LIDAR_STATUS,
     MAP,
-    MAP_CM,
     POSITION,
+    SIDE,
     Feature,
     maps,
     packet,
@@ -36,15 +36,15 @@ _PROGRAM = (0.2, 0.0, 0.3)
 
 
 class Machine:
-    """One robot; ``random`` seeds what it says."""
+    """One robot; ``random`` seeds what it says. ``side``: cells along a side of its map."""
 
-    def __init__(self, random: Random) -> None:
+    def __init__(self, random: Random, side: int = SIDE) -> None:
         self.place = Body()
         self.lidar_on = self.camera_on = False
         self._random = random
         self._drive = (0.0, 0.0, 0.0)
         self._on_its_own = False
-        grid, angles = Grid(MAP_CM // CELL_CM, CELL_CM / 100), np.radians(np.arange(360.0))
+        grid, angles = Grid(side, CELL_CM / 100), np.radians(np.arange(360.0))
         grid.see(0.0, 0.0, angles, cast(0.0, 0.0, angles, _RANGE_M), _RANGE_M)
         self._map = grid.cells.tobytes()
 

@@ -26,8 +26,8 @@ LIDAR_MODE, LIDAR_STATUS, GET_MAP, MAP, GET_POSITION, POSITION, MAP_PART = 50, 5
 GET_SCAN, SCAN = 60, 61
 BY_UDP = frozenset({MOVE, ROTATE, SCAN, MAP, POSITION, MAP_PART})
 """The packets marked UDP* ("Packets")."""
-MAP_CM, CELL_CM = 1000, 10
-"""SLAMMapSize and SLAMMapIntervall of the simulated map."""
+SIDE, CELL_CM = 100, 10
+"""Cells along a side of the simulated map, and SLAMMapIntervall; the largest maps of the field have 2048."""
 _TAIL_BYTES = 1 << 20
 
 
@@ -224,10 +224,10 @@ def string(text: str) -> bytes:
     return struct.pack("<i", len(text)) + text.encode("ascii")
 
 
-def server_settings(version: str, client: int, features: Collection[Feature]) -> bytes:
+def server_settings(version: str, client: int, features: Collection[Feature], side: int = SIDE) -> bytes:
     """Write the body of packet 2 as a robot of ``version`` does ("Settings and version negotiation")."""
     flags = bytes(flag in features for flag in list(Feature)[: FLAGS[version]])
-    sizes = struct.pack("<ii", MAP_CM, CELL_CM) if FLAGS[version] == 7 else b""
+    sizes = struct.pack("<ii", side * CELL_CM, CELL_CM) if FLAGS[version] == 7 else b""
     return bytes([client]) + string(SENT[version]) + flags + sizes
 
 

@@ -25,7 +25,7 @@ from gateways.tcpudp.session.hq_handshake import HqHandshake
 from gateways.tcpudp.session.registered import Registered
 from gateways.tcpudp.settings import Feature
 from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed
+from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed, Spare
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -53,7 +53,7 @@ class HqRole(HqHandshake):
     ``announce``: the features that we announce. ``predecessor``: the session of the connection before.
     """
 
-    kept: ClassVar[dict[str, Any]] = {"sent_autonomous": bool, "_chosen": FRAME, "_raw": FRAMES}
+    kept: ClassVar[dict[str, Any]] = {"sent_autonomous": bool, "_chosen": FRAME, "_raw": Spare(FRAMES)}
 
     def __init__(
         self,

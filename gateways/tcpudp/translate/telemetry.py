@@ -27,7 +27,7 @@ from gateways.tcpudp.settings import RobotSettings13, Settings
 from gateways.tcpudp.translate.options import NAME, Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, FleetMessage, Map, Pose, Raw, Switch, Text
-from zbridge.protocol import Form, Kept, ProtocolError, Telemetry, Translate
+from zbridge.protocol import Form, Kept, ProtocolError, Spare, Telemetry, Translate
 
 ON, OFF = 1, 2
 MAX_SIDE = 2048
@@ -40,7 +40,7 @@ class TelemetryTranslator(Kept):
     """Translates what one robot sends; puts maps together that come in parts. Made anew for each robot, not session."""
 
     kept: ClassVar[dict[str, Any]] = {
-        "_parts": Form(lambda parts: parts, lambda raw: None if raw is None else bytearray(raw)),
+        "_parts": Spare(Form(lambda parts: parts, lambda raw: None if raw is None else bytearray(raw))),
         "_parts_ns": int,
         "_parts_from": str | None,
         "_map_awaited": bool,

@@ -1,8 +1,7 @@
 """What a gateway process tells its supervisor: the device and the links are played, the post is a real socket."""
 
 import asyncio
-import mmap
-import os
+import logging
 import signal
 import socket
 from collections.abc import AsyncIterator, Iterator
@@ -10,11 +9,11 @@ from collections.abc import AsyncIterator, Iterator
 import msgspec
 import pytest
 
-from zbridge.app.handover.messages import Given
+from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.supervisor import child
 from zbridge.app.supervisor.child import Reporter
+from zbridge.app.supervisor.memory import DEPOSIT_BYTES, SLOTS, MemoryReader
 from zbridge.app.supervisor.messages import (
-    PAGE_BYTES,
     Beat,
     Closed,
     Kept,
@@ -27,9 +26,11 @@ from zbridge.app.supervisor.messages import (
 )
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.errors import HandoverError
+from zbridge.protocol.kept import Budget
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 from zbridge.transport import Parcel
 from zbridge.transport.fake import FakeLink
+from zbridge.wire.frames import Partial
 
 
 class PlayedDevice:
@@ -38,6 +39,7 @@ class PlayedDevice:
     def __init__(self) -> None:
         self.now = LastStop(frames=(StopFrame(b"stop"),), state="established")
         self.stands = Boundary()
+        self.rest: Partial | None = Partial()
 
     @property
     def driven(self) -> bool:
@@ -53,6 +55,9 @@ class PlayedDevice:
     def boundary(self, name: str) -> Boundary:
         return self.stands
 
+    def partial(self, name: str, most_bytes: int) -> Partial | None:
+        return self.rest
+
 
 class Scene:
     """A reporter, its device, and the supervisor's end of the post."""
@@ -64,15 +69,16 @@ class Scene:
         self.reporter.begin()
         received = self.post.receive()
         assert received is not None
-        shared, (self.page,) = received
+        shared, (descriptor,) = received
         assert shared == Shared()
+        self.memory = MemoryReader(descriptor)
         self.reporter.began(self.device)
-        self.told()
+        assert self.told()[:2] == [Beat(LastStop()), Kept()], "the first deposit tells that there is nothing"
 
     def close(self) -> None:
         self.reporter.close()
         self.post.close()
-        os.close(self.page)
+        self.memory.close()
 
     def told(self) -> list[Message]:
         """What was told since."""
@@ -141,10 +147,10 @@ async def test_a_link_comes_with_its_sockets_and_goes_at_once(scene: Scene, sock
     scene.reporter.linked("robot", link, True)
     assert scene.told() == [Opened(1, "robot")]
     assert scene.descriptors == 1
-    scene.device.stands = Boundary(incoming=False)
+    scene.device.stands = Boundary(outgoing=False)
     scene.device.now = LastStop(state="handshaking")
     scene.reporter.changed()
-    assert scene.told() == [Beat(scene.device.now, {1: Boundary(incoming=False)})]
+    assert scene.told() == [Beat(scene.device.now, {1: Boundary(outgoing=False)})]
     scene.reporter.linked("robot", link, False)
     scene.reporter.linked("robot", link, False)
     assert scene.told() == [Closed(1)]
@@ -188,8 +194,12 @@ async def test_a_successor_is_asked_for_with_its_socket_and_the_answer_awaited(s
         assert not asking.done()
         scene.post.send(Started())
         await asking
-        scene.reporter.succeeded()
+        assert scene.reporter.handed_over(), "the supervisor looks after the robot"
         assert scene.told() == [Succeeded()]
+        while scene.reporter._post.send(Beat()):
+            pass
+        with pytest.raises(HandoverError, match="does not listen"):
+            scene.reporter.handed_over()
 
 
 async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -> None:
@@ -205,50 +215,134 @@ async def test_why_no_successor_was_started_is_told(scene: Scene, monkeypatch) -
             await scene.reporter.start_successor(far)
 
 
-async def test_what_a_successor_needs_is_deposited_with_its_sockets(scene: Scene, sock: socket.socket) -> None:
+GIVEN = Given(VERSION, {}, 1, claim={"since": 1.0}, device={"links": []})
+
+
+def linked(scene: Scene, sock: socket.socket, name: str = "robot") -> FakeLink:
     link = FakeLink()
     link.descriptors = (sock.fileno(),)
-    scene.reporter.linked("robot", link, True)
-    given = Given(1, {}, 1, claim={"since": 1.0}, device={"links": []})
-    left = [given]
+    scene.reporter.linked(name, link, True)
+    scene.told()
+    return link
 
-    def keep(parcel: Parcel) -> Given | None:
+
+def deposit(scene: Scene, state: str) -> Kept:
+    """Let the state of the robot become another one, with which the deposit is made anew."""
+    scene.device.now = LastStop(state=state)
+    scene.reporter.changed()
+    return next(message for message in scene.told() if isinstance(message, Kept))
+
+
+async def test_what_a_successor_needs_is_deposited_with_its_sockets(scene: Scene, sock: socket.socket) -> None:
+    linked(scene, sock)
+    left = [GIVEN]
+
+    def keep(parcel: Parcel, budget: Budget) -> Given | None:
         parcel.put(sock.fileno())
         return left[0] if left else None
 
     scene.reporter.keep = keep
-    scene.told()
-    scene.device.now = LastStop(state="handshaking")
-    scene.reporter.changed()
-    kept = next(message for message in scene.told() if isinstance(message, Kept))
-    assert msgspec.msgpack.decode(kept.given, type=Given) == given
+    kept = deposit(scene, "handshaking")
+    assert msgspec.msgpack.decode(scene.memory.deposit(kept.area, kept.size), type=Given) == GIVEN
     assert kept.sockets == ((1, 0),)
+    left[0] = msgspec.structs.replace(GIVEN, claim={"since": 2.0})
+    newer = deposit(scene, "established")
+    assert newer.area != kept.area, "the one before it is still there if this process dies now"
     left.clear()
-    scene.device.now = LastStop(state="closing")
+    assert deposit(scene, "closing") == Kept(), "nobody could go on any more"
+
+
+async def test_another_stop_comes_with_another_deposit(scene: Scene, sock: socket.socket) -> None:
+    linked(scene, sock)
+    numbers = iter(range(9))
+
+    def keep(parcel: Parcel, budget: Budget) -> Given:
+        parcel.put(sock.fileno())
+        return msgspec.structs.replace(GIVEN, claim={"since": next(numbers)})
+
+    scene.reporter.keep = keep
+    await asyncio.sleep(child.LOOK_S)
+    scene.device.now = LastStop(frames=(StopFrame(b"mode"), StopFrame(b"stop")), state="established")
     scene.reporter.changed()
-    assert Kept() in scene.told(), "nobody could go on any more"
+    assert isinstance(scene.told()[0], Kept), "a robot that drives itself is stopped by another session than before"
 
 
-async def test_the_shared_page_tells_at_any_time_whether_a_link_is_between_frames(sock: socket.socket) -> None:
-    scene = Scene()
-    link = FakeLink()
-    link.descriptors = (sock.fileno(),)
-    scene.reporter.linked("robot", link, True)
-    with mmap.mmap(scene.page, PAGE_BYTES, prot=mmap.PROT_READ) as page:
-        seen = [page[1]]
-        scene.reporter.read("robot")
-        seen.append(page[1])
-        link.reads()  # bytes are about to be taken from the kernel
-        seen.append(page[1])
-        scene.device.stands = Boundary(incoming=False)
-        scene.reporter.read("robot")
-        seen.append(page[1])
-        scene.device.stands = Boundary()
-        scene.reporter.read("robot")
-        scene.reporter.linked("robot", link, False)
-        seen.append(page[1])
-    assert seen == [0, 1, 0, 0, 0]
-    scene.close()
+@pytest.mark.parametrize("fault", ["a name that is not UTF-8", "too large", "raises"])
+async def test_a_deposit_that_cannot_be_made_is_told_once_and_the_beats_go_on(
+    scene: Scene, sock: socket.socket, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, fault: str
+) -> None:
+    linked(scene, sock)
+
+    def keep(parcel: Parcel, budget: Budget) -> Given | None:
+        if fault == "raises":
+            raise KeyError("a protocol's fault")
+        value = "\udcff" if "UTF-8" in fault else bytes(DEPOSIT_BYTES)
+        return msgspec.structs.replace(GIVEN, device={"links": [value]})
+
+    scene.reporter.keep = keep
+    for state in ("handshaking", "established", "closing"):
+        scene.device.now = LastStop(state=state)
+        scene.reporter.changed()
+        assert scene.told() == [Beat(scene.device.now, {1: Boundary()})]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert "a crash would end the robot's connection" in record.getMessage()
+
+
+async def test_what_is_left_out_of_a_deposit_is_told_once_a_minute_at_most(
+    scene: Scene, sock: socket.socket, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    linked(scene, sock)
+    sizes = iter((child.VALUE_BYTES, child.VALUE_BYTES + 1, child.VALUE_BYTES + 2))
+
+    def keep(parcel: Parcel, budget: Budget) -> Given:
+        size = next(sizes)
+        parcel.put(sock.fileno())
+        admitted = budget.admits("Robot.map", bytes(size))
+        return msgspec.structs.replace(GIVEN, device={"links": [size], "map": admitted})
+
+    scene.reporter.keep = keep
+    for state in ("handshaking", "established", "closing"):
+        deposit(scene, state)
+    (record,) = caplog.records
+    assert record.getMessage() == (
+        "after a crash the next process would begin without Robot.map: 131073 bytes, more than 131072"
+    )
+
+
+async def test_the_shared_memory_tells_at_any_time_where_the_stream_of_a_link_was_cut(
+    scene: Scene, sock: socket.socket
+) -> None:
+    link = linked(scene, sock)
+    seen = [scene.memory.partial(1), scene.memory.is_touched(1)]
+    link.reads()  # bytes are about to be taken from the kernel
+    seen.append(scene.memory.partial(1))
+    scene.reporter.read("robot", lambda most_bytes: Partial(b"half"))
+    seen.append(scene.memory.partial(1))
+    link.reads()
+    scene.reporter.read("robot", lambda most_bytes: None)
+    seen.append(scene.memory.partial(1))
+    scene.device.rest = Partial(skip=7)
+    deposit_beat = LastStop(state="handshaking")
+    scene.device.now = deposit_beat
+    scene.reporter.changed()
+    seen.append(scene.memory.partial(1))
+    assert seen == [Partial(), False, None, Partial(b"half"), None, Partial(skip=7)]
+
+
+async def test_a_link_that_comes_and_goes_often_leaves_the_slots_of_others_alone(
+    scene: Scene, sock: socket.socket
+) -> None:
+    linked(scene, sock, "drive")
+    scene.reporter.read("drive", lambda most_bytes: Partial(b"drive"))
+    for _ in range(3 * SLOTS):
+        laser = FakeLink()
+        scene.reporter.linked("laser", laser, True)
+        laser.reads()
+        scene.reporter.linked("laser", laser, False)
+        laser.reads()  # one that ends late
+    assert scene.memory.partial(1) == Partial(b"drive")
 
 
 async def test_the_end_of_the_supervisor_ends_the_process_in_order(scene: Scene) -> None:

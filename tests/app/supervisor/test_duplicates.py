@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import pytest
 
 from zbridge.app.supervisor import duplicates
-from zbridge.app.supervisor.duplicates import LINKS, Duplicates
+from zbridge.app.supervisor.duplicates import Duplicates
+from zbridge.app.supervisor.memory import SLOTS
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
 
 STOP = LastStop(driven=True, frames=(StopFrame(b"one"), StopFrame(b"two")))
@@ -109,9 +110,9 @@ def test_what_is_no_link_and_links_beyond_the_bound_are_closed(tmp_path: object)
     kept.opened(1, "file", [os.open("/proc/self/stat", os.O_RDONLY)], drives=True)
     assert len(kept) == 0
     with socket.socket() as one:
-        for link in range(LINKS + 3):
+        for link in range(SLOTS + 3):
             kept.opened(link, "robot", [os.dup(one.fileno())], drives=True)
-        assert len(kept) == LINKS
+        assert len(kept) == SLOTS
         kept.close()
     assert len(os.listdir("/proc/self/fd")) == before
 

@@ -1,16 +1,20 @@
 """Robot files that come, change and go, as real files."""
 
+import os
 from pathlib import Path
 
 import pytest
 
+from zbridge.app.supervisor import files
 from zbridge.app.supervisor.files import Changes, Follower, RobotFile, first_look, paths_of, read
+from zbridge.app.toml import FILE_BYTES
 from zbridge.errors import ConfigError
 
 
-def write(folder: Path, name: str, robot: str = "", port: int = 11001, more: str = "") -> Path:
+def write(folder: Path, name: str, robot: str = "", port: int = 0, more: str = "", host: str = "127.0.0.1") -> Path:
+    """Write a robot's file; port 0: one of the name's own."""
     path = folder / f"{name}.toml"
-    connect = f'connect = ["tcp://127.0.0.1:{port}"]'
+    connect = f'connect = ["tcp://{host}:{port or 11000 + ord(name[0]) - 96}"]'
     path.write_text(f'[robot]\nname = "{robot or name}"\n[device]\nprotocol = "tcpudp"\n{connect}\n{more}')
     return path
 
@@ -97,6 +101,18 @@ def test_a_second_file_with_the_name_of_a_robot_is_faulty_until_the_first_is_gon
     assert scene.look() == {"came": ["aa"], "gone": ["b"]}
 
 
+def test_a_second_file_with_the_address_of_a_robot_is_faulty_until_the_first_has_another_one(scene: Scene) -> None:
+    write(scene.folder, "c", host="localhost", port=11002)
+    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    assert faulty.fault is not None
+    assert f"device.connect: expected another address than that of {scene.folder}/b.toml" in faulty.fault
+    write(scene.folder, "b", port=11009)
+    scene.look()
+    assert scene.look() == {"came": ["c"]}
+    write(scene.folder, "b", port=11001, more="[control]\n")
+    assert scene.look() == {"faulty": ["b"]}, "that of another one that runs"
+
+
 @pytest.mark.parametrize("twice", [False, True])
 def test_a_file_that_is_renamed_keeps_its_robot(scene: Scene, twice: bool) -> None:
     (scene.folder / "a.toml").rename(scene.folder / "z.toml")
@@ -132,6 +148,59 @@ def test_what_cannot_be_started_is_refused(tmp_path: Path, robots: dict[str, str
         write(tmp_path, name, robot=robot)
     with pytest.raises(ConfigError, match=words):
         first_look((tmp_path,))
+
+
+@pytest.mark.parametrize("what", ["fifo", "device", "large", "brackets", "digits", "name", "bug"])
+def test_whatever_a_file_is_it_is_faulty_and_the_others_are_followed(
+    scene: Scene, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, ran = scene.folder / "c.toml", scene.running[scene.folder / "a.toml"]
+    match what:
+        case "fifo":
+            os.mkfifo(path)
+        case "device":
+            path.symlink_to("/dev/zero")
+        case "large":
+            path.write_text(f"a = [{3_000_000 * '1,'}]")
+        case "brackets":
+            path.write_text("a = " + 20_000 * "[")
+        case "digits":
+            path.write_text("a = " + 5_000 * "1")
+        case "name":
+            Path(os.fsdecode(os.fsencode(scene.folder) + b"/c\xff.toml")).write_bytes(ran.content)
+        case "bug":
+            monkeypatch.setattr("zbridge.app.supervisor.files.load", lambda path, content: content / 2)
+            path.write_text("a = 1")
+    (faulty,) = scene.follower.look(scene.running, twice=False).faulty
+    assert faulty.fault is not None
+    faulty.fault.encode()  # it is logged, and told to the code that takes this supervisor's place
+    assert len(faulty.fault) < 500
+    monkeypatch.undo()
+    write(scene.folder, "a", port=11009)
+    assert scene.look()["changed"] == ["a"]
+
+
+def test_a_faulty_file_that_is_the_same_is_checked_again_at_sighup_and_now_and_then(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checked: list[Path] = []
+    check = files.check
+    monkeypatch.setattr(files, "check", lambda path, content: [checked.append(path), check(path, content)][1])
+    write(scene.folder, "a", more="colour = 1\n")
+    for _ in range(5):
+        scene.look(twice=True)
+    assert len(checked) == 1, "a large file takes long to check"
+    scene.look(twice=False)
+    assert len(checked) == 2
+    monkeypatch.setattr(files, "CHECK_AGAIN_S", 0.0)
+    scene.look(twice=True)
+    assert len(checked) == 3
+
+
+def test_a_host_may_allow_larger_files(tmp_path: Path) -> None:
+    path = write(tmp_path, "a", more="#" * FILE_BYTES)
+    assert read(path).fault == f"{path}: {path.stat().st_size} bytes, expected {FILE_BYTES} at most"
+    assert read(path, 2 * FILE_BYTES).fault is None
 
 
 def test_a_faulty_file_does_not_keep_the_others_from_starting(tmp_path: Path) -> None:

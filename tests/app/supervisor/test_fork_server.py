@@ -38,11 +38,11 @@ async def ended(pid: int) -> int:
             await asyncio.sleep(0.01)
 
 
-async def forked(made: Forks, file: Path) -> int:
-    """Fork the gateway of a file; nobody listens to what it tells."""
+async def forked(made: Forks, file: Path, content: bytes = b"") -> int:
+    """Fork the gateway of a file with this content; nobody listens to what it tells."""
     post, far = Post.pair()
     with far, contextlib.closing(post):
-        return await made.fork(Fork(str(file), "r1"), far)
+        return await made.fork(Fork(str(file), "r1"), far, content)
 
 
 async def test_a_forked_gateway_is_a_child_of_ours_and_shows_its_end(tmp_path: Path, capfd) -> None:
@@ -51,7 +51,7 @@ async def test_a_forked_gateway_is_a_child_of_ours_and_shows_its_end(tmp_path: P
         pids = [await forked(made, tmp_path / f"r{number}.toml") for number in range(2)]
         assert [await ended(pid) for pid in pids] == [2, 2], "the exit code of a faulty configuration"
     said = capfd.readouterr().err
-    assert said.count("No such file or directory") == 2, said
+    assert said.count("robot: missing, it is required") == 2, said
     assert "Traceback" not in said
 
 
@@ -67,6 +67,30 @@ async def test_a_protocol_that_cannot_be_loaded_stops_no_gateway_of_another_one(
     _become_reaper()
     async with forks() as made:
         assert await ended(await forked(made, tmp_path / "r1.toml")) == 2
+
+
+async def test_a_forked_gateway_runs_by_the_content_that_it_is_given_not_by_what_the_file_holds(
+    tmp_path: Path, capfd
+) -> None:
+    _become_reaper()
+    file = tmp_path / "r1.toml"
+    file.write_text("of = 'the file'\n")
+    content = b"large = '%s'\ngiven = 1\n" % (200_000 * b"x")
+    async with forks() as made:
+        assert await ended(await forked(made, file, content)) == 2
+    assert "large = 'xxx" in capfd.readouterr().err
+
+
+async def test_without_a_free_descriptor_no_gateway_is_forked_and_the_reason_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(name: str) -> int:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(os, "memfd_create", fail)
+    async with forks() as made:
+        with pytest.raises(NotReady, match="no memory for a file: Too many open files"):
+            await forked(made, tmp_path / "r1.toml")
 
 
 async def test_a_fork_server_whose_code_is_broken_is_reported(caplog: pytest.LogCaptureFixture) -> None:

@@ -64,6 +64,14 @@ def test_the_end_of_the_other_process_is_seen_after_its_last_message(ends: tuple
     assert not ends[1].send(Succeeded())
 
 
+def test_what_a_process_told_before_it_died_is_seen_though_it_left_something_unread(ends: tuple[Post, Post]) -> None:
+    ends[1].send(Started())
+    ends[0].send(Beat())
+    ends[0].send(Succeeded())
+    ends[0].close()
+    assert [ends[1].receive() for _ in range(3)] == [(Beat(), []), (Succeeded(), []), None]
+
+
 def test_what_finds_no_room_is_counted_and_does_not_block(ends: tuple[Post, Post]) -> None:
     while ends[0].send(Beat()):
         pass

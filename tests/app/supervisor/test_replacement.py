@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
@@ -16,10 +17,12 @@ import pytest
 from zbridge.app.host import HostSettings
 from zbridge.app.supervisor import replacement
 from zbridge.app.supervisor import supervisor as module
-from zbridge.app.supervisor.files import RobotFile
+from zbridge.app.supervisor.deposit import Deposit
+from zbridge.app.supervisor.files import Changes, RobotFile
 from zbridge.app.supervisor.forks import SIGNALS, Forks
 from zbridge.app.supervisor.heart import DRIVEN_S, Heart, HeartState
-from zbridge.app.supervisor.messages import PAGE_BYTES, Beat, Kept, Opened, Shared
+from zbridge.app.supervisor.memory import MemoryWriter
+from zbridge.app.supervisor.messages import Beat, Kept, Opened, Shared
 from zbridge.app.supervisor.post import Post
 from zbridge.app.supervisor.process import GatewayProcess
 from zbridge.app.supervisor.replacement import replace
@@ -36,8 +39,10 @@ from zbridge.app.supervisor.state import (
 from zbridge.app.supervisor.supervisor import Supervisor
 from zbridge.errors import HandoverError
 from zbridge.robot.observer import Boundary, LastStop, StopFrame
+from zbridge.wire.frames import Partial
 
 LAST = LastStop(True, (StopFrame(b"stop"), StopFrame(b"also", datagram=True)), 0.01, "established")
+FILE = RobotFile(Path("r1.toml"), b"", ("fleet", "r1"))
 NOBODY = 2**22 + 1
 """A process id that Linux never gives."""
 
@@ -56,7 +61,7 @@ def stored(state: SupervisorState) -> Iterator[int]:
 
 
 def test_a_state_is_read_as_it_was_written_as_often_as_wanted() -> None:
-    process = ProcessState(7, 8, 1.5, HeartState(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Kept(b"given", ((1, 0),)), ())
+    process = ProcessState(7, 8, 1.5, HeartState(2.0, DRIVEN_S, 0.1, 3), LAST, 9, True, Kept(((1, 0),), 1, 5), ())
     robots = (
         RunnerState("robots/r1.toml", b"\xff", ("fleet", "r1"), 2, 1, None, process),
         RunnerState("robots/r2.toml", b"", None, 0, 6, 61.5),
@@ -102,7 +107,7 @@ def test_a_heart_goes_on_with_what_it_knew() -> None:
 
 
 def resumed_process(state: ProcessState) -> GatewayProcess:
-    process = GatewayProcess(state.pid, Post.inherited(state.post), wants_successor=lambda *_: None)
+    process = GatewayProcess(state.pid, Post.inherited(state.post), FILE, wants_successor=lambda *_: None)
     process.resume(state)
     return process
 
@@ -110,13 +115,13 @@ def resumed_process(state: ProcessState) -> GatewayProcess:
 async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the_stop_of_its_robot() -> None:
     near, far = Post.pair()
     told, (ours, robot) = Post(far), socket.socketpair()
-    page = os.memfd_create("page")
-    os.ftruncate(page, PAGE_BYTES)
-    before = GatewayProcess(NOBODY, near, wants_successor=lambda *_: None)
-    told.send(Shared(), [page])
+    memory = MemoryWriter()
+    before = GatewayProcess(NOBODY, near, FILE, wants_successor=lambda *_: None)
+    told.send(Shared(), [memory.descriptor])
+    memory.sent()
     told.send(Opened(3, "robot"), [ours.fileno()])
-    told.send(Kept(b"given", ((3, 0),)))
-    told.send(Beat(LAST, {3: Boundary(incoming=False)}, hands_over=True))
+    told.send(Kept(((3, 0),), memory.deposit(b"given"), 5))
+    told.send(Beat(LAST, {3: Boundary(outgoing=False)}, hands_over=True))
     before.hear()
     asyncio.get_running_loop().remove_reader(near.fileno())
     state = msgspec.msgpack.decode(msgspec.msgpack.encode(before.state), type=ProcessState)
@@ -130,13 +135,19 @@ async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the
     )
     before.close()
     ours.close()
-    assert (after.last, after.hands_over, after.kept) == (LAST, True, Kept(b"given", ((3, 0),)))
+    assert (after.last, after.hands_over) == (LAST, True)
     assert after.heart.state == before.heart.state
-    assert after.duplicates.state[0].boundary == Boundary(incoming=False)
-    os.pwrite(page, b"\0\0\0\1", 0)
-    assert after._page is not None
-    assert after._page[3] == 1, "it sees the same page"
-    assert await after.duplicates.stop(LastStop(frames=(StopFrame(b"stop"),)), 1)
+    assert after.deposit.duplicates.state[0].boundary == Boundary(outgoing=False)
+    kept, shared = after.deposit.kept, after.deposit.memory
+    assert kept is not None
+    assert shared is not None
+    assert (kept.sockets, shared.deposit(kept.area, kept.size)) == (((3, 0),), b"given")
+    memory.cut(3, Partial(b"half"))
+    assert shared.partial(3) == Partial(b"half"), "it sees the same memory"
+    told.send(Beat(LastStop(frames=(StopFrame(b"stop"),))))
+    after.hear()
+    after.deposit.duplicates.stands({3: Boundary()})
+    assert await after.deposit.stop(1)
     assert robot.recv(100) == b"stop"
     told.send(Beat(LastStop(state="offline")))
     after.hear()
@@ -145,13 +156,11 @@ async def test_a_process_is_known_as_before_with_its_page_its_kept_state_and_the
     assert robot.recv(100) == b"", "nobody has a duplicate"
     told.close()
     robot.close()
-    os.close(page)
+    memory.close()
 
 
 def runner() -> Runner:
-    return Runner(
-        RobotFile(Path("r1.toml"), b"", ("fleet", "r1")), Forks(["false"]), verbose=False, changed=lambda: None
-    )
+    return Runner(FILE, Forks(["false"]), verbose=False, changed=lambda: None)
 
 
 @pytest.fixture
@@ -182,7 +191,7 @@ async def test_a_resumed_runner_keeps_its_process_and_its_counts(
     assert kept.process.pid == NOBODY
 
 
-@pytest.mark.parametrize("what", ["told_to_end", "succeeded", "killed", "restarting"])
+@pytest.mark.parametrize("what", ["told_to_end", "killed", "restarting", "given"])
 async def test_a_runner_with_something_under_way_is_not_calm(
     running: tuple[Runner, asyncio.Task[None], Post], what: str
 ) -> None:
@@ -193,6 +202,8 @@ async def test_a_runner_with_something_under_way_is_not_calm(
             made.process.kill("hung")
         case "restarting":
             made._restarting = 1
+        case "given":
+            made.process.deposit.given = Deposit()
         case _:
             setattr(made.process, what, True)
     assert not made.is_calm
@@ -273,11 +284,36 @@ async def test_without_such_a_moment_nothing_is_replaced(monkeypatch: pytest.Mon
         await replace(["false"], lambda: None)
 
 
+async def test_files_are_read_off_the_event_loop_which_watches_the_gateways(monkeypatch: pytest.MonkeyPatch) -> None:
+    supervisor, looked = Supervisor((), HostSettings(), [], watch=True, verbose=False), threading.Event()
+    supervisor._forks = PlayedForks()  # type: ignore[assignment]
+    supervisor._code = "one"  # type: ignore[assignment]
+    seen: list[bool] = []
+
+    def look(running: object, *, twice: bool) -> Changes:
+        seen.append(looked.wait(10.0))
+        return Changes()
+
+    monkeypatch.setattr(supervisor._follower, "look", look)
+    supervisor._reload.set()
+    following = asyncio.ensure_future(supervisor._follow())
+    asyncio.get_running_loop().call_later(0.01, looked.set)  # never called while the loop reads files
+    async with asyncio.timeout(30.0):
+        while not seen:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+    following.cancel()
+    await asyncio.wait([following])
+    assert seen == [True]
+
+
 class PlayedForks:
     """The fork server of an installation that the test names."""
 
     stamp: str | None = "one"
-    refused = False
+    refused = unsettled = False
+
+    async def renew(self) -> None:
+        pass
 
 
 @pytest.mark.parametrize(

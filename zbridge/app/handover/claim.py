@@ -13,6 +13,7 @@ class ClaimPart:
     def __init__(self, ownership: Ownership) -> None:
         self._ownership = ownership
         self._claim: Exported | None = None
+        self._withdrawn = False
 
     def __repr__(self) -> str:
         return f"<ClaimPart {self._ownership!r}>"
@@ -28,18 +29,20 @@ class ClaimPart:
         """Do nothing."""
 
     def hand_over(self, parcel: Parcel) -> Exported:
-        """Describe the claim; ``{}`` where the robot is not owned."""
-        self._claim = self._ownership.export()
+        """Describe the claim; ``{}`` where the robot is not owned. One that was withdrawn is the successor's."""
+        if not self._withdrawn:
+            self._claim = self._ownership.export()
         return self._claim or {}
 
     async def go_on(self) -> None:
         """Claim the robot again, where the claim was withdrawn."""
-        self._ownership.hands_over = False
+        self._ownership.hands_over = self._withdrawn = False
         if self._claim is not None and self._ownership.export() is None:
             self._ownership.inherit(self._claim)
 
     def withdraw(self) -> None:
         """Leave the claim, and the liveliness token, to the successor's."""
+        self._withdrawn = True
         self._ownership.release()
 
     async def release(self) -> None:

@@ -2,6 +2,8 @@
 
 Until then nothing is read from a socket or written to one, whatever happens: a failure ends this process, and the other
 one goes on. Where the other one dies once everything was handed over, this one begins: nobody else has the sockets.
+With a supervisor this one ends instead: the supervisor has the sockets too, stops the robot over them, and starts
+another one.
 """
 
 from __future__ import annotations
@@ -27,15 +29,19 @@ GO_S = 30.0
 
 
 class Incoming:
-    """What comes by the channel. ``setup``: what must be the same in both configurations, by key."""
+    """What comes by the channel. ``setup``: what must be the same in both configurations, by key.
 
-    def __init__(self, end: socket.socket, setup: Exported) -> None:
+    ``supervised``: somebody looks after the robot if the other process dies.
+    """
+
+    def __init__(self, end: socket.socket, setup: Exported, *, supervised: bool = False) -> None:
         self.given: Given
         self.parcel = Parcel()
         self.begun = asyncio.Event()
         """Set when the other process has let go."""
         self._channel = Channel(end)
         self._setup = setup
+        self._supervised = supervised
         self._missing = 0
 
     def __repr__(self) -> str:
@@ -67,7 +73,11 @@ class Incoming:
         await self._channel.send(Up())
         try:
             await self._channel.receive(Go, GO_S)
-        except EndError:
+        except EndError as error:
+            if self._supervised:
+                raise HandoverError(
+                    "the gateway before this one has died: the supervisor looks after its robot"
+                ) from error
             log.warning("the gateway before this one has died: going on in its place")
         self._channel.close()
         self.begun.set()

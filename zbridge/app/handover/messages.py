@@ -5,8 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from zbridge.protocol.kept import Exported
+from zbridge.wire.frames import Partial
 
-VERSION = 1
+VERSION = 2
 """The form of :class:`Given`. Raise it with every change of what is ``kept`` and of the maps around it."""
 
 
@@ -21,7 +22,9 @@ class Given(msgspec.Struct, tag="given", frozen=True):
     """Gateway: nothing is read or written any more; take this over, and ``descriptors`` descriptors behind it.
 
     setup: what must be the same in both configurations. claim: on the robot, None where it is not owned. device: None
-    where it is not served. listeners: in the order of the configuration. metrics: numbers of sockets in the parcel.
+    where it is not served. listeners: in the order of the configuration; none of a gateway that died: the successor
+    binds its own. metrics: numbers of sockets in the parcel. partials: of a gateway that died, the incomplete frame of
+    each stream, in the order of the device's links.
     """
 
     version: int
@@ -31,6 +34,7 @@ class Given(msgspec.Struct, tag="given", frozen=True):
     device: Exported | None = None
     listeners: tuple[Exported, ...] = ()
     metrics: tuple[int, ...] = ()
+    partials: tuple[Partial, ...] = ()
 
 
 class Up(msgspec.Struct, tag="up", frozen=True):

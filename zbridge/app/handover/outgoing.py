@@ -11,6 +11,9 @@ nothing is lost that this gateway cannot take back.
    the sockets. From *go* on the successor reads and writes.
 
 Until *go* every failure leads back: the successor is killed, and only when it has ended this gateway reads again.
+
+Where a supervisor started the successor, the supervisor is told of *go* first (:meth:`Successor.handed_over`). From
+then on it treats the successor as the robot's gateway, and nothing leads back.
 """
 
 from __future__ import annotations
@@ -75,15 +78,15 @@ Describe = Callable[[Parcel], Given]
 
 
 class Outgoing:
-    """One handover. ``start``: starts the successor. ``parts``: what is handed over. ``describe``: writes all of it.
+    """One handover. ``successor``: starts it. ``parts``: what is handed over. ``describe``: writes all of it.
 
     ``drain``: waits until what was published has left: what the successor publishes must not overtake it.
     """
 
     def __init__(
-        self, start: Successor, parts: Sequence[Part], describe: Describe, drain: Callable[[], Awaitable[None]]
+        self, successor: Successor, parts: Sequence[Part], describe: Describe, drain: Callable[[], Awaitable[None]]
     ) -> None:
-        self._start = start
+        self._successor = successor
         self._parts = parts
         self._describe = describe
         self._drain = drain
@@ -95,11 +98,15 @@ class Outgoing:
 
     async def run(self) -> int:
         """Hand everything over; return the process that has it. Raise Refused and its reason: all is as before then."""
-        near, far = socket.socketpair()
-        channel, changed = Channel(near), False
+        try:
+            near, far = socket.socketpair()
+        except OSError as error:
+            log.error("not restarted: %s", error)
+            raise NotReady(f"not restarted: {error}") from error
+        channel, changed, looked_after = Channel(near), False, False
         try:
             with far:
-                await self._start(far)
+                await self._successor.start_successor(far)
             hello = await channel.receive(Hello, START_S)
             self._know(hello)
             changed = True
@@ -108,14 +115,21 @@ class Outgoing:
             for part in self._parts:
                 part.withdraw()
             await self._drain()
-            await channel.send(Go())
+            looked_after = self._successor.handed_over()
+            if not looked_after:
+                await channel.send(Go())
         except (HandoverError, Refused, BusError, OSError) as error:
             await self._take_back(channel, str(error), changed=changed)
             raise error if isinstance(error, Refused) else NotReady(f"not restarted: {error}") from error
         except BaseException:  # the gateway ends meanwhile: it needs its sockets to take leave
             await asyncio.shield(self._take_back(channel, "the gateway ends", changed=changed))
             raise
-        await asyncio.gather(*(part.release() for part in self._parts))
+        released = asyncio.gather(*(part.release() for part in self._parts))
+        if looked_after:
+            await asyncio.sleep(0)  # the robot's part is released at once: an end of this process must not stop it
+            with contextlib.suppress(HandoverError):
+                await channel.send(Go())
+        await released
         channel.close()
         self._forget()
         return hello.pid

@@ -25,6 +25,7 @@ from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Query
 from zbridge.fleet.topics import KeySpace
+from zbridge.protocol.kept import Budget
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import CLAIM
 from zbridge.transport import Parcel
@@ -63,9 +64,9 @@ class Restarts:
             await self._restart()
             self.gone.set()
 
-    def keep(self, parcel: Parcel) -> Given | None:
+    def keep(self, parcel: Parcel, budget: Budget) -> Given | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
-        device = self.device.keep(parcel) if self.device is not None else None
+        device = self.device.keep(parcel, budget) if self.device is not None else None
         claim = self.claim.hand_over(parcel) if self.claim is not None else None
         if device is None or not claim:
             return None

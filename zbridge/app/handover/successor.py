@@ -1,4 +1,4 @@
-"""How a successor is started: by a function that gets the far end of the channel. Here the one without a supervisor."""
+"""How a successor is started, and told that it has the robot: with a supervisor, or, as here, without one."""
 
 from __future__ import annotations
 
@@ -7,18 +7,30 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Protocol
 
 from zbridge.errors import HandoverError
 
 COMMAND = [sys.executable, "-m", "zbridge"]
 """The installed version of this program."""
-Successor = Callable[[socket.socket], Awaitable[None]]
-"""``await start(far_end)``: start a process that owns the far end; raise HandoverError where none can be started.
 
-The caller closes its own copy of the far end afterwards, in any case.
-"""
+
+class Successor(Protocol):
+    """Who starts successors of this process."""
+
+    async def start_successor(self, far_end: socket.socket) -> None:
+        """Start a process that owns the far end; raise HandoverError where none can be started.
+
+        The caller closes its own copy of the far end afterwards, in any case.
+        """
+
+    def handed_over(self) -> bool:
+        """Note that the successor has the robot from now on; called before the successor is told.
+
+        True: somebody looks after the robot whatever happens to either process, so there is no way back. False: nobody
+        does; this process takes everything back if the successor cannot be told.
+        """
 
 
 class Spawn:
@@ -33,12 +45,16 @@ class Spawn:
     def __repr__(self) -> str:
         return f"<Spawn {self._file} {self.process.pid if self.process else ''}>"
 
-    async def __call__(self, far_end: socket.socket) -> None:
+    async def start_successor(self, far_end: socket.socket) -> None:
         """Start the process; it is waited for where it ends before we do."""
         try:
             self.process = await asyncio.to_thread(self._start, far_end.fileno())
         except OSError as error:
             raise HandoverError(f"no process can be started: {error}") from error
+
+    def handed_over(self) -> bool:
+        """Return False: nobody looks after two processes."""
+        return False
 
     def _start(self, descriptor: int) -> subprocess.Popen[bytes]:
         if self.process is not None:

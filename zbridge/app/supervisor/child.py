@@ -1,16 +1,20 @@
-"""What a gateway process tells its supervisor: beats, its links, and the stop that its robot needs if it dies.
+"""What a gateway process tells its supervisor: beats, its links, and what is needed if it dies.
 
 Theory of operation. The reporter observes the robot's device (:class:`zbridge.robot.observer.Observer`). A timer of the
 event loop sends a beat: no beat comes from a loop that hangs. Whatever changes what the supervisor needs (the robot is
 driven or not, the state of the link, a link that is up or gone) sends a beat at once. The end of the post means that
 the supervisor is gone: then the process ends in order, as nobody looks after its robot.
+
+A beat has the stop of the robot. The state that a successor would need is deposited in shared memory, at most every
+:data:`KEEP_S` unless the state of the robot or its stop is another one; where each stream stands is noted there with
+every read (:mod:`zbridge.app.supervisor.memory`).
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import mmap
+import math
 import os
 import signal
 import socket
@@ -20,8 +24,8 @@ from functools import partial
 import msgspec
 
 from zbridge.app.handover.messages import Given
+from zbridge.app.supervisor.memory import DEPOSIT_BYTES, PARTIAL_BYTES, SLOTS, MemoryWriter, slot_of
 from zbridge.app.supervisor.messages import (
-    PAGE_BYTES,
     Beat,
     Closed,
     Kept,
@@ -32,8 +36,9 @@ from zbridge.app.supervisor.messages import (
     WantSuccessor,
 )
 from zbridge.app.supervisor.post import Post, close_all
-from zbridge.errors import HandoverError
-from zbridge.robot.observer import LastStop, Observed
+from zbridge.errors import HandoverError, describe
+from zbridge.protocol.kept import Budget
+from zbridge.robot.observer import LastStop, Observed, Resume
 from zbridge.transport import Link, Parcel
 
 log = logging.getLogger("zbridge.app.supervisor")
@@ -48,9 +53,16 @@ ANSWER_S = 10.0
 """Longest wait for the start of a successor."""
 KEEP_S = 0.9
 """Least seconds between two deposits of what a successor needs."""
-KEPT_BYTES = 48 * 1024
-"""Largest such deposit."""
+VALUE_BYTES = 128 * 1024
+"""Largest single value in a deposit: a map that came in parts, a published message; larger ones are left out."""
+TELL_S = 60.0
+"""Least seconds between two log lines about what is not in a deposit."""
+_LOST = "a crash would end the robot's connection"
+_NUMBERS = 16 * SLOTS
+"""Links are numbered up to here, then again from the lowest free number."""
 _encode = msgspec.msgpack.Encoder().encode
+Keep = Callable[[Parcel, Budget], Given | None]
+"""``keep(parcel, budget)``: describe what a successor needs; None where none could resume."""
 
 
 class _Listed(Parcel):
@@ -78,10 +90,14 @@ class Reporter:
         self._told = LastStop()
         self._looked_at = self._kept_at = 0.0
         self._kept = Kept()
+        self._deposited = b""
+        self._missing_told = ("", -math.inf)
+        """What the log said last of what is not in the deposit, and when."""
         self._at: dict[str, int] = {}
-        self._page: mmap.mmap
-        self.keep: Callable[[Parcel], Given | None] = lambda parcel: None
-        """Describes what a successor needs; set by the gateway's process."""
+        """The number of the link of each name."""
+        self._memory: MemoryWriter
+        self.keep: Keep = lambda parcel, budget: None
+        """Set by the gateway's process."""
         self._timer: asyncio.TimerHandle | None = None
         self._answer: asyncio.Future[Started] | None = None
 
@@ -102,7 +118,7 @@ class Reporter:
         if self._post.fileno() >= 0:
             self._loop.remove_reader(self._post.fileno())
             self._post.close()
-            self._page.close()
+            self._memory.close()
 
     async def start_successor(self, far_end: socket.socket) -> None:
         """Ask for a process that takes over from ``far_end``; raise HandoverError if none is started."""
@@ -119,15 +135,21 @@ class Reporter:
         if started.reason is not None:
             raise HandoverError(started.reason)
 
-    def succeeded(self) -> None:
-        """Tell that the successor has taken over: this process is not to be started again."""
-        self._post.send(Succeeded())
+    def handed_over(self) -> bool:
+        """Tell that the successor has the robot from now on; True: the supervisor looks after both, also if one dies.
+
+        Raise HandoverError if the supervisor cannot be told.
+        """
+        if not self._post.send(Succeeded()):
+            raise HandoverError("the supervisor does not listen")
+        return True
 
     # The observer
 
     def began(self, device: Observed) -> None:
-        """Start: the device serves its robot."""
+        """Start: the device serves its robot. What this process deposits counts from now on, even if it is nothing."""
         self._device = device
+        self._keep(first=True)
         self._beat()
 
     def ended(self) -> None:
@@ -137,21 +159,24 @@ class Reporter:
 
     def linked(self, name: str, link: Link, up: bool) -> None:
         """Give the supervisor duplicates of a link's sockets, or tell it to close them."""
-        if up:
-            self._numbers = self._numbers % (PAGE_BYTES - 1) + 1
-            self._links[link] = (self._numbers, name, ())
-            self._at[name] = self._numbers
-            link.reads = partial(self._page.__setitem__, self._numbers, 0)
+        if up and len(self._links) < SLOTS:
+            number = self._numbers = self._next_number()
+            self._links[link] = (number, name, ())
+            self._at[name] = number
+            self._memory.begin(number)
+            link.reads = partial(self._memory.reading, number)
             self._show(link)
         elif link in self._links:
             number, _, _ = self._links.pop(link)
-            self._page[number] = 0
+            if self._at.get(name) == number:
+                del self._at[name]
+            link.reads = lambda: None
             self._post.send(Closed(number))
 
-    def read(self, name: str) -> None:
-        """Note in the shared page whether a successor could go on reading here."""
-        if self._device is not None and name in self._at:
-            self._page[self._at[name]] = self._device.boundary(name).incoming
+    def read(self, name: str, resume: Resume) -> None:
+        """Note in the shared memory where a successor would resume the stream of a link."""
+        if name in self._at:
+            self._memory.cut(self._at[name], resume(PARTIAL_BYTES))
 
     def changed(self) -> None:
         """Beat at once if a program has begun to drive the robot, or has ended, or its link is another one."""
@@ -172,34 +197,71 @@ class Reporter:
             self._show(link)
         device = self._device
         streams = {number: device.boundary(name) for number, name, _ in self._links.values()} if device else {}
-        for _, name, _ in self._links.values():
-            self.read(name)
+        if device is not None:
+            for name, number in self._at.items():  # the last read may have found nothing
+                if (found := device.partial(name, PARTIAL_BYTES)) is not None:
+                    self._memory.cut(number, found)
         last = device.last_stop() if device else LastStop()
-        if self._loop.time() >= self._kept_at + KEEP_S or last.state != self._told.state:
+        if self._loop.time() >= self._kept_at + KEEP_S or (last.state, last.frames) != (
+            self._told.state,
+            self._told.frames,
+        ):
             self._keep()
         if self._post.send(Beat(last, streams, self._hands_over)):
             self._told = last
         self._timer = self._loop.call_later(DRIVEN_BEAT_S if last.driven else BEAT_S, self._beat)
 
-    def _keep(self) -> None:
-        """Deposit what a successor needs if this process dies."""
+    def _keep(self, *, first: bool = False) -> None:
+        """Deposit what a successor needs if this process dies. first: also that there is nothing."""
         self._kept_at, parcel = self._loop.time(), _Listed()
-        given = self.keep(parcel) if self._device is not None else None
+        data, missing, why = self._exported(parcel)
         known = {told: (number, at) for number, _, all_told in self._links.values() for at, told in enumerate(all_told)}
         kept = Kept()
-        if given is not None and all(descriptor in known for descriptor in parcel.descriptors):
-            data = _encode(given)
-            if len(data) <= KEPT_BYTES:
-                kept = Kept(data, tuple(known[descriptor] for descriptor in parcel.descriptors))
-        if kept != self._kept and self._post.send(kept):
-            self._kept = kept
+        sockets = tuple(known[descriptor] for descriptor in parcel.descriptors if descriptor in known)
+        if data and sockets and len(sockets) == len(parcel):
+            if (data, sockets) == (self._deposited, self._kept.sockets):
+                return
+            kept = Kept(sockets, self._memory.deposit(data), len(data))
+        if (first or kept != self._kept) and self._post.send(kept):
+            self._kept, self._deposited = kept, data
+            if kept.sockets:
+                self._memory.told(kept.area)
+        self._tell_missing(missing, why, logging.INFO if data else logging.WARNING)
+
+    def _exported(self, parcel: Parcel) -> tuple[bytes, str, str]:
+        """Describe what a successor needs, b"" for nothing; say what is missing, and why.
+
+        What a protocol raises here ends no beat.
+        """
+        budget = Budget(VALUE_BYTES)
+        try:
+            given = self.keep(parcel, budget) if self._device is not None else None
+            data = _encode(given) if given is not None else b""
+        except Exception as error:
+            return b"", _LOST, describe(error)
+        if len(data) > DEPOSIT_BYTES:
+            return b"", _LOST, f"its state has {len(data)} bytes, more than {DEPOSIT_BYTES}"
+        names = sorted(budget.left_out)
+        missing = f"after a crash the next process would begin without {', '.join(names)}" if names else ""
+        sizes = ", ".join(str(budget.left_out[name]) for name in names)
+        return data, missing, f"{sizes} bytes, more than {VALUE_BYTES}"
+
+    def _tell_missing(self, what: str, why: str, level: int) -> None:
+        now, (told, at) = self._loop.time(), self._missing_told
+        if what and what != told and now >= at + TELL_S:
+            self._missing_told = (what, now)
+            log.log(level, "%s: %s", what, why)
+
+    def _next_number(self) -> int:
+        """Choose the number of a new link: one that was not given lately, with a slot of its own."""
+        taken = {slot_of(number) for number, _, _ in self._links.values()}
+        after = (self._numbers % _NUMBERS + step for step in range(1, SLOTS + 1))
+        return next(number for number in after if slot_of(number) not in taken)
 
     def _share(self) -> None:
-        descriptor = os.memfd_create("zbridge")
-        os.ftruncate(descriptor, PAGE_BYTES)
-        self._page = mmap.mmap(descriptor, PAGE_BYTES)
-        self._post.send(Shared(), [descriptor])
-        os.close(descriptor)
+        self._memory = MemoryWriter()
+        self._post.send(Shared(), [self._memory.descriptor])
+        self._memory.sent()
 
     def _show(self, link: Link) -> None:
         """Give the sockets of a link that were not given yet: that of datagrams is opened later."""

@@ -14,6 +14,7 @@ import socket
 import stat
 from collections.abc import Sequence
 
+from zbridge.app.supervisor.memory import SLOTS
 from zbridge.app.supervisor.post import close_all
 from zbridge.app.supervisor.state import LinkState
 from zbridge.robot.observer import Boundary, LastStop
@@ -26,8 +27,6 @@ PERIOD_S = 0.12
 """Seconds between two stops."""
 LEAVE_S = 0.5
 """Longest time for which a connection is read empty before it is closed."""
-LINKS = 16
-"""Most links of one process."""
 _READS, _READ_BYTES = 32, 65_536
 """How much is read away at a time."""
 
@@ -149,10 +148,18 @@ class Duplicates:
 
     def opened(self, link: int, name: str, descriptors: Sequence[int], *, drives: bool) -> None:
         """Keep the descriptors of a link; too many links, and what is no socket or line, are closed at once."""
-        if len(self._links) >= LINKS or not descriptors or not all(map(_is_link, descriptors)):
+        if len(self._links) >= SLOTS or not descriptors or not all(map(_is_link, descriptors)):
             close_all(descriptors)
             return
         self._links.setdefault(link, Duplicate(name, drives=drives)).take(descriptors)
+
+    def name(self, link: int) -> str | None:
+        """Give the name of a link; None where there is none of this number."""
+        return self._links[link].name if link in self._links else None
+
+    def named(self, name: str) -> int | None:
+        """Give the number of the newest link of this name."""
+        return next((link for link, each in reversed(self._links.items()) if each.name == name), None)
 
     def descriptor(self, link: int, at: int) -> int | None:
         """Give a descriptor of a link: 0 its stream's, 1 that of datagrams; None where there is none, or half a frame

@@ -36,11 +36,21 @@ _NAME_BYTES = 15
 
 
 class Birth(msgspec.Struct, frozen=True):
-    """What a forked gateway begins with: the request, and its descriptors. take_over: -1: nobody to take over from."""
+    """What a forked gateway begins with: the request, and its descriptors. content: of its file, in memory.
+
+    take_over: -1: nobody to take over from.
+    """
 
     request: Fork
     post: int
+    content: int
     take_over: int = -1
+
+    def read(self) -> bytes:
+        """Read the content of the file, and close its descriptor."""
+        with os.fdopen(self.content, "rb") as file:
+            file.seek(0)
+            return file.read()
 
 
 Run = Callable[[Birth], int]
@@ -64,7 +74,7 @@ def serve(control: Post, run: Run) -> None:
         if received is None:
             return
         request, descriptors = received
-        if isinstance(request, Fork) and descriptors:
+        if isinstance(request, Fork) and len(descriptors) > 1:
             control.send(_forked(control, request, descriptors, run))
         close_all(descriptors)
 
@@ -90,11 +100,12 @@ def _forked(control: Post, request: Fork, descriptors: list[int], run: Run) -> F
     """Fork twice; answer with the process id of the second."""
     if (count := threads()) != 1:
         return Forked(0, f"the fork server has {count} threads")
-    told, telling = os.pipe()
+    pipe: tuple[int, ...] = ()
     try:
+        told, telling = pipe = os.pipe()
         middle = os.fork()
     except OSError as error:
-        close_all([told, telling])
+        close_all(pipe)
         return Forked(0, f"fork: {error.strerror}")
     if not middle:
         _be_middle(telling, request, descriptors, run)
@@ -126,8 +137,7 @@ def _be_gateway(request: Fork, descriptors: list[int], run: Run) -> NoReturn:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         _close_others({0, 1, 2, *descriptors})
         Path("/proc/self/comm").write_bytes(f"zb {request.robot}".encode()[:_NAME_BYTES])
-        post, take_over = (*descriptors, -1)[:2]
-        code = run(Birth(request, post, take_over))
+        code = run(Birth(request, *descriptors[:3]))
         sys.stdout.flush()
         sys.stderr.flush()
     except BaseException:

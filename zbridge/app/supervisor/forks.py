@@ -11,7 +11,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from zbridge.app.supervisor.installation import HOME, Stamp
@@ -32,6 +33,8 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THRE
 """What numpy's libraries must be told, before they are loaded, to start no threads."""
 SIGNALS = (signal.SIGHUP, signal.SIGUSR2, signal.SIGTERM, signal.SIGINT)
 """What a supervisor is told by signals."""
+THREADS = 64
+"""Most threads of a supervisor that wait at a time: for files, and for successors of gateways that died together."""
 NOT_INHERITED = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 
 
@@ -211,21 +214,28 @@ class Forks:
         self._leaving = [_Adopted(pid) for pid in leaving]
 
     async def fork(
-        self, request: Fork, post: socket.socket, take_over: int | None = None, *, at_once: bool = False
+        self,
+        request: Fork,
+        post: socket.socket,
+        content: bytes,
+        take_over: int | None = None,
+        *,
+        at_once: bool = False,
     ) -> int:
         """Fork a gateway and return its process id; raise NotReady with the reason.
 
-        post: the gateway's end. take_over: descriptor of the socket by which it takes over. at_once: do not look
-        whether the installation has changed.
+        post: the gateway's end. content: of its file. take_over: descriptor of the socket by which it takes over.
+        at_once: do not look whether the installation has changed.
         """
-        descriptors = [post.fileno()] if take_over is None else [post.fileno(), take_over]
         loop = asyncio.get_running_loop()
-        async with self._turn:
-            looks = not at_once and loop.time() >= self._looked_at + LOOK_S
-            if looks or self._server is None or not self._server.alive:
-                await self._renew()
-            assert self._server is not None
-            return await self._server.fork(request, descriptors)
+        with _in_memory(content) as file:
+            descriptors = [post.fileno(), file] if take_over is None else [post.fileno(), file, take_over]
+            async with self._turn:
+                looks = not at_once and loop.time() >= self._looked_at + LOOK_S
+                if looks or self._server is None or not self._server.alive:
+                    await self._renew()
+                assert self._server is not None
+                return await self._server.fork(request, descriptors)
 
     async def renew(self) -> None:
         """Start the fork server, or another one if the installation has changed; raise NotReady if there is none.
@@ -238,7 +248,7 @@ class Forks:
     async def _renew(self) -> None:
         self._looked_at = asyncio.get_running_loop().time()
         self._leaving = [each for each in self._leaving if not each.ended]
-        old, stamp = self._server, await asyncio.to_thread(_look)
+        old, stamp = self._server, await asyncio.to_thread(Stamp)
         if old is not None and old.alive:
             if stamp == old.stamp:
                 self._refused = None
@@ -266,10 +276,27 @@ class Forks:
                 each.kill()
 
 
-def _look() -> Stamp:
-    """Look at the installation, in a thread that takes no signals of the process: they would be lost at its exec."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    return Stamp()
+@contextlib.contextmanager
+def _in_memory(content: bytes) -> Iterator[int]:
+    """Write the content of a file to memory; give its descriptor. Raise NotReady where that is not possible."""
+    try:
+        descriptor = os.memfd_create("zbridge file")
+        try:
+            os.pwrite(descriptor, content, 0)  # memory takes all of it, or nothing
+        except OSError:
+            os.close(descriptor)
+            raise
+    except OSError as error:
+        raise NotReady(f"no memory for a file: {error.strerror or error}") from error
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def quiet_threads() -> ThreadPoolExecutor:
+    """Make threads that take no signals of the process: they would be lost at its exec. Many may wait at a time."""
+    return ThreadPoolExecutor(THREADS, "zbridge", lambda: signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS))
 
 
 async def _started(command: Sequence[str], stamp: Stamp) -> _Server:

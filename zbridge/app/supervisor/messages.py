@@ -9,9 +9,6 @@ import msgspec
 
 from zbridge.robot.observer import Boundary, LastStop
 
-PAGE_BYTES = 256
-"""Size of the shared page, a byte for each link."""
-
 
 class Beat(msgspec.Struct, frozen=True, tag="beat"):
     """The event loop of a gateway turns. streams: where the streams of its links stand, by the links' numbers.
@@ -42,20 +39,20 @@ class Closed(msgspec.Struct, frozen=True, tag="closed"):
 
 
 class Shared(msgspec.Struct, frozen=True, tag="shared"):
-    """A page of memory that both processes see; its descriptor comes along. Byte n is 1 while link n is between frames.
-
-    The byte is 0 from before a read until its bytes are handled: then a successor could not go on reading.
-    """
+    """The memory that both processes see (:mod:`zbridge.app.supervisor.memory`); its descriptor comes along."""
 
 
 class Kept(msgspec.Struct, frozen=True, tag="kept"):
-    """What a successor needs to go on if this process dies (:class:`Given` of the handover), as MessagePack.
+    """A deposit was written to the shared memory: what a successor needs if this process dies, as MessagePack
+    (:class:`Given` of the handover).
 
-    sockets: the numbers of the links and of their descriptors, in the order of the parcel. Empty: nobody could go on.
+    sockets: the numbers of the links and of their descriptors, in the order of the parcel. area, size: where it is in
+    the memory. Without sockets nobody could resume.
     """
 
-    given: bytes = b""
     sockets: tuple[tuple[int, int], ...] = ()
+    area: int = -1
+    size: int = 0
 
 
 class WantSuccessor(msgspec.Struct, frozen=True, tag="successor"):
@@ -63,7 +60,10 @@ class WantSuccessor(msgspec.Struct, frozen=True, tag="successor"):
 
 
 class Succeeded(msgspec.Struct, frozen=True, tag="succeeded"):
-    """The successor has taken over; this process ends by itself."""
+    """From now on the successor has the robot, whatever happens to it; this process ends by itself.
+
+    Told before the successor hears of it. A process that dies before it has told this has not handed over.
+    """
 
 
 FromGateway = Beat | Opened | Closed | Shared | Kept | WantSuccessor | Succeeded
@@ -76,7 +76,9 @@ class Started(msgspec.Struct, frozen=True, tag="started"):
 
 
 class Fork(msgspec.Struct, frozen=True, tag="fork"):
-    """Fork a gateway: its end of the post comes along, then the socket from which it takes over, if it does."""
+    """Fork a gateway. Descriptors come along: its end of the post, the content of its file, and the socket from which
+    it takes over, if it does.
+    """
 
     file: str
     robot: str

@@ -69,12 +69,12 @@ class Post:
         cannot be read; its descriptors are closed.
         """
         try:
-            # socket.recv_fds ignores its flags in Python 3.11.
-            data, sent, _, _ = self._socket.recvmsg(
-                MESSAGE_BYTES, socket.CMSG_LEN(DESCRIPTORS * _DESCRIPTOR.itemsize), socket.MSG_CMSG_CLOEXEC
-            )
-        except ConnectionError:
-            return None
+            data, sent = self._receive()
+        except ConnectionResetError:  # it ended with a message of ours unread: what it told before follows
+            try:
+                data, sent = self._receive()
+            except ConnectionError:
+                return None
         if not data:
             return None
         descriptors = _descriptors(sent)
@@ -83,6 +83,13 @@ class Post:
         except msgspec.MsgspecError as error:
             close_all(descriptors)
             raise ValueError(str(error)) from error
+
+    def _receive(self) -> tuple[bytes, list[tuple[int, int, bytes]]]:
+        # socket.recv_fds ignores its flags in Python 3.11.
+        data, sent, _, _ = self._socket.recvmsg(
+            MESSAGE_BYTES, socket.CMSG_LEN(DESCRIPTORS * _DESCRIPTOR.itemsize), socket.MSG_CMSG_CLOEXEC
+        )
+        return data, sent
 
     def close(self) -> None:
         """Close this end; idempotent."""

@@ -5,33 +5,29 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import mmap
 import os
 import signal
 import socket
 import time
 from collections.abc import Callable
 
-import msgspec
-
-from zbridge.app.handover.messages import Given
-from zbridge.app.supervisor.duplicates import Duplicates
+from zbridge.app.supervisor.deposit import Deposit
+from zbridge.app.supervisor.files import RobotFile
 from zbridge.app.supervisor.heart import Heart
 from zbridge.app.supervisor.messages import (
-    PAGE_BYTES,
     Beat,
     Closed,
     FromGateway,
     Kept,
     Opened,
     Shared,
+    Started,
     Succeeded,
     WantSuccessor,
 )
 from zbridge.app.supervisor.post import Post, close_all
 from zbridge.app.supervisor.state import ProcessState
 from zbridge.robot.observer import LastStop
-from zbridge.transport import Parcel
 
 log = logging.getLogger("zbridge.app.supervisor")
 
@@ -39,41 +35,40 @@ KILLED_S = 0.05
 """Longest wait for the end of a process that was killed, before its robot is stopped."""
 _MESSAGES = 64
 """Most messages that are taken from one process before others have their turn."""
+_DRAINED = 64
+"""The same, times :data:`_MESSAGES`, of a process that has ended: more than its socket holds."""
 
 
 class GatewayProcess:
-    """A forked gateway, a child of this process. Holds duplicates of its sockets until :meth:`close`.
+    """A forked gateway, a child of this process. Holds what it deposited until :meth:`close`.
 
-    wants_successor: called with this process and the far end of the socket from which the successor takes over; the
-    callee closes it. changed: called when the state of the robot is another one.
+    file: as the process runs by it. wants_successor: called with this process and the far end of the socket from which
+    the successor takes over; the callee closes it. changed: called when the state of the robot is another one.
     """
 
     def __init__(
         self,
         pid: int,
         post: Post,
+        file: RobotFile,
         *,
         wants_successor: Callable[[GatewayProcess, socket.socket], object],
         changed: Callable[[], object] = lambda: None,
     ) -> None:
         self.pid = pid
         self.post = post
-        self.duplicates = Duplicates()
-        self.last = LastStop()
-        """What the process deposited last."""
+        self.file = file
+        self.deposit = Deposit()
         self.hands_over = False
         self.succeeded = False
-        """Whether a successor has taken over."""
+        """Whether a successor has the robot."""
         self.told_to_end = False
         self.heart = Heart(time.monotonic())
         self.over: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         """Done when the process has ended; its wait status."""
-        self.kept = Kept()
-        """What a successor needs if the process dies."""
-        self._page: mmap.mmap | None = None
-        self._page_descriptor: int | None = None
         self._killed: str | None = None
-        self._hung = asyncio.Event()
+        self._left = asyncio.Event()
+        """Set when the process has hung, or handed over."""
         self._began = time.monotonic()
         self._wants_successor = wants_successor
         self._changed = changed
@@ -84,13 +79,15 @@ class GatewayProcess:
         return f"<GatewayProcess {self.pid} {self.last.state}>"
 
     async def ended(self) -> str | None:
-        """Wait for the end of the process; how it ended, None: in order."""
-        hung = asyncio.ensure_future(self._hung.wait())
-        await asyncio.wait((self.over, hung), return_when=asyncio.FIRST_COMPLETED)
-        hung.cancel()
-        if not self.over.done():
+        """Wait until the process has ended, or handed over; how it ended, None: in order."""
+        left = asyncio.ensure_future(self._left.wait())
+        await asyncio.wait((self.over, left), return_when=asyncio.FIRST_COMPLETED)
+        left.cancel()
+        if not self.over.done() and not self.succeeded:
             await self.gone(KILLED_S)
-        self.hear()
+        for _ in range(_DRAINED):  # all that it told before it died counts
+            if not self.hear():
+                break
         return self._killed or self.how
 
     @property
@@ -125,7 +122,7 @@ class GatewayProcess:
         """End the process now: it counts as one that crashed."""
         self._killed = self._killed or why
         self.signal(signal.SIGKILL)
-        self._hung.set()
+        self._left.set()
 
     def signal(self, number: int) -> None:
         """Send it a signal, unless it has ended."""
@@ -133,107 +130,102 @@ class GatewayProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
-    def hear(self) -> None:
-        """Take what the process told."""
+    def hear(self) -> bool:
+        """Take what the process told, some messages at a time; whether there may be more."""
         for _ in range(_MESSAGES):
             try:
                 received = self.post.receive()
             except BlockingIOError:
-                return
+                return False
             except ValueError as error:
                 log.error("process %d: not understood: %s", self.pid, error)
                 continue
             except OSError:  # closed
-                return
+                return False
             if received is None:
                 self._loop.remove_reader(self.post.fileno())
-                return
+                return False
             message, descriptors = received
             self._take(message, descriptors)  # type: ignore[arg-type]
+        return True
 
     def _take(self, message: FromGateway, descriptors: list[int]) -> None:
         match message:
+            case _ if self.succeeded:  # what it does at its end is its successor's no more
+                pass
             case Beat():
-                state, self.last, self.hands_over = self.last.state, message.last, message.hands_over
+                state, self.deposit.last, self.hands_over = self.last.state, message.last, message.hands_over
                 self.heart.beat(time.monotonic(), driven=message.last.driven)
-                self.duplicates.stands(message.streams)
+                self.deposit.duplicates.stands(message.streams)
                 if message.last.state != state or self.heart.beats == 1:
                     self._changed()
             case Opened():
-                self.duplicates.opened(message.link, message.name, descriptors, drives=message.drives)
+                self.deposit.duplicates.opened(message.link, message.name, descriptors, drives=message.drives)
                 return
             case Closed():
-                self.duplicates.closed(message.link)
+                self.deposit.closed(message.link)
             case Kept():
-                self.kept = message
-            case Shared() if descriptors and self._page is None:
-                self._share(descriptors.pop(0))
+                self.deposit.keep(message)
+            case Shared() if descriptors and self.deposit.memory is None:
+                self.deposit.share(descriptors.pop(0))
             case WantSuccessor() if descriptors:
                 self._wants_successor(self, socket.socket(fileno=descriptors.pop(0)))
+            case WantSuccessor():
+                self.post.send(Started("the supervisor has no free descriptor"))
             case Succeeded():
                 self.succeeded = True
-                self.duplicates.close()
+                self._left.set()
         close_all(descriptors)
 
-    def _share(self, descriptor: int) -> None:
-        try:
-            self._page = mmap.mmap(descriptor, PAGE_BYTES, prot=mmap.PROT_READ)
-        except (OSError, ValueError):
-            os.close(descriptor)
-            return
-        self._page_descriptor = descriptor
+    @property
+    def last(self) -> LastStop:
+        """What the process told last of its robot's stop, motion and state."""
+        return self.deposit.last
 
     @property
     def is_over(self) -> bool:
         """Whether the process has ended, is being ended, or has handed over."""
-        return self.over.done() or self._hung.is_set() or self.told_to_end or self.succeeded
+        return self.over.done() or self._left.is_set() or self.told_to_end
 
     @property
     def state(self) -> ProcessState:
-        """What the code that takes the supervisor's place needs to go on, while the process is not over."""
+        """What the code that takes the supervisor's place needs to go on, while the process is not over.
+
+        To be read while the deposit is the process's own.
+        """
+        deposit = self.deposit
         return ProcessState(
             self.pid,
             self.post.fileno(),
             self._began,
             self.heart.state,
-            self.last,
-            self._page_descriptor,
+            deposit.last,
+            deposit.memory.descriptor if deposit.memory is not None else None,
             self.hands_over,
-            self.kept,
-            self.duplicates.state,
+            deposit.kept,
+            deposit.duplicates.state,
         )
 
     def resume(self, state: ProcessState) -> None:
         """Go on with a process as the code before this one knew it."""
-        self._began, self.heart, self.last = state.began, Heart.of(state.heart), state.last
-        self.hands_over, self.kept = state.hands_over, state.kept
-        self.duplicates.resume(state.links)
+        deposit = self.deposit
+        self._began, self.heart, deposit.last = state.began, Heart.of(state.heart), state.last
+        self.hands_over, deposit.kept = state.hands_over, state.kept
+        deposit.duplicates.resume(state.links)
         if state.page is not None:
-            self._share(state.page)
+            deposit.share(state.page)
 
-    def inheritance(self) -> tuple[Given, Parcel] | None:
-        """Give what a successor of this dead process can take over; None where it would read or write half a frame."""
-        links = {link for link, _ in self.kept.sockets}
-        if not links or self._page is None or not all(self._page[link] for link in links):
-            return None
-        descriptors = [self.duplicates.descriptor(link, at) for link, at in self.kept.sockets]
-        if None in descriptors:
-            return None
-        try:
-            given = msgspec.msgpack.decode(self.kept.given, type=Given)
-        except msgspec.MsgspecError:
-            return None
-        return given, Parcel([os.dup(number) for number in descriptors if number is not None])
+    def hand_on(self, successor: GatewayProcess) -> None:
+        """Give a successor what this process deposited: it counts until the successor has made its own deposit."""
+        deposit, self.deposit = self.deposit, Deposit()
+        if successor.deposit.kept is None:
+            successor.deposit.given = deposit
+        else:  # it was quicker than the news
+            deposit.close()
 
     def close(self) -> None:
-        """Close the post and all duplicates; idempotent."""
+        """Close the post and what was deposited; idempotent."""
         if self.post.fileno() >= 0:
             self._loop.remove_reader(self.post.fileno())
             self.post.close()
-        self.duplicates.close()
-        if self._page is not None:
-            self._page.close()
-            self._page = None
-        if self._page_descriptor is not None:
-            os.close(self._page_descriptor)
-            self._page_descriptor = None
+        self.deposit.close()

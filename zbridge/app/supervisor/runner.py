@@ -2,9 +2,26 @@
 
 Theory of operation. :meth:`Runner.run` holds one process after the other. A process ends by itself (it crashed), since
 it was told to (the supervisor ends, or its file changed), or as no beat came: then it is killed. Whatever the cause, if
-it did not end in order its robot is sent the stop that the process deposited last, over the duplicate of its socket,
-and the next process starts after a time that :class:`BackOff` gives. A process that handed over is not started again:
-its successor is the process from then on.
+it did not end in order its robot is sent the stop that the process deposited last, over the duplicate of its socket.
+
+**A crash.** The stop is written before anything else. Then a process is forked that takes over what the dead one
+deposited, and so keeps the robot's connection; it may read and write when the stop was written often enough. Where that
+is not possible, or the third in a row has crashed, the connection is closed, and the next process starts after a time
+that :class:`BackOff` gives.
+
+**A restart.** The process asks for a successor, and hands everything over to it. It says so
+(:class:`~zbridge.app.supervisor.messages.Succeeded`) before it tells the successor. That message decides:
+
+=========================  =========================================================================================
+who dies, when             what happens
+=========================  =========================================================================================
+the successor, before it   the process goes on as before
+the process, before it     the successor is killed: it has touched nothing. Then as after a crash
+either, after it           the successor is the robot's process. Until it makes a deposit, that of the process before
+                           it counts: if the successor dies, it crashed, and the robot is stopped
+=========================  =========================================================================================
+
+A process runs by the content of its file that was checked, never by what the file may hold meanwhile.
 """
 
 from __future__ import annotations
@@ -17,46 +34,66 @@ import socket
 import time
 from collections.abc import Callable
 
+import msgspec
+
 from zbridge.app.supervisor.back_off import HEALTHY_S, BackOff
 from zbridge.app.supervisor.duplicates import PERIOD_S, TIMES
-from zbridge.app.supervisor.files import RobotFile, read
+from zbridge.app.supervisor.files import RobotFile
 from zbridge.app.supervisor.forks import Forks
-from zbridge.app.supervisor.inheritance import bequeath
-from zbridge.app.supervisor.messages import Fork, Started
+from zbridge.app.supervisor.launch import Launcher
 from zbridge.app.supervisor.post import Post
 from zbridge.app.supervisor.process import KILLED_S, GatewayProcess
 from zbridge.app.supervisor.state import RunnerState
+from zbridge.app.supervisor.succession import GONE_S, Succession
+from zbridge.app.tasks import Background
+from zbridge.app.toml import FILE_BYTES
 from zbridge.errors import HandoverError, NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
 
-END_S = 5.0
-"""Seconds that a process is given to end in order, with its robot's stop."""
-GONE_S = 2.0
-"""Longest wait for the end of a process that was killed, before another one has its connections."""
-ASK_S = 5.0
-"""Longest wait until a process that was told to hand over asks for its successor."""
+END_S, ASK_S = 5.0, 5.0
+"""Seconds that a process is given to end in order, with its robot's stop, and to ask for its successor."""
 HAND_OVER_S = 40.0
 """Seconds that a process is given to hand over to a successor."""
+KEPT_CRASHES = 3
+"""Crashes in a row over which a connection is kept: what was deposited may be what kills each of them."""
+OFFERS = 2
+"""How often what a dead process left is offered to another successor, if one does not take it over."""
 
 
 class Runner:
-    """Keeps one robot's gateway running. changed: called when :attr:`process` or its state is another one."""
+    """Keeps one robot's gateway running. changed: called when :attr:`process` or its state is another one.
 
-    def __init__(self, file: RobotFile, forks: Forks, *, verbose: bool, changed: Callable[[], object]) -> None:
+    most_bytes: of the robot's file.
+    """
+
+    def __init__(
+        self,
+        file: RobotFile,
+        forks: Forks,
+        *,
+        verbose: bool,
+        changed: Callable[[], object],
+        most_bytes: int = FILE_BYTES,
+    ) -> None:
         self.file = file
         self.process: GatewayProcess | None = None
         self.restarts = 0
-        self._forks = forks
-        self._verbose = verbose
+        self._launcher = Launcher(forks, self._process, verbose=verbose)
         self._changed = changed
+        self._most_bytes = most_bytes
         self._back_off = BackOff()
-        self._successor: GatewayProcess | None = None
-        self._succession: asyncio.Task[None] | None = None
+        self._former: set[GatewayProcess] = set()
+        """Those that have handed over or crashed, until they have ended."""
+        self._tasks = Background()
         self._asked = asyncio.Event()
         """Set when the process asks for a successor."""
         self._settled = asyncio.Event()
         """Set when a successor has taken over, or has not."""
+        self._succession = Succession(file.robot, self._launcher, self._settled)
+        self._attended = asyncio.Event()
+        """Cleared while the robot of a process that died is stopped."""
+        self._attended.set()
         self._ending = False
         self._now = asyncio.Event()
         """Set to start the next process without waiting."""
@@ -71,8 +108,8 @@ class Runner:
 
     @property
     def processes(self) -> tuple[GatewayProcess, ...]:
-        """The process, and its successor while it hands over."""
-        return tuple(each for each in (self.process, self._successor) if each is not None)
+        """The process, its successor while it hands over, and all others that have not ended."""
+        return (*(() if self.process is None else (self.process,)), *self._succession.processes, *self._former)
 
     @property
     def state(self) -> str:
@@ -82,29 +119,33 @@ class Runner:
     @property
     def is_calm(self) -> bool:
         """Whether nothing is under way but a process that runs, or the wait for the next: :attr:`state` is all then."""
-        succeeding = self._successor is not None or not (self._succession is None or self._succession.done())
         process = self.process
-        over = process.is_over if process is not None else self._now.is_set()
-        return self._waits and not (self._ending or self._restarting or succeeding or over)
+        under_way = self._succession.processes or self._former or self._tasks or self._restarting or self._ending
+        if process is None:
+            return self._waits and not under_way and not self._now.is_set()
+        return self._waits and not under_way and not process.is_over and process.deposit.given is None
 
     @property
     def kept(self) -> RunnerState:
         """What :meth:`resume` needs, of a calm runner."""
+        file = self.file
         return RunnerState(
-            str(self.file.path),
-            self.file.content,
-            self.file.identity,
+            str(file.path),
+            file.content,
+            file.identity,
             self.restarts,
             self._back_off.failures,
             self._next_at,
             self.process.state if self.process is not None else None,
+            tuple(file.forms),
+            file.shares,
         )
 
     def resume(self, state: RunnerState) -> None:
         """Go on where the code before this one was; then call :meth:`run`."""
         self.restarts, self._back_off.failures, self._next_at = state.restarts, state.failures, state.next_at
         if state.process is not None:
-            self.process = self._process(state.process.pid, Post.inherited(state.process.post))
+            self.process = self._process(state.process.pid, Post.inherited(state.process.post), self.file)
             self.process.resume(state.process)
 
     async def run(self) -> None:
@@ -114,7 +155,7 @@ class Runner:
         while not self._ending:
             began = time.monotonic() - (self.process.lived_s if self.process is not None else 0.0)
             try:
-                self.process = self.process or await self._start()
+                self.process = self.process or await self._launcher.start(self.file)
             except NotReady as error:
                 log.error("%s: no process: %s", self.file.robot, error)
             else:
@@ -127,7 +168,7 @@ class Runner:
         """End the process in order, within :data:`END_S`; it is not started again."""
         self._ending = True
         self._now.set()
-        await asyncio.gather(*(self._end(process) for process in self.processes))
+        await asyncio.gather(self._attended.wait(), *(self._end(process) for process in self.processes))
 
     async def restart(self, file: RobotFile) -> None:
         """Run by a changed file from now on: hand over where the process can, else end it and start another one."""
@@ -150,85 +191,96 @@ class Runner:
 
     # One process
 
-    async def _start(self, take_over: int | None = None, *, at_once: bool = False) -> GatewayProcess:
-        """Fork a process; ``at_once``: without a look at the installation."""
-        post, far = Post.pair()
-        request = Fork(str(self.file.path), self.file.robot, self._verbose)
-        try:
-            with far:
-                pid = await self._forks.fork(request, far, take_over, at_once=at_once)
-        except NotReady:
-            post.close()
-            raise
-        log.info("%s: process %d", self.file.robot, pid)
-        process = self._process(pid, post)
+    def _process(self, pid: int, post: Post, file: RobotFile) -> GatewayProcess:
+        process = GatewayProcess(pid, post, file, wants_successor=self._succeed, changed=self._changed)
         if self._ending:
             process.signal(signal.SIGTERM)
         return process
 
-    def _process(self, pid: int, post: Post) -> GatewayProcess:
-        return GatewayProcess(pid, post, wants_successor=self._succeed, changed=self._changed)
-
     async def _keep(self) -> None:
-        """Wait for the end of the process, and of its successors; stop the robot if it was no orderly one."""
+        """Wait for the end of the process, and of those that follow it; stop the robot if it was no orderly one."""
         while (process := self.process) is not None:
             self._waits = True
             how = await process.ended()
             self._waits = False
-            successor, self._successor = self._successor, None
-            self.process = successor
-            self._settled.set()
-            if process.succeeded or (process.told_to_end and not len(process.duplicates)):
-                how = None
-            if how is not None:
-                log.error("%s: process %d %s", self.file.robot, process.pid, how)
-                await process.duplicates.stop(process.last, 1)  # before anything that may take time
-                stopped = asyncio.ensure_future(self._stop_again(process))
-                if successor is None and not self._ending and not process.told_to_end:
-                    self.process = await self._inherited(process, stopped)
-                await stopped
-                if self.process is None:
-                    await process.duplicates.leave()
+            if process.succeeded:
+                if self._handed_on(process):
+                    continue
+                how = "handed over to nobody"
+            self.process = None
+            self._former.add(process)  # it may still have to be waited for
+            if not (how is None or (process.told_to_end and not process.deposit.has_links)):
+                self.process = await self._crashed(process, how)
+            await self._succession.give_up()
+            self._former.discard(process)
             process.close()
-            if self.process is not None and successor is None:
-                self.restarts += 1
-            elif successor is not None:  # one that has not taken over ends by itself
-                log.info("%s: process %d serves it now", self.file.robot, successor.pid)
+            self.restarts += self.process is not None
+            self._settled.set()
+
+    async def _crashed(self, process: GatewayProcess, how: str) -> GatewayProcess | None:
+        """Stop the robot of a process that died; give the process that has its connections, None where none has."""
+        self._attended.clear()
+        log.error("%s: process %d %s", self.file.robot, process.pid, how)
+        await process.deposit.stop(1)  # before anything that may take time
+        stopped = asyncio.ensure_future(self._stop_again(process))
+        await self._succession.give_up()
+        successor = None
+        if not self._ending and not process.told_to_end and process.deposit.has_links:
+            successor = await self._inherited(process, stopped)
+        await stopped
+        if successor is None:
+            await process.deposit.leave()
+        elif successor.file.content != self.file.content:  # the file changed while the process died
+            self._tasks.run(self.restart(self.file))
+        self._attended.set()
+        return successor
 
     async def _inherited(self, process: GatewayProcess, stopped: asyncio.Future[None]) -> GatewayProcess | None:
         """Start a successor of a dead process that keeps its connections; None where that is not possible."""
-        if not await process.gone(GONE_S):  # it may still be within a read
-            return None
-        left = process.inheritance() if self._back_off.failures == 0 or process.lived_s >= HEALTHY_S else None
-        if left is None:
-            return None
-        self._back_off.failed(process.lived_s)
-        near, far = socket.socketpair()
-        try:
-            with far:
-                successor = await self._start(far.fileno(), at_once=True)
-        except NotReady as error:
-            log.error("%s: its connections are lost: %s", self.file.robot, error)
-            near.close()
-            left[1].close()
-            return None
-        self._successor = successor
-        try:
-            await bequeath(near, *left, stopped)
-        except HandoverError as error:
-            log.error("%s: its connections are lost: %s", self.file.robot, error)
-            await self._end(successor)
-            successor.close()
-            return None
-        finally:
-            self._successor = None
-        log.info("%s: process %d goes on with its connections", self.file.robot, successor.pid)
-        return successor
+        reason = ""
+        if not await process.gone(GONE_S):
+            reason = "it may still be within a read"
+        elif self._back_off.failures >= KEPT_CRASHES and process.lived_s < HEALTHY_S:
+            reason = f"{KEPT_CRASHES} processes that took it over have crashed"
+        for _ in range(0 if reason else OFFERS):
+            if self._ending:
+                return None
+            try:
+                successor = await self._succession.offer(process, self.file.path, stopped)
+            except (HandoverError, NotReady, OSError) as error:
+                reason = str(error)
+            else:
+                self._back_off.failed(process.lived_s)
+                log.info("%s: process %d goes on with its connections", self.file.robot, successor.pid)
+                return successor
+        log.error("%s: its connections are lost: %s", self.file.robot, reason)
+        return None
+
+    def _handed_on(self, process: GatewayProcess) -> bool:
+        """Let the successor be the robot's process; False where there is none."""
+        successor = self._succession.take()
+        self._settled.set()
+        if successor is None:
+            process.signal(signal.SIGKILL)
+            return False
+        process.hand_on(successor)
+        self.process = successor
+        self.file = msgspec.structs.replace(successor.file, path=self.file.path)  # it may have been renamed meanwhile
+        log.info("%s: process %d serves it now", self.file.robot, successor.pid)
+        self._former.add(process)
+        self._tasks.run(self._see_off(process))
+        return True
+
+    async def _see_off(self, process: GatewayProcess) -> None:
+        """Wait for the end of a process that has handed over."""
+        await self._gone(process)
+        process.close()
+        self._former.discard(process)
 
     async def _stop_again(self, process: GatewayProcess) -> None:
         """Write the stop that the process deposited last some times more."""
         await asyncio.sleep(PERIOD_S)
-        took = await process.duplicates.stop(process.last, TIMES - 1)
+        took = await process.deposit.stop(TIMES - 1)
         if took is not None:
             moved = "it was driven" if process.last.driven else "it was not driven"
             what = "the robot was sent its stop" if took else "the robot's link takes no stop"
@@ -237,6 +289,10 @@ class Runner:
     async def _end(self, process: GatewayProcess) -> None:
         process.told_to_end = True
         process.signal(signal.SIGTERM)
+        await self._gone(process)
+
+    async def _gone(self, process: GatewayProcess) -> None:
+        """Wait for the end of a process that ends by itself."""
         if not await process.gone(END_S):
             log.error("%s: process %d did not end within %g s", self.file.robot, process.pid, END_S)
             process.kill(f"did not end within {END_S:g} s")
@@ -280,34 +336,8 @@ class Runner:
     def _succeed(self, process: GatewayProcess, far_end: socket.socket) -> None:
         """Start the successor of a process; ``far_end``: the socket from which it takes over."""
         self._asked.set()
-        self._succession = asyncio.ensure_future(self._start_successor(process, far_end))
 
-    async def _start_successor(self, process: GatewayProcess, far_end: socket.socket) -> None:
-        reason = None
-        with far_end:
-            if self._successor is not None or process is not self.process or self._ending:
-                reason = "another process takes over already, or this one ends"
-            elif (fault := read(self.file.path).fault) is not None:
-                reason = fault
-            else:
-                try:
-                    self._successor = successor = await self._start(far_end.fileno())
-                    self._watch(successor)
-                except NotReady as error:
-                    reason = str(error)
-        if reason is not None:
-            log.error("%s: no successor: %s", self.file.robot, reason)
-            self._settled.set()
-        process.post.send(Started(reason))
+        def alone() -> bool:
+            return process is self.process and self._succession.successor is None and not self._ending
 
-    def _watch(self, successor: GatewayProcess) -> None:
-        """Forget a successor that ends before it has taken over."""
-
-        def ended(_: object) -> None:
-            self._settled.set()
-            if self._successor is successor:
-                self._successor = None
-                log.error("%s: process %d has not taken over: %s", self.file.robot, successor.pid, successor.how)
-                successor.close()
-
-        successor.over.add_done_callback(ended)
+        self._tasks.run(self._succession.begin(process, far_end, self.file.path, self._most_bytes, alone))

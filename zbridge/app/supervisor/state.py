@@ -12,6 +12,7 @@ import msgspec
 
 from zbridge.app.supervisor.heart import HeartState
 from zbridge.app.supervisor.messages import Kept
+from zbridge.app.toml import FILE_BYTES
 from zbridge.errors import HandoverError
 from zbridge.robot.observer import Boundary, LastStop
 
@@ -33,7 +34,7 @@ class LinkState(msgspec.Struct, frozen=True):
 
 
 class ProcessState(msgspec.Struct, frozen=True):
-    """A running gateway process. post and page: descriptors. began: when it was forked."""
+    """A running gateway process. post, page: descriptors, page that of the shared memory. began: when it was forked."""
 
     pid: int
     post: int
@@ -42,7 +43,7 @@ class ProcessState(msgspec.Struct, frozen=True):
     last: LastStop
     page: int | None = None
     hands_over: bool = False
-    kept: Kept = Kept()
+    kept: Kept | None = None
     links: tuple[LinkState, ...] = ()
 
     @property
@@ -53,7 +54,10 @@ class ProcessState(msgspec.Struct, frozen=True):
 
 
 class RunnerState(msgspec.Struct, frozen=True):
-    """One robot: the file as it runs, and its process. next_at: when the next one starts, if none runs."""
+    """One robot: the file as it runs, and its process. next_at: when the next one starts, if none runs.
+
+    forms, shares: of the robot's addresses.
+    """
 
     path: str
     content: bytes
@@ -62,6 +66,8 @@ class RunnerState(msgspec.Struct, frozen=True):
     failures: int = 0
     next_at: float | None = None
     process: ProcessState | None = None
+    forms: tuple[str, ...] = ()
+    shares: bool = False
 
 
 class ServerState(msgspec.Struct, frozen=True):
@@ -82,6 +88,7 @@ class SupervisorState(msgspec.Struct, frozen=True):
     watch: bool = False
     verbose: bool = False
     stagger_s: float = 0.0
+    file_bytes: int = FILE_BYTES
     is_ready: bool = False
     runners: tuple[RunnerState, ...] = ()
     server: ServerState | None = None

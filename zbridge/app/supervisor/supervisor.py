@@ -19,19 +19,19 @@ import random
 import signal
 import time
 from collections import Counter
-from collections.abc import Coroutine, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from zbridge.app.host import HostSettings
 from zbridge.app.supervisor.files import Changes, Follower, RobotFile, compare, first_look
-from zbridge.app.supervisor.forks import Forks
+from zbridge.app.supervisor.forks import Forks, quiet_threads
 from zbridge.app.supervisor.installation import Stamp
 from zbridge.app.supervisor.notify import Systemd
 from zbridge.app.supervisor.process import GatewayProcess
 from zbridge.app.supervisor.replacement import release_signals, replace
 from zbridge.app.supervisor.runner import Runner
 from zbridge.app.supervisor.state import VERSION, SupervisorState
+from zbridge.app.tasks import Background
 from zbridge.errors import ConfigError, HandoverError, NotReady
 
 log = logging.getLogger("zbridge.app.supervisor")
@@ -83,12 +83,12 @@ class Supervisor:
         self._forced = False
         """Set to replace this code though the installation is the same."""
         self._faults = {Path(path): fault for path, fault in resumed.faults.items()} if resumed is not None else {}
-        self._follower = Follower(sources, self._faults)
+        self._follower = Follower(sources, self._faults, host.file_bytes)
         self._systemd = Systemd()
         self._runners: dict[Path, Runner] = {}
         self._leaving: set[Runner] = set()
         """Those whose file is gone, until their process has ended."""
-        self._running: set[asyncio.Task[None]] = set()
+        self._running = Background()
         self._timer: asyncio.TimerHandle | None = None
         self._look_at = math.inf
         """When the hearts are looked at next."""
@@ -105,8 +105,11 @@ class Supervisor:
 
         Raise ConfigError where two files name one robot, or no file is sound.
         """
-        files = first_look(self._sources) if self._resumed is None else []
         loop = asyncio.get_running_loop()
+        loop.set_default_executor(quiet_threads())
+        files: list[RobotFile] = []
+        if self._resumed is None:
+            files = await asyncio.to_thread(first_look, self._sources, self._host.file_bytes)
         _become_reaper()
         loop.add_signal_handler(signal.SIGCHLD, self._reap)
         loop.add_signal_handler(signal.SIGHUP, self._reload.set)
@@ -118,7 +121,7 @@ class Supervisor:
                 await self._start_forks()
             self._code = self._forks.stamp
             for task in (self._follow(), self._live()):
-                self._run(task)
+                self._running.run(task)
             self._look_at_hearts()
             await self._apply(compare({}, files), first=True)
             self._all_started = True
@@ -141,23 +144,11 @@ class Supervisor:
         self._ends = True
         self._systemd.tell("STOPPING=1", f"STATUS=ending {len(self._runners)} gateways")
         await asyncio.gather(*(runner.end() for runner in (*self._runners.values(), *self._leaving)))
-        for task in self._running:
-            task.cancel()
-        await asyncio.gather(*self._running, return_exceptions=True)
+        await self._running.cancel()
         for timer in (self._timer, self._told):
             if timer is not None:
                 timer.cancel()
         self._forks.close()
-
-    def _run(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.ensure_future(work)
-        self._running.add(task)
-        task.add_done_callback(self._done)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._running.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            log.error("%s", error, exc_info=error)
 
     # Files
 
@@ -174,7 +165,7 @@ class Supervisor:
             try:
                 if asked or self._watch:
                     running = {path: runner.file for path, runner in self._runners.items()}
-                    await self._apply(self._follower.look(running, twice=not asked))
+                    await self._apply(await asyncio.to_thread(self._follower.look, running, twice=not asked))
                 await self._forks.renew()
             except (ConfigError, NotReady) as error:
                 log.error("%s", error)
@@ -193,10 +184,10 @@ class Supervisor:
             self._faults[file.path] = str(file.fault)
         for path in changes.gone:
             log.info("%s: is gone: its robot's gateway ends", path)
-            self._run(self._leave(self._runners.pop(path)))
+            self._running.run(self._leave(self._runners.pop(path)))
         for file in changes.changed:
             log.info("%s: has changed", file.path)
-            self._run(self._runners[file.path].restart(file))
+            self._running.run(self._runners[file.path].restart(file))
         for path in [*changes.gone, *(file.path for file in (*changes.came, *changes.changed))]:
             self._faults.pop(path, None)
         for number, file in enumerate(changes.came):
@@ -205,7 +196,7 @@ class Supervisor:
             if not first:
                 log.info("%s: is new", file.path)
             self._runners[file.path] = runner = self._runner(file)
-            self._run(runner.run())
+            self._running.run(runner.run())
         self._state_changed()
 
     async def _leave(self, runner: Runner) -> None:
@@ -247,11 +238,12 @@ class Supervisor:
             watch=self._watch,
             verbose=self._verbose,
             stagger_s=self._host.stagger_s,
+            file_bytes=self._host.file_bytes,
             is_ready=self._is_ready,
             runners=tuple(runner.kept for runner in runners),
             server=server,
             leaving=leaving,
-            faults={str(path): fault for path, fault in self._faults.items()},
+            faults={str(path): fault for path, fault in self._faults.items() if str(path).isprintable()},
         )
 
     def _resume(self, state: SupervisorState) -> None:
@@ -261,10 +253,11 @@ class Supervisor:
         self._forks.resume(state.server, state.leaving)
         self._is_ready, self._look_at = state.is_ready, state.look_at
         for each in state.runners:
-            file = RobotFile(Path(each.path), each.content, each.identity)
+            forms = frozenset(each.forms)
+            file = RobotFile(Path(each.path), each.content, each.identity, forms=forms, shares=each.shares)
             self._runners[file.path] = runner = self._runner(file)
             runner.resume(each)
-            self._run(runner.run())
+            self._running.run(runner.run())
         release_signals()
         taken_ms = (time.monotonic() - state.at) * 1000
         log.info("the installed code has taken over in %.0f ms: %s", taken_ms, self.status)
@@ -272,7 +265,8 @@ class Supervisor:
     # Processes
 
     def _runner(self, file: RobotFile) -> Runner:
-        return Runner(file, self._forks, verbose=self._verbose, changed=self._state_changed)
+        most_bytes = self._host.file_bytes
+        return Runner(file, self._forks, verbose=self._verbose, changed=self._state_changed, most_bytes=most_bytes)
 
     def _processes(self) -> Iterator[GatewayProcess]:
         for runner in (*self._runners.values(), *self._leaving):

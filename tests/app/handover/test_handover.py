@@ -1,0 +1,196 @@
+"""A gateway and its successor, both played but for the steps between them: who has the robot whatever fails when."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import AsyncIterator
+
+import pytest
+
+from zbridge.app.handover.channel import Channel
+from zbridge.app.handover.incoming import Incoming
+from zbridge.app.handover.messages import VERSION, Given, Go, Hello, Up
+from zbridge.app.handover.outgoing import Outgoing
+from zbridge.errors import HandoverError, NotReady
+from zbridge.protocol.kept import Exported
+from zbridge.transport import Parcel
+
+SOON_S = 10.0
+
+
+class PlayedPart:
+    """What is handed over: notes each step."""
+
+    def __init__(self, steps: list[str]) -> None:
+        self._steps = steps
+
+    async def prepare(self, reason: str, within_s: float) -> None:
+        self._steps.append("prepare")
+
+    async def shut(self) -> None:
+        pass
+
+    def hold(self) -> None:
+        self._steps.append("hold")
+
+    def hand_over(self, parcel: Parcel) -> Exported:
+        return {}
+
+    async def go_on(self) -> None:
+        self._steps.append("go on")
+
+    def withdraw(self) -> None:
+        self._steps.append("withdraw")
+
+    async def release(self) -> None:
+        self._steps.append("release")
+
+
+class PlayedSuccessor:
+    """Starts a process that sleeps; the test plays what it says. looks_after: whether there is a supervisor."""
+
+    def __init__(self, steps: list[str], *, looks_after: bool) -> None:
+        self.process = subprocess.Popen(["sleep", "3600"])
+        self.channel: Channel
+        self.unheard = False
+        """Set when the supervisor hears nothing."""
+        self._steps, self._looks_after = steps, looks_after
+
+    async def start_successor(self, far_end: socket.socket) -> None:
+        self.channel = Channel(socket.socket(fileno=os.dup(far_end.fileno())))
+
+    def handed_over(self) -> bool:
+        if self.unheard:
+            raise HandoverError("the supervisor does not listen")
+        self._steps.append("handed over")
+        return self._looks_after
+
+    async def comes_up(self) -> None:
+        await self.channel.send(Hello(VERSION, self.process.pid))
+        await self.channel.receive(Given, SOON_S)
+        await self.channel.send(Up())
+
+    def dies(self) -> None:
+        self.process.kill()
+        self.channel.close()
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.channel.close()
+
+
+class Scene:
+    def __init__(self, *, looks_after: bool) -> None:
+        self.steps: list[str] = []
+        self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
+        describe = lambda parcel: Given(VERSION, {}, 0)  # noqa: E731
+        self.outgoing = Outgoing(self.successor, [PlayedPart(self.steps)], describe, self._drain)
+        self.drained = asyncio.Event()
+        self.drained.set()
+
+    async def _drain(self) -> None:
+        await self.drained.wait()
+
+    async def up(self) -> asyncio.Task[int]:
+        """Hand over until the successor is up; give the task, which waits to say *go*."""
+        self.drained.clear()
+        running = asyncio.ensure_future(self.outgoing.run())
+        while not hasattr(self.successor, "channel"):  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        await self.successor.comes_up()
+        while "withdraw" not in self.steps:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        return running
+
+
+@pytest.fixture(params=[True, False])
+async def scene(request: pytest.FixtureRequest) -> AsyncIterator[Scene]:
+    made = Scene(looks_after=request.param)
+    yield made
+    made.successor.close()
+
+
+supervised = pytest.mark.parametrize("scene", [True], indirect=True)
+alone = pytest.mark.parametrize("scene", [False], indirect=True)
+
+
+async def test_the_supervisor_is_told_before_the_successor_hears_go(scene: Scene) -> None:
+    running = await scene.up()
+    with pytest.raises(HandoverError, match="says nothing"):
+        await scene.successor.channel.receive(Go, 0.01)
+    assert "handed over" not in scene.steps
+    scene.drained.set()
+    await scene.successor.channel.receive(Go, SOON_S)
+    assert await running == scene.successor.process.pid
+    assert scene.steps == ["prepare", "hold", "withdraw", "handed over", "release"]
+
+
+@supervised
+async def test_from_go_on_nothing_leads_back_where_a_supervisor_looks_after_the_robot(scene: Scene) -> None:
+    running = await scene.up()
+    scene.successor.dies()
+    scene.drained.set()
+    await running
+    assert scene.steps == ["prepare", "hold", "withdraw", "handed over", "release"], "the successor has crashed"
+
+
+@alone
+async def test_a_successor_that_cannot_be_told_to_go_leaves_everything_where_nobody_else_looks_after_it(
+    scene: Scene,
+) -> None:
+    running = await scene.up()
+    scene.successor.dies()
+    scene.drained.set()
+    with pytest.raises(NotReady, match="the other side has ended"):
+        await running
+    assert scene.steps[-1] == "go on"
+
+
+@supervised
+async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) -> None:
+    running = await scene.up()
+    scene.successor.unheard = True
+    scene.drained.set()
+    with pytest.raises(NotReady, match="does not listen"):
+        await running
+    assert scene.steps[-1] == "go on"
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+
+
+async def test_without_a_free_descriptor_a_restart_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise OSError(24, "Too many open files")
+
+    with socket.socket() as end:
+        await scene.successor.start_successor(end)
+    monkeypatch.setattr(socket, "socketpair", fail)
+    with pytest.raises(NotReady, match=r"not restarted: .*Too many open files"):
+        await scene.outgoing.run()
+    assert scene.steps == []
+
+
+@pytest.mark.parametrize("supervised", [True, False])
+async def test_a_gateway_that_dies_before_go_leaves_the_robot_to_its_successor_or_to_the_supervisor(
+    supervised: bool,
+) -> None:
+    near, far = socket.socketpair()
+    before, incoming = Channel(near), Incoming(far, {}, supervised=supervised)
+    receiving = asyncio.ensure_future(incoming.receive())
+    await before.receive(Hello, SOON_S)
+    await before.send(Given(VERSION, {}, 0))
+    await receiving
+    finishing = asyncio.ensure_future(incoming.finish())
+    await before.receive(Up, SOON_S)
+    before.close()
+    if supervised:
+        with pytest.raises(HandoverError, match="the supervisor looks after its robot"):
+            await finishing
+    else:
+        await finishing
+    assert incoming.begun.is_set() is not supervised
+    incoming.fail("the test ends")

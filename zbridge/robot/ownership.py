@@ -1,8 +1,8 @@
 """Ownership: one gateway per robot. A second gateway finds the first one's claim, waits until it goes, and says so.
 
-A claim is an answered query: for how long its gateway has served the robot, and whether it *has* the robot, that is,
-whether it ever reached it since. The bus tells whose claim an answer is (the replier), never a payload. The liveliness
-token beside the claim shows sooner that there may be another gateway; without a claim behind it, it means nothing.
+A claim is an answered query (:class:`Claim`). The bus tells whose claim an answer is (the replier), never a payload.
+The liveliness token beside the claim shows sooner that there may be another gateway; without a claim behind it, it
+means nothing.
 
 Theory of operation. The machine is :attr:`Ownership.TABLE`, ``{state: {input: (action, next state)}}``;
 ``docs/control.md`` shows the same table, and a test compares both. The gateway awaits :meth:`Ownership.take`, then
@@ -11,10 +11,17 @@ runs :meth:`Ownership.watch` beside its device, and calls :meth:`Ownership.relea
 LOOKING: other gateways are looked for. One look that finds none is enough at the start; :data:`LOOKS` in a row after a
 gateway was seen or the bus was gone. CLAIMING: the own claim is announced, and other claims are asked for once they
 must have come. Two gateways that start at the same moment both find none; of their claims the one of the lower session
-id is better. OWNING: the robot is served and was never reached. It is left to a better claim: of a gateway that has
-the robot, or has served it longer, or has the lower id. KEEPING: the robot was reached. It is left to nobody, whatever
-others answer; they are reported. So after two gateways were cut off from each other the one that has the robot keeps
-it, and where both have it both report it.
+id is better. OWNING: the robot is served. After a network that was cut has healed, two may own one robot: the better
+claim goes on owning it, and the other leaves the robot alone. YIELDED: to a better claim, but with a connection to the
+robot that must not be closed, for many robots accept nobody once a connection has ended. The gateway looks on until no
+claim is better, and owns the robot again.
+
+Which claim is better is told by each gateway for itself, of its own claim as it was when it asked, and of the answers.
+So a gateway that asks seems a little younger than it is: two never both think themselves better. Both may think the
+other one better where their ages are nearly the same; of two that have yielded the lower id goes on.
+
+A gateway asks for claims every :data:`WATCH_S`; every :data:`CLOSE_S` while there may be another one that nobody said
+goodbye to. Who is asked by another gateway that serves the robot asks too.
 """
 
 from __future__ import annotations
@@ -25,14 +32,15 @@ import logging
 import math
 import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import StrEnum
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import msgspec
 
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.errors import BusError
+from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.kept import Exported
 
@@ -50,6 +58,12 @@ ASK_S = 1.0
 """Longest wait for the claims of others."""
 WATCH_S = 5.0
 """Seconds between two looks for others while the robot is served."""
+CLOSE_S = 0.5
+"""The same while there may be another gateway that serves the robot; the least time between two looks."""
+YOUNG_S = 60.0
+"""Seconds for which a gateway that found nobody at its start looks closely: it may have started beside a cut."""
+SPREAD_S = 1.0
+"""All gateways of a router find their bus at once, and look each at another moment of so many seconds."""
 RIVALS = 16
 """Claims of others that are considered at a time: the best."""
 MOST_S = 10 * 365 * 86_400.0
@@ -59,22 +73,84 @@ CLAIM = "@rpc/claim/gateway"
 """The path at which a gateway answers with its claim."""
 
 
-class _Served(msgspec.Struct):
-    """A claim. held_s: seconds since the robot is served, 0 while it is not. has: whether it was reached since."""
+class Standing(msgspec.Struct, frozen=True):
+    """How a gateway stands with its robot.
+
+    healthy: the robot is established, not in doubt, and was heard of a moment ago. connected_s: age of the connection,
+    0 where there is none. latches: the robot's latched stops.
+    """
+
+    healthy: bool = False
+    connected_s: float = 0.0
+    latches: tuple[Latch, ...] = ()
+
+
+class Claim(msgspec.Struct, frozen=True):
+    """What a gateway claims. held_s: seconds since the robot is served, 0 while it is not.
+
+    healthy, connected_s, latches: its :class:`Standing`. yielded: to a better claim. leaving: it ends in good order.
+    """
 
     held_s: float = 0.0
-    has: bool = False
+    healthy: bool = False
+    connected_s: float = 0.0
+    yielded: bool = False
+    leaving: bool = False
+    latches: tuple[Latch, ...] = ()
 
     @property
     def plausible(self) -> bool:
-        return math.isfinite(self.held_s) and 0 <= self.held_s <= MOST_S and (self.held_s > 0 or not self.has)
+        """Whether a gateway can claim this."""
+        return all(math.isfinite(age_s) and 0 <= age_s <= MOST_S for age_s in (self.held_s, self.connected_s)) and (
+            self.held_s > 0 or self == Claim()
+        )
 
-    def better_than(self, other: _Served, zid: str, other_zid: str) -> bool:
-        return (self.has, self.held_s, other_zid) > (other.has, other.held_s, zid)
+    def better_than(self, other: Claim, zid: str, other_zid: str) -> bool:
+        """Tell whether this claim, of the session ``zid``, is better than another one's."""
+        first, second = (each.rank for each in (self, other))
+        if first != second:
+            return first > second
+        if self.yielded:
+            return zid < other_zid
+        return (self.connected_s, self.held_s, other_zid) > (other.connected_s, other.held_s, zid)
+
+    @property
+    def rank(self) -> tuple[bool, ...]:
+        """What counts before any age; higher is better."""
+        return (self.held_s > 0, not self.leaving, self.healthy, not self.yielded)
 
 
-_read = msgspec.msgpack.Decoder(_Served).decode
+class _Question(msgspec.Struct, frozen=True):
+    """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too."""
+
+    zid: str = ""
+    serves: bool = False
+
+
+_read = msgspec.msgpack.Decoder(Claim).decode
+_read_question = msgspec.msgpack.Decoder(_Question).decode
 _write = msgspec.msgpack.Encoder().encode
+
+
+class Served(Protocol):
+    """What serves a robot, as :meth:`Ownership.watch` sees it."""
+
+    @property
+    def standing(self) -> Standing:
+        """How the gateway stands with the robot now."""
+
+    @property
+    def must_stay(self) -> bool:
+        """Whether there is a connection to the robot that must not be closed."""
+
+    def heard(self, claims: Mapping[str, Claim]) -> None:
+        """Take what other gateways that serve the robot claim, by their session ids; after every look."""
+
+    async def step_aside(self) -> None:
+        """Leave the robot to another gateway, and stay connected."""
+
+    async def step_in(self) -> None:
+        """Serve the robot again."""
 
 
 class State(StrEnum):
@@ -83,7 +159,7 @@ class State(StrEnum):
     LOOKING = "looking"
     CLAIMING = "claiming"
     OWNING = "owning"
-    KEEPING = "keeping"
+    YIELDED = "yielded"
 
 
 class Input(StrEnum):
@@ -94,32 +170,54 @@ class Input(StrEnum):
     LAST_CLEAR = "nobody, last look"
     BEST = "no better claim"
     OUTBID = "a better claim"
-    REACHED = "robot reached"
+    OUTBID_CONNECTED = "a better claim, while connected"
     RELEASE = "release"
 
 
 class Ownership:
-    """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`."""
+    """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`.
 
-    def __init__(self, bus: Bus, keys: KeySpace, clock: Callable[[], float] = time.monotonic) -> None:
+    mirror: is told the latched stops of the gateway that owns the robot while this one does not. chance: 0 to 1.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        mirror: Callable[[tuple[Latch, ...]], object] = lambda latches: None,
+        chance: Callable[[], float] = random.random,
+    ) -> None:
         self._bus = bus
         self._keys = keys
         self._clock = clock
+        self._mirror = mirror
+        self._chance = chance
         self._state = State.LOOKING
         self._looks = 1
         """Looks that must still find nobody."""
-        self._handles: list[Handle] = []
+        self._claimed: list[Handle] = []
+        self._shown: list[Handle] = []
         self._held_since: float | None = None
-        self._has: Callable[[], bool] = lambda: False
+        self._leaving = False
+        self._standing: Callable[[], Standing] = Standing
         self._connected = asyncio.Event()
         self._was_connected = False
         self._came = asyncio.Event()
+        """The bus has come, or come back."""
+        self._asked = asyncio.Event()
+        """Another gateway that serves the robot has asked for claims."""
+        self._close_until = -math.inf
+        """Other gateways are looked for every CLOSE_S until then."""
         self._watch: Handle | None = None
         self.hands_over = False
         """Whether a successor announces the same claim now: it is no rival."""
+        self._waits = False
+        """Whether the gateway before still serves the robot."""
 
     def __repr__(self) -> str:
-        return f"<Ownership {self._keys.robot} {'held' if self._held_since is not None else 'not held'}>"
+        return f"<Ownership {self._keys.robot} {self._state.value}>"
 
     async def take(self) -> None:
         """Wait until no other gateway claims the robot, then own it.
@@ -136,49 +234,76 @@ class Ownership:
                 found = Input.CLEAR if self._looks > 1 else Input.LAST_CLEAR
             if self._handle(found) is State.CLAIMING:
                 await asyncio.sleep(ANNOUNCE_S)
-                found = Input.OUTBID if self._better(await self._claims()) else Input.BEST
+                own = self._claim()
+                found = Input.OUTBID if self._better(own, await self._claims()) else Input.BEST
                 if self._handle(found) is State.OWNING:
+                    self._close_until = others.close_until(self._clock())
                     return
             await asyncio.sleep(LOOK_S)
 
-    async def watch(self, has: Callable[[], bool], tell: Callable[[tuple[str, ...]], object]) -> None:
-        """Look for other gateways that serve the robot; return when the robot must be left to one of them.
-
-        has: whether the robot was ever reached. tell: called after every look with the session ids of the other
-        gateways that serve the robot.
-        """
-        self._has = has
+    async def watch(self, served: Served) -> None:
+        """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
+        self._standing = lambda: served.standing
+        if self._state is State.YIELDED:
+            await served.step_aside()
         while True:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(WATCH_S):
-                    await self._came.wait()
-            self._came.clear()
-            await asyncio.sleep(random.uniform(1.0, 4.0) * LOOK_S)  # all gateways of a router find their bus at once
-            if self.hands_over:
+            await self._next_look()
+            if self.hands_over or self._waits:
                 continue
-            with contextlib.suppress(BusError):
-                serving = {zid: claim for zid, claim in (await self._claims()).items() if claim.held_s}
-                if has():
-                    self._handle(Input.REACHED)
-                if self._better(serving) and self._handle(Input.OUTBID) is State.LOOKING:
-                    log.error("another gateway served %s before this one: leaving it alone", self._keys.robot)
-                    return
-                tell(tuple(serving))
+            own = self._claim()
+            try:
+                claims = await self._claims()
+            except BusError:
+                continue
+            serving = {zid: claim for zid, claim in claims.items() if claim.held_s}
+            if serving:
+                self._close_until = -math.inf if all(claim.leaving for claim in serving.values()) else math.inf
+            served.heard(serving)
+            state, found = self._state, Input.BEST
+            if self._better(own, serving):
+                found = Input.OUTBID_CONNECTED if served.must_stay else Input.OUTBID
+            if self._handle(found) is State.LOOKING:
+                log.error("another gateway serves %s: leaving it alone", self._keys.robot)
+                return
+            if self._state is not state:
+                log.error("%s: %s", self._keys.robot, _TURNS[self._state])
+                await (served.step_in() if self._state is State.OWNING else served.step_aside())
 
     def export(self) -> Exported | None:
         """Write the claim for a successor of this gateway; None where the robot is not owned."""
-        return None if self._held_since is None else {"since": self._held_since, "has": self._has()}
+        if self._held_since is None:
+            return None
+        yielded = self._state is State.YIELDED
+        return {"since": self._held_since, "yielded": yielded, "close_until": self._close_until}
 
     def inherit(self, claim: Exported) -> None:
-        """Own the robot as the gateway before did, without waiting until it goes; called instead of :meth:`take`."""
+        """Own the robot as the gateway before did, once that goes; called instead of :meth:`take`.
+
+        Until :meth:`begin` the claim is a weak one, so that the gateway before may go on if this process fails.
+        """
+        self._waits = True
         self._announce()
-        self._held_since, has = float(claim["since"]), bool(claim["has"])
-        self._has = lambda: has
-        self._state = State.KEEPING if has else State.OWNING
+        self._held_since, self._close_until = float(claim["since"]), float(claim["close_until"])
+        self._state = State.OWNING
+        if claim["yielded"]:
+            self._handle(Input.OUTBID_CONNECTED)
+
+    def begin(self) -> None:
+        """Note that the gateway before has gone."""
+        self._waits = False
+
+    def leave(self) -> None:
+        """Say goodbye: the robot will be left in good order."""
+        self._leaving = True
 
     def release(self) -> None:
         """Withdraw the claim; idempotent."""
         self._handle(Input.RELEASE)
+
+    @property
+    def yielded(self) -> bool:
+        """Whether the robot is left to another gateway, while its connection is kept."""
+        return self._state is State.YIELDED
 
     # The machine
 
@@ -197,20 +322,24 @@ class Ownership:
         self._looks -= 1
 
     def _announce(self) -> None:
-        self._handles = [
-            self._bus.answer(self._keys.key(CLAIM), self._on_question),
-            self._bus.announce(self._keys.alive(_WHO)),
-        ]
+        self._leaving = False
+        self._claimed = [self._bus.answer(self._keys.key(CLAIM), self._on_question)]
+        self._show()
 
     def _own(self) -> None:
         self._held_since = self._clock()
 
-    def _keep(self) -> None:
-        """Do nothing: from now on no claim is better."""
+    def _hide(self) -> None:
+        shown, self._shown = self._shown, []
+        for handle in shown:
+            handle.close()
+
+    def _show(self) -> None:
+        self._shown = [self._bus.announce(self._keys.alive(_WHO))]
 
     def _withdraw(self) -> None:
-        handles, self._handles = self._handles, []
-        self._held_since, self._has, self._looks = None, lambda: False, LOOKS
+        handles, self._claimed, self._shown = self._claimed + self._shown, [], []
+        self._held_since, self._standing, self._looks = None, Standing, LOOKS
         for handle in handles:
             handle.close()
 
@@ -231,21 +360,35 @@ class Ownership:
             self._connected.set()
             self._came.set()
 
+    async def _next_look(self) -> None:
+        """Wait until it is time to look for others."""
+        await asyncio.sleep(CLOSE_S)
+        if self._state is not State.YIELDED and self._clock() >= self._close_until:
+            await _within(WATCH_S - CLOSE_S, self._came, self._asked)
+        if self._came.is_set() and not self._asked.is_set():
+            await _within(self._chance() * SPREAD_S, self._asked)
+        self._came.clear()
+        self._asked.clear()
+
     async def _sees(self, others: _Others) -> bool:
         """Look for a token, and for the claim behind it."""
         token = bool(await self._bus.alive(self._keys.alive(_WHO)))
-        return others.seen(token, bool(token and await self._claims()))
+        claims = await self._claims() if token else {}
+        serving = [claim for claim in claims.values() if claim.held_s]
+        if serving:
+            self._mirror(serving[0].latches)
+        return others.seen(token, bool(claims), leaving=any(claim.leaving for claim in serving))
 
-    def _better(self, claims: dict[str, _Served]) -> bool:
+    def _better(self, own: Claim, claims: Mapping[str, Claim]) -> bool:
         """Return whether any of these claims is better than the own one."""
-        own = self._claim()
         return any(claim.better_than(own, zid, self._bus.zid) for zid, claim in claims.items())
 
-    async def _claims(self) -> dict[str, _Served]:
-        """Ask for the claims of others; return the best by session id. Implausible claims are ignored."""
-        claims: list[tuple[_Served, str]] = []
+    async def _claims(self) -> dict[str, Claim]:
+        """Ask for the claims of others; return the best by session id, the best first. Implausible ones are ignored."""
+        claims: list[tuple[Claim, str]] = []
         heard = {self._bus.zid}
-        for answer in await self._bus.ask(self._keys.key(CLAIM), timeout_s=ASK_S):
+        question = _write(_Question(self._bus.zid, self._held_since is not None))
+        for answer in await self._bus.ask(self._keys.key(CLAIM), question, timeout_s=ASK_S):
             if answer.replier is None or answer.replier in heard:
                 continue
             heard.add(answer.replier)
@@ -253,15 +396,29 @@ class Ownership:
                 claim = _read(answer.payload)
                 if answer.error is None and claim.plausible:
                     claims.append((claim, answer.replier))
-        claims.sort(key=lambda each: (not each[0].has, -each[0].held_s, each[1]))
+        claims.sort(
+            key=lambda each: (*(not good for good in each[0].rank), -each[0].connected_s, -each[0].held_s, each[1])
+        )
         return {zid: claim for claim, zid in claims[:RIVALS]}
 
-    def _claim(self) -> _Served:
+    def _claim(self) -> Claim:
         if self._held_since is None:
-            return _Served()
-        return _Served(max(self._clock() - self._held_since, 1e-3), self._has())
+            return Claim()
+        standing = self._standing()
+        return Claim(
+            held_s=max(self._clock() - self._held_since, 1e-3),
+            healthy=standing.healthy,
+            connected_s=standing.connected_s,
+            yielded=self._state is State.YIELDED or self._waits,
+            leaving=self._leaving,
+            latches=standing.latches,
+        )
 
     def _on_question(self, question: IncomingQuery) -> None:
+        with contextlib.suppress(msgspec.MsgspecError, RecursionError):
+            asker = _read_question(question.payload)
+            if asker.serves and asker.zid != self._bus.zid:
+                self._asked.set()
         question.answer(_write(self._claim()))
 
     TABLE: ClassVar[dict[State, dict[Input, tuple[Callable[[Ownership], None], State]]]] = {
@@ -277,13 +434,31 @@ class Ownership:
         },
         State.OWNING: {
             Input.OUTBID: (_withdraw, State.LOOKING),
-            Input.REACHED: (_keep, State.KEEPING),
+            Input.OUTBID_CONNECTED: (_hide, State.YIELDED),
             Input.RELEASE: (_withdraw, State.LOOKING),
         },
-        State.KEEPING: {
+        State.YIELDED: {
+            Input.BEST: (_show, State.OWNING),
+            Input.OUTBID: (_withdraw, State.LOOKING),
             Input.RELEASE: (_withdraw, State.LOOKING),
         },
     }
+
+
+_TURNS = {
+    State.OWNING: "no other gateway serves it better: serving it again",
+    State.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
+}
+
+
+async def _within(seconds: float, *events: asyncio.Event) -> None:
+    """Wait so long, or until one of these events."""
+    waits = [asyncio.ensure_future(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for wait in waits:
+            wait.cancel()
 
 
 class _Others:
@@ -293,17 +468,23 @@ class _Others:
         self._robot = robot
         self._without_claim = 0
         self._said: set[str] = set()
+        self._close_until: float | None = None
 
-    def seen(self, token: bool, claim: bool) -> bool:
+    def seen(self, token: bool, claim: bool, *, leaving: bool) -> bool:
         """Return whether there is another gateway. A token without a claim, :data:`LOOKS` times in a row, is none."""
         if claim:
             self._without_claim = 0
+            self._close_until = -math.inf if leaving else math.inf
             self._say("another gateway serves %s: waiting until it goes")
             return True
         self._without_claim = self._without_claim + 1 if token else 0
         if self._without_claim == LOOKS:
             self._say("there is a token of a gateway of %s and no gateway that answers: it is ignored")
         return 0 < self._without_claim < LOOKS
+
+    def close_until(self, now: float) -> float:
+        """Return until when others must be looked for closely: one that went without a goodbye may come back."""
+        return now + YOUNG_S if self._close_until is None else self._close_until
 
     def _say(self, text: str) -> None:
         if text not in self._said:

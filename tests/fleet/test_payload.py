@@ -23,6 +23,8 @@ def none(names: str) -> dict[str, None]:
     return dict.fromkeys(names.split())
 
 
+STOP, OTHER_STOP = b"\x04" * 16, b"\x05" * 16
+LATCH = {"id": STOP, "who": "ann", "reason": None, "fleet": True}
 LEASE, TOKEN, PROOF = b"\x01" * 8, b"\x02" * 32, b"\x03" * 16
 OFFLINE = m.Refusal(who=None, command="drive", code="not_ready", reason="offline", count=2)
 OFFLINE_SENT = {"who": None, "command": "drive", "code": "not_ready", "reason": "offline", "count": 2, "by": None}
@@ -62,8 +64,11 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
     ),
     (
         m.Control("stopped", refusals=(OFFLINE,)),
-        {"state": "stopped", "refusals": [OFFLINE_SENT]} | none("holder lease priority expires_in_s"),
+        {"state": "stopped", "refusals": [OFFLINE_SENT], "latches": [], "stops": []}
+        | none("holder lease priority expires_in_s"),
     ),
+    (m.Unlatch(STOP), {"id": STOP}),
+    (m.FleetLatches((m.Latch(STOP, "ann", fleet=True),), (OTHER_STOP,)), {"latches": [LATCH], "released": [OTHER_STOP]}),
     (m.Drive(**DRIVE), {**DRIVE, "turn": 0.0, "light": None}),
     (m.Motor(2.0), {"value": 2.0}),
     (m.Mode("manual"), {"mode": "manual"}),

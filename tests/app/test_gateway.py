@@ -24,6 +24,7 @@ from zbridge.app.joining import RETRY_S, join_bus
 from zbridge.app.tasks import until_signal
 from zbridge.bus import Bus, Handle
 from zbridge.bus.fake import FakeBus
+from zbridge.control.latch_store import LatchStore
 from zbridge.errors import BusError, ConfigError
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq import RobotSubscription
@@ -70,9 +71,9 @@ async def acquired(bus: FakeBus, who: str = "hq") -> dict[str, Any]:
     return lease
 
 
-def claiming(bus: FakeBus, held_s: float) -> Handle:
-    """Play another gateway that has the robot for so long."""
-    payload = msgpack.packb({"held_s": held_s, "has": True})
+def claiming(bus: FakeBus, held_s: float, **more: Any) -> Handle:
+    """Play another gateway that serves the robot for so long."""
+    payload = msgpack.packb({"held_s": held_s, **more})
     return bus.join("beef").answer("fleet/r1/@rpc/claim/gateway", lambda question: question.answer(payload))
 
 
@@ -155,10 +156,9 @@ async def test_an_audit_log_that_cannot_be_written_keeps_the_gateway_from_starti
 
 @jumping
 async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log(monkeypatch, caplog) -> None:
-    monkeypatch.setattr("zbridge.robot.device.Device.reached", True)
     text = "another gateway serves this robot too: beef"
     async with serving(configured(), monkeypatch) as bus:
-        forged = claiming(bus, 3600.0)
+        forged = claiming(bus, 1e-3)
         await asyncio.sleep(20.0)
         assert last(bus, "status")["reason"].endswith(f"; {text}")
         (refused,) = last(bus, "control")["refusals"]
@@ -171,16 +171,38 @@ async def test_another_gateway_is_told_on_status_and_control_and_once_in_the_log
 
 
 @jumping
+async def test_a_gateway_that_has_yielded_is_no_rival_and_must_not_be_ended(monkeypatch, caplog) -> None:
+    text = "a second connection is open; ending that gateway makes the robot deaf"
+    async with serving(configured(), monkeypatch) as bus:
+        claiming(bus, 3600.0, yielded=True, connected_s=3600.0)
+        await asyncio.sleep(20.0)
+        assert last(bus, "status")["reason"].endswith(f"; {text}")
+        assert last(bus, "control")["refusals"] == []
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"r1: {text}"]
+
+
+@jumping
+async def test_latched_stops_of_another_gateway_of_the_robot_come_into_force(monkeypatch) -> None:
+    monkeypatch.setattr(LatchStore, "save", lambda store, latches: None)  # no threads in this loop
+    latch = {"id": b"\x07" * 16, "who": "ann", "reason": "wet floor", "fleet": False}
+    async with serving(configured(), monkeypatch) as bus:
+        claiming(bus, 1e-3, yielded=True, latches=[latch])
+        await asyncio.sleep(7.0)
+        assert last(bus, "control")["state"] == "latched"
+        assert last(bus, "control")["latches"] == [latch]
+
+
+@jumping
 async def test_a_robot_that_was_never_reached_is_left_to_a_gateway_that_has_it(monkeypatch, caplog) -> None:
     async with serving(configured(), monkeypatch) as bus:
-        claiming(bus, 1e-3)
+        claiming(bus, 1e-3, healthy=True, connected_s=1e-3)
         bus.join("beef").announce("fleet/r1/@alive/gateway")
         await asyncio.sleep(10.0)
         shown = len(bus.values("fleet/r1/status"))
         await asyncio.sleep(10.0)
         assert len(bus.values("fleet/r1/status")) == shown, "nothing more is said of the robot"
         assert last(bus, "status")["reason"] == "gateway stopped"
-    assert "another gateway served r1 before this one: leaving it alone" in caplog.text
+    assert "another gateway serves r1: leaving it alone" in caplog.text
 
 
 async def received(number: signal.Signals) -> None:

@@ -130,6 +130,10 @@ class Fleet:
         lease.close()
         assert lease.ask("release", lease.held.question("release")).get("ok")
 
+    def lost(self, robot: str = "r1") -> bool:
+        """Whether the lease of a robot was refused its renewal."""
+        return self._leases[robot].lost
+
     def get_within(self, key: str, timeout_s: float) -> list[Any]:
         """Plain get that may take its time."""
         return ask(self.session, key, timeout_s=timeout_s)

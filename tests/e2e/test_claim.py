@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
+import time
 
+import msgpack
 import pytest
 import zenoh
 
 from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, start, until
+from tests.e2e.relay import Relay
 from tests.e2e.robots import Robot
+from tests.machine import Patience
 from tests.ports import free_port
 from tests.proofs import packed
-from zbridge.robot.ownership import WATCH_S
+from zbridge.app.serving import SECOND_CONNECTION
+from zbridge.robot.ownership import CLOSE_S, WATCH_S
 
 CLAIM = "fleet/r1/@rpc/claim/gateway"
 TOLD = "another gateway serves this robot too: "
-LEFT = "another gateway served r1 before this one: leaving it alone"
+LEFT = "another gateway serves r1: leaving it alone"
+YIELDED = "r1: another gateway serves it: leaving the robot alone, and staying connected"
+AGAIN = "r1: no other gateway serves it better: serving it again"
 LOOK_S = WAIT_S + WATCH_S
 
 
@@ -102,16 +110,70 @@ def test_of_two_that_meet_the_one_that_has_the_robot_keeps_it(bench: Bench, robo
     assert robot.connections == 1
 
 
-def test_where_both_have_the_robot_both_keep_it_and_tell(bench: Bench) -> None:
+def granted(bench: Bench) -> int:
+    """Ask all gateways for the lease; how many grant it? It is given back by not being renewed."""
+    replies = bench.fleet.session.get(
+        "fleet/r1/@rpc/control/takeover/judge",
+        payload=packed({"who": "judge", "lease_s": 0.1}),
+        target=zenoh.QueryTarget.ALL,
+        timeout=1.0,
+    )
+    return sum(bool(reply.ok and msgpack.unpackb(reply.ok.payload.to_bytes())["ok"]) for reply in replies)
+
+
+def test_where_both_have_the_robot_one_leaves_it_alone_and_stays_connected(bench: Bench) -> None:
     port = bench.simulator()
     first, second, joined = apart(bench, port, port)
     with zenoh.open(joined):
-        until(lambda: first.log.count(TOLD) == second.log.count(TOLD) == 1, LOOK_S, what="both tell")
-        reasons = {str(status["reason"]) for status in bench.fleet.seen["fleet/r1/status"]}
-        assert [reason for reason in reasons if TOLD in reason]
+        until(lambda: [YIELDED in each.log for each in (first, second)].count(True) == 1, LOOK_S, what="one yields")
+        until(lambda: bench.fleet.reason() == SECOND_CONNECTION, what="the owner's status")
+        assert granted(bench) == 1
+        bench.fleet.hold(how="takeover")
+        time.sleep(WATCH_S)
+        assert not bench.fleet.lost()
     for gateway in (first, second):
         end(gateway.process)
         assert LEFT not in gateway.log
+
+
+def test_a_standby_that_took_over_during_a_silent_cut_yields_within_2_s_and_steps_in_when_the_owner_goes(
+    bench: Bench,
+) -> None:
+    port = bench.simulator()
+    with contextlib.closing(Relay(int(bench.endpoint.rpartition(":")[2]))) as relay:
+        first = bench.gateway(device(port), name="first", endpoint=f"tcp/127.0.0.1:{relay.port}")
+        until(lambda: bench.fleet.state() == "established", what="established")
+        second = bench.gateway(device(port), name="standby")
+        until(lambda: "waiting until it goes" in second.log, what="a standby")
+        relay.cut()
+        cut_at = time.monotonic()
+        until(lambda: "established" in second.log, what="the standby takes over")
+        while time.monotonic() < cut_at + 8.0:
+            time.sleep(0.1)
+        patience = Patience(2.0)
+        relay.heal()
+        while not (YIELDED in second.log and granted(bench) == 1):
+            assert not patience.over, "exactly one grants leases within 2 s"
+            time.sleep(0.05)
+        assert YIELDED not in first.log, "the older connection is kept"
+        until(lambda: bench.fleet.reason() == SECOND_CONNECTION, what="the owner's status")
+        bench.fleet.hold(how="takeover")
+        for _ in range(30):
+            bench.fleet.put("r1/@cmd/drive", forward=0.1)
+            time.sleep(0.1)
+        assert not bench.fleet.lost()
+        assert "robot: established" in second.log
+        assert "next attempt" not in second.log, "its connection is kept"
+        bench.fleet.put("r1/@cmd/stop", id=b"\x07" * 16, latch=True, who="ann")
+        until(lambda: bench.fleet.last("r1/control").get("state") == "latched", what="latched")
+        time.sleep(2 * CLOSE_S)
+        first.end()
+        until(lambda: AGAIN in second.log, what="it serves the robot again")
+        until(lambda: bench.fleet.reason() == "" and bench.fleet.state() == "established", what="its status")
+        until(lambda: bench.fleet.last("r1/control").get("state") == "latched", what="its latched stop")
+        assert [latch["who"] for latch in bench.fleet.last("r1/control")["latches"]] == ["ann"]
+        assert "next attempt" not in second.log, "its connection is kept"
+        second.end()
 
 
 def test_of_two_that_start_together_one_serves_the_robot(bench: Bench) -> None:

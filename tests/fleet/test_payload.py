@@ -68,7 +68,10 @@ PAYLOADS: list[tuple[m.FleetMessage, dict[str, Any]]] = [
         | none("holder lease priority expires_in_s"),
     ),
     (m.Unlatch(STOP), {"id": STOP}),
-    (m.FleetLatches((m.Latch(STOP, "ann", fleet=True),), (OTHER_STOP,)), {"latches": [LATCH], "released": [OTHER_STOP]}),
+    (
+        m.FleetLatches((m.Latch(STOP, "ann", fleet=True),), (OTHER_STOP,)),
+        {"latches": [LATCH], "released": [OTHER_STOP]},
+    ),
     (m.Drive(**DRIVE), {**DRIVE, "turn": 0.0, "light": None}),
     (m.Motor(2.0), {"value": 2.0}),
     (m.Mode("manual"), {"mode": "manual"}),

@@ -19,7 +19,18 @@ from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
-from zbridge.robot.ownership import ANNOUNCE_S, LOOKS, MOST_S, RIVALS, WATCH_S, YOUNG_S, Claim, Ownership, Standing
+from zbridge.robot.ownership import (
+    ANNOUNCE_S,
+    CLOSE_S,
+    LOOKS,
+    MOST_S,
+    RIVALS,
+    WATCH_S,
+    YOUNG_S,
+    Claim,
+    Ownership,
+    Standing,
+)
 
 pytestmark = pytest.mark.jumping
 
@@ -145,6 +156,7 @@ class Robot:
     connected_at: float | None = 0.0
     latches: tuple[Latch, ...] = ()
     rivals: list[set[str]] = field(default_factory=list)
+    heard_latches: set[Latch] = field(default_factory=set)
     turns: list[str] = field(default_factory=list)
 
     @property
@@ -158,6 +170,7 @@ class Robot:
 
     def heard(self, claims: Mapping[str, Claim]) -> None:
         self.rivals.append(set(claims))
+        self.heard_latches.update(latch for claim in claims.values() for latch in claim.latches)
 
     async def step_aside(self) -> None:
         self.turns.append("aside")
@@ -373,7 +386,7 @@ async def test_who_yielded_serves_again_when_the_other_goes_or_is_worse() -> Non
     assert two.serving == FIRST, "the older connection alone is no reason to change again"
     two.watching[0].cancel()
     two.ownerships[0].release()
-    await asyncio.sleep(1.0)
+    await asyncio.sleep(2.0)
     assert two.serving[1]
     assert two.robots[1].turns == ["aside", "in"]
 
@@ -450,7 +463,7 @@ async def test_whoever_answers_better_claims_silences_a_gateway_for_as_long_as_i
     await asyncio.sleep(2.0)
     assert (robot.turns, await bus.alive(TOKEN)) == (["aside"], [])
     forged.close()
-    await asyncio.sleep(1.0)
+    await asyncio.sleep(2.0)
     assert (robot.turns, await bus.alive(TOKEN), watching.done()) == (["aside", "in"], [TOKEN], False)
 
 
@@ -512,3 +525,59 @@ async def test_the_successor_of_one_that_had_yielded_has_yielded() -> None:
 
 def test_the_table_of_the_documentation_is_the_one_that_is_executed() -> None:
     assert documented("control.md", "found") == executed(Ownership.TABLE)
+
+
+@pytest.mark.parametrize("noticed", [False, True])
+async def test_a_latched_stop_of_the_one_that_leaves_is_heard_by_the_one_that_stays(*, noticed: bool) -> None:
+    latch = Latch(b"\x07" * 16, "ann")
+    for first, second, winner in [
+        (Robot(True, 0.0), Robot(False, None, (latch,)), 0),
+        (Robot(False, None, (latch,)), Robot(True, 0.0), 1),
+        (Robot(True, 0.0), Robot(True, 5.0, (latch,)), 0),
+    ]:
+        two = Two()
+        await two.serve(first, second)
+        await asyncio.sleep(9.0)
+        two.heal(noticed=noticed)
+        await asyncio.sleep(2.0)
+        assert two.serving == [FIRST, SECOND][winner]
+        assert two.robots[winner].heard_latches == {latch}
+        for watching in two.watching:
+            watching.cancel()
+
+
+@pytest.mark.parametrize("goodbye", [False, True])
+async def test_who_has_yielded_serves_again_after_a_goodbye_or_once_three_looks_in_a_row_found_nobody(
+    *, goodbye: bool
+) -> None:
+    two = Two()
+    await two.serve(Robot(True, 0.0), Robot(True, 5.0))
+    await asyncio.sleep(9.0)
+    two.heal(noticed=False)
+    await asyncio.sleep(2.0)
+    assert two.robots[1].turns == ["aside"]
+    if goodbye:
+        two.ownerships[0].leave()
+    else:
+        two.watching[0].cancel()
+        two.ownerships[0].release()
+    await asyncio.sleep(LOOKS * CLOSE_S - 0.6)
+    assert two.robots[1].turns == ["aside", "in"][: 1 + goodbye]
+    await asyncio.sleep(1.0)
+    assert two.robots[1].turns == ["aside", "in"]
+
+
+async def test_who_has_yielded_and_hears_nothing_because_the_bus_is_gone_leaves_the_robot_alone() -> None:
+    two = Two()
+    await two.serve(Robot(True, 0.0), Robot(True, 5.0))
+    await asyncio.sleep(9.0)
+    two.heal(noticed=True)
+    await asyncio.sleep(2.0)
+    two.buses[1].connection(False)
+    two.watching[0].cancel()
+    two.ownerships[0].release()
+    await asyncio.sleep(60.0)
+    assert two.robots[1].turns == ["aside"]
+    two.buses[1].connection(True)
+    await asyncio.sleep(3.0)
+    assert two.robots[1].turns == ["aside", "in"]

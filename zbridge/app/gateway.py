@@ -14,7 +14,7 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Coroutine
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
+from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.bus.tls.files import own_certificate
@@ -34,7 +35,7 @@ from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
-from zbridge.errors import Held, ZbridgeError, describe
+from zbridge.errors import ZbridgeError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Sessions
@@ -56,11 +57,6 @@ log = logging.getLogger("zbridge.app.gateway")
 
 LINGER_S = 0.2
 """Seconds between a handover and the end of the bus session: closing it drops what Zenoh has not yet sent."""
-TELL_S = 60.0
-"""Seconds between two log lines about other gateways that serve the same robot."""
-_NAMED = 3
-"""Other gateways that a log line names."""
-_RIVALS = "rivals"
 
 
 class Neighbourhood(msgspec.Struct, frozen=True):
@@ -109,7 +105,7 @@ class Gateway:
         """The name of this process on the bus, while it does not serve the robot."""
         self._neighbourhood: Neighbourhood | None = None
         self._on_the_bus = False
-        self._device_served: Device | None = None
+        self._serving: Serving | None = None
 
     def __repr__(self) -> str:
         return f"<Gateway {self._plan.config.robot.name}>"
@@ -203,7 +199,7 @@ class Gateway:
         """Give the reasons for which this gateway is of no use now: no bus, or its robot is not established."""
         reasons = [] if self._on_the_bus or self._plan.config.bus.alone_is_normal else ["no bus"]
         if self._plan.device is not None:
-            state = self._device_served.state if self._device_served is not None else "served by another gateway"
+            state = self._serving.state if self._serving is not None else SERVED_ELSEWHERE
             reasons += [f"robot {state}"] * (state != "established")
         return tuple(reasons)
 
@@ -212,8 +208,8 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        ownership, incoming = Ownership(bus, self._keys), self._incoming
         self.restarts.latches = store = LatchStore(self._keys, self.conditions)
+        ownership, incoming = Ownership(bus, self._keys, mirror=store.mirror), self._incoming
         self.restarts.claim = ClaimPart(ownership)
         try:
             bus.gather(self._keys.key("@rpc/**"))
@@ -226,9 +222,10 @@ class Gateway:
 
                     async def begin(incoming: Incoming = incoming, device: Device = device) -> None:
                         await incoming.taken()
+                        ownership.begin()
                         device.restore_latches(store.load())  # one that came last is only in the file
 
-                    await self._serve_shown(bus, ownership, device, begin)
+                    await self._serve(bus, ownership, device, store, begin)
                 elif not incoming.given.listeners:
                     await incoming.finish()
                 await incoming.begun.wait()
@@ -237,23 +234,10 @@ class Gateway:
                 await ownership.take()
                 if shown is not None:
                     shown.close()
-                await self._serve_shown(bus, ownership, self._make_device(bus, audit, plan, store))
+                await self._serve(bus, ownership, self._make_device(bus, audit, plan, store), store)
         finally:
             ownership.release()
             await asyncio.shield(store.flush())
-
-    async def _serve_shown(
-        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None = None
-    ) -> None:
-        """Serve the robot, show the sessions as the gateway's, and answer who asks for a restart."""
-        handles = (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
-        self.restarts.device = device
-        try:
-            await self._serve(bus, ownership, device, begin)
-        finally:
-            self.restarts.device = None
-            for handle in handles:
-                handle.close()
 
     def _show_sessions(self, bus: Bus, who: str) -> Handle:
         """Answer queries for the session table of this process; ``who`` names the process."""
@@ -264,43 +248,23 @@ class Gateway:
         return bus.answer(self._keys.key(topics.RPC_SESSIONS(who).path), answer)
 
     async def _serve(
-        self, bus: Bus, ownership: Ownership, device: Device, begin: Callable[[], Awaitable[None]] | None
+        self, bus: Bus, ownership: Ownership, device: Device, store: LatchStore, begin: Begin | None = None
     ) -> None:
         """Serve the robot, and its camera, until another gateway has to take it."""
-        self._device_served = device
-        work = [device.run(begin), ownership.watch(lambda: device.reached, self._rival_teller(device))]
+        self.restarts.device, camera = device, None
         if self._plan.camera is not None:
             from zbridge.camera.camera import Camera
 
-            work.append(Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run())
-        tasks = [asyncio.ensure_future(each) for each in work]
+            camera = Camera(self._plan.camera, self._keys, bus, self.metrics, self.conditions).run
+
+        def show() -> tuple[Handle, ...]:
+            return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
+
+        self._serving = Serving(self._keys.robot, device, ownership, store, self.conditions, show, camera)
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+            await self._serving.run(begin)
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
-            self._device_served = None
-            self.conditions.set(_RIVALS, None)
-
-    def _rival_teller(self, device: Device) -> Callable[[tuple[str, ...]], None]:
-        """Return what reports other gateways: on ``status`` always, on ``control`` and in the log every TELL_S."""
-        robot, told_at = self._plan.config.robot.name, -math.inf
-
-        def tell(zids: tuple[str, ...]) -> None:
-            nonlocal told_at
-            more = f" and {len(zids) - _NAMED} more" if len(zids) > _NAMED else ""
-            text = f"another gateway serves this robot too: {', '.join(zids[:_NAMED])}{more}"
-            self.conditions.set(_RIVALS, text if zids else None)
-            if zids and time.monotonic() - told_at >= TELL_S:
-                told_at = time.monotonic()
-                log.error("%s: %s", robot, text)
-                for zid in zids[:_NAMED]:
-                    device.refuse("claim", Held("this gateway serves the robot"), zid)
-
-        return tell
+            self.restarts.device = self._serving = None
 
     def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> Device:
         near = self._neighbourhood

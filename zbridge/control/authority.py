@@ -208,6 +208,12 @@ class Authority:
         for latch in self.latches.adopt(answers):
             self._latch(latch)
 
+    def merge(self, latches: Iterable[Latch]) -> None:
+        """Take over the latched stops that another gateway of this robot knows."""
+        for latch in latches:
+            if self.latches.add(latch):
+                self._latch(latch)
+
     def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
         """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""
         if self.latches.release(stop_id, fleet=fleet):

@@ -27,7 +27,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Motor, Raw
+from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Latch, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
@@ -148,6 +148,11 @@ class Enforcer:
     def adopt(self, answers: Iterable[FleetLatches]) -> None:
         """Take over the fleet's latched stops that other gateways know."""
         self.authority.adopt(answers)
+        self.settle()
+
+    def merge(self, latches: Iterable[Latch]) -> None:
+        """Take over the latched stops that another gateway of this robot knows."""
+        self.authority.merge(latches)
         self.settle()
 
     def hold_back(self, reason: str, *, stops: bool) -> None:

@@ -93,6 +93,7 @@ class Outbox(Kept):
         self._turn_of_queue = False
         self._exempt: deque[bytes] = deque()
         self._quiet_until = -math.inf
+        self._muted = False
 
     def __repr__(self) -> str:
         return f"<Outbox {len(self._queue)} waiting, slots {sorted(self._slots)}>"
@@ -107,6 +108,8 @@ class Outbox(Kept):
 
     def put(self, frame: bytes) -> None:
         """Queue a frame that is sent once; raise Refused when ``limit`` frames wait."""
+        if self._muted:
+            return
         if len(self._queue) >= self._limit:
             raise NotReady(f"{self._limit} packets wait for the robot", Code.BUSY)
         self._queue.append(frame)
@@ -114,6 +117,13 @@ class Outbox(Kept):
     def quiet(self, until: float) -> None:
         """Begin a silence: before ``until`` only exempt frames leave."""
         self._quiet_until = until
+
+    def mute(self, muted: bool) -> None:
+        """Drop everything but exempt frames, what waits and what comes, until ``mute(False)``."""
+        self._muted = muted
+        if muted:
+            for place in (self._queue, self._urgent, self._slots):
+                place.clear()
 
     def put_exempt(self, frame: bytes) -> None:
         """Queue a frame that leaves first, and during a silence; raise Refused when ``limit`` of them wait."""
@@ -150,6 +160,8 @@ class Outbox(Kept):
         ``urgent``: queue it before all slots, to leave whole; the slot holds its repetitions, none if ``until`` is not
         after ``now``.
         """
+        if self._muted:
+            return
         old = self._slots.get(slot)
         new = self._slots[slot] = _Group(frames, now, period_s, until, spacing_s)
         if urgent:

@@ -50,6 +50,8 @@ class Robot(Kept, ABC):
     dialect: ClassVar[str | None] = None
     hands_over: ClassVar[bool] = False
     """Whether this class and its sessions name in ``kept`` all that they must not lose when the gateway restarts."""
+    closing_harmless: ClassVar[bool] = False
+    """Whether a robot with two connections obeys the other one as before when one is closed; most deployed do not."""
     link_names: tuple[str, ...]
     """One name for each configured address, in the order of the configuration; the first link drives the robot."""
 

@@ -126,6 +126,7 @@ class Connection:
         """Cleared while another process may get the link: nothing is connected then."""
         self._free.set()
         self._given: tuple[Exported, Parcel] | None = None
+        self._muted = False
         self._wire = WireTap(label)
 
     def __repr__(self) -> str:
@@ -155,6 +156,18 @@ class Connection:
             await self._link.ended()
         self.state, self.reason = "offline", reason
 
+    @property
+    def is_up(self) -> bool:
+        """Whether there is a connection."""
+        return self.conversation is not None and self.conversation.link is not None
+
+    def mute(self, muted: bool) -> None:
+        """Write nothing but what keeps the connection alive, and connect to nobody, until ``mute(False)``."""
+        self._muted = muted
+        if self.conversation is not None:
+            self.conversation.session.outbox.mute(muted)
+        (self._free.clear if muted else self._free.set)()
+
     # A restart
 
     @property
@@ -175,7 +188,8 @@ class Connection:
 
     async def go_on(self) -> None:
         """Go on after :meth:`hold`, or attach what was taken over: from now on this process has the link."""
-        self._free.set()
+        if not self._muted:
+            self._free.set()
         given, self._given = self._given, None
         if self.conversation is None:
             return
@@ -198,7 +212,7 @@ class Connection:
         session.restore(given["session"])
         self.state, self.reason = _STATES[session.state], session.busy or session.reason
         self.conversation = conversation = self._make_conversation(session)
-        conversation.held = True
+        conversation.held, conversation.connected_at = True, given["connected_at"]
         self._given = (given["link"], parcel)
 
     def release(self) -> None:
@@ -240,6 +254,7 @@ class Connection:
     def _make_conversation(self, session: Session[Any]) -> Conversation:
         hooks = self._hooks
         session.name = self.name
+        session.outbox.mute(self._muted)
         self._wire.begin(session)
         return Conversation(
             session,

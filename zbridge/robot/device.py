@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -26,6 +26,7 @@ from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
+from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
@@ -38,6 +39,8 @@ from zbridge.robot.commands import Commands
 from zbridge.robot.connection import Connect, Connection, Hooks, Links
 from zbridge.robot.fleet_latches import FleetLatchNews
 from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
+from zbridge.robot.on_demand import OnDemand
+from zbridge.robot.ownership import Standing
 from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
@@ -46,6 +49,10 @@ from zbridge.transport import Parcel, connect
 from zbridge.transport.fair_share import FairShare
 from zbridge.wire.frames import Partial
 
+HEARD_S = 3.0
+"""A robot of which nothing came for so long is not healthy."""
+ASIDE_S = 1.0
+"""Longest time for the last stop to be written, before the robot is left to another gateway."""
 HEARTBEAT_S = 1.0
 """Seconds between repetitions of ``status`` and ``control``."""
 LEAVE_S = 0.7
@@ -54,6 +61,7 @@ FLUSH_S = 0.2
 """Longest time the bus is given to take the last words."""
 _LEAVING = "gateway stopped"
 _CRASHED = "crashed"
+_ASIDE = "another gateway serves the robot"
 _TAKING_OVER = "another process takes the robot over"
 _LOOK_S = 0.005
 """Seconds between two looks whether the links can be handed over."""
@@ -100,6 +108,9 @@ class Device:
         """Whether the robot was taken over from a process that died."""
         self._commanded: list[Handle] = []
         self._declared: list[Handle] = []
+        self._on_demand: list[OnDemand] = []
+        self._aside = False
+        """Whether another gateway serves the robot, while this one's connection is kept."""
         clock, conditions = clock or loop.time, conditions or Conditions()
         self._share = share
         self._shared_address = shared_address
@@ -120,7 +131,7 @@ class Device:
             raw_ms,
             suspended_s,
         )
-        pending = PendingQueries(loop)
+        self._pending = pending = PendingQueries(loop)
         self._standstill = Standstill(context, authority, idle_stop_s)
         self._enforcer = Enforcer(context, authority, self._standstill, audit, limits, keep_latches)
         self._enforcer.settled = self._observer.changed
@@ -175,7 +186,8 @@ class Device:
             if self._crashed:
                 self._publishers.repeat()
             self._show()
-        self._standstill.begin()
+        if not self._aside:
+            self._standstill.begin()
         self._observer.began(self)
         async with asyncio.TaskGroup() as tasks:
             work = [tasks.create_task(self._beat()), tasks.create_task(self._latch_news.run())]
@@ -193,22 +205,22 @@ class Device:
         self._enforcer.report()
 
     def _declare(self) -> None:
+        bus = self._context.bus
+        bus.on_relief(self._links.resume)
         self._listen()
-        self._declared = [self._context.bus.watch_connected(self._on_bus), *self._telemetry.serve()]
+        self._declared = [bus.watch_connected(self._on_bus)]
 
     def _listen(self) -> None:
-        """Take commands and queries from the bus; idempotent."""
+        """Take commands and queries from the bus, and watch for listeners; idempotent. Not while another one serves."""
+        if self._aside:
+            return
         context = self._context
+        self._on_demand = self._on_demand or self._telemetry.serve()
         self._commanded = self._commanded or [
             *self._leases.serve(),
             context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
             *self._queries.serve(),
         ]
-
-    @property
-    def reached(self) -> bool:
-        """Whether the robot was ever reached."""
-        return self._presence.reached
 
     @property
     def driven(self) -> bool:
@@ -223,7 +235,7 @@ class Device:
     def last_stop(self) -> LastStop:
         """Give what stops the robot now; see :class:`LastStop`."""
         session, driven, state = self._context.robot.driving, self.driven, self.state
-        if session is None or session.state is not State.ESTABLISHED:
+        if self._aside or session is None or session.state is not State.ESTABLISHED:
             return LastStop(driven, state=state)
         try:
             frames = self._context.robot.stop_frames()
@@ -270,8 +282,77 @@ class Device:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self._publishers.expire()
-            self._presence.publish_status()
-            self._enforcer.beat()
+            if not self._aside:
+                self._presence.publish_status()
+                self._enforcer.beat()
+
+    # Another gateway serves the robot too
+
+    @property
+    def standing(self) -> Standing:
+        """How this gateway stands with the robot."""
+        session, talk = self._context.robot.driving, self._links.first.conversation
+        latches = self._enforcer.authority.latches.in_force
+        if talk is None or session is None:
+            return Standing(latches=latches)
+        established = session.state is State.ESTABLISHED and session.doubtful is None
+        healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
+        return Standing(healthy, talk.connected_s, latches)
+
+    @property
+    def must_stay(self) -> bool:
+        """Whether there is a connection that must not be closed while another gateway has one."""
+        return not self._context.robot.closing_harmless and any(connection.is_up for connection in self._links)
+
+    def merge_latches(self, latches: Iterable[Latch]) -> None:
+        """Take over the latched stops that another gateway of this robot knows."""
+        self._enforcer.merge(latches)
+
+    async def step_aside(self) -> None:
+        """Stop the robot once, and leave it to another gateway: only what keeps the connections alive is written.
+
+        Nothing is published, and no command or query taken, until :meth:`step_in`.
+        """
+        if self._aside:  # as the process before this one
+            return
+        self._commands.refuse_all(_ASIDE)
+        self._leases.refuse_all(_ASIDE)
+        self._enforcer.stop(_ASIDE)
+        self._enforcer.beat()
+        self._pending.refuse_all(_ASIDE)
+        self._aside = True
+        self._standstill.close()
+        self.withdraw()
+        self._publishers.mute(True)
+        await self._stop_written()
+        for connection in self._links:
+            connection.mute(True)
+        on_demand, self._on_demand = self._on_demand, []
+        for each in on_demand:
+            each.close(tell=True)
+        self._observer.changed()
+
+    async def step_in(self) -> None:
+        """Serve the robot again, beginning with a stop."""
+        self._aside = False
+        for connection in self._links:
+            connection.mute(False)
+        self._publishers.mute(False)
+        self._listen()
+        self._commands.refuse_all(None)
+        self._leases.refuse_all(None)
+        self._latch_news.returned()
+        self._standstill.begin()
+        self._enforcer.stop("served again")
+        self._show()
+        self._observer.changed()
+
+    async def _stop_written(self) -> None:
+        session, until = self._context.robot.driving, self._context.clock() + ASIDE_S
+        while session is not None and session.outbox.hurried:
+            if self._context.clock() >= until:
+                return
+            await asyncio.sleep(_LOOK_S)
 
     # A restart: another process takes the robot over
 
@@ -311,6 +392,7 @@ class Device:
             "robot": self._context.robot.export(budget),
             "published": self._publishers.export(budget),
             "latches": self._enforcer.authority.latches.export(),
+            "aside": self._aside,
         }
 
     def keep(self, parcel: Parcel, budget: Budget) -> Exported | None:
@@ -334,6 +416,9 @@ class Device:
         self._commands.refuse_all(_TAKING_OVER)
         self._leases.refuse_all(_TAKING_OVER)
         self._crashed = bool(given.get(_CRASHED))
+        self._aside = self._publishers.muted = given["aside"]
+        for connection in self._links:
+            connection.mute(self._aside)
         self._enforcer.authority.restore_latches(given["latches"])
         for link, partial_frame in zip(filter(None, given["links"]), partials, strict=False):
             link["session"][PARTIAL] = list(partial_frame)
@@ -357,8 +442,9 @@ class Device:
     async def go_on(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""
         self._listen()
-        self._commands.refuse_all(None)
-        self._leases.refuse_all(None)
+        reason = _ASIDE if self._aside else None
+        self._commands.refuse_all(reason)
+        self._leases.refuse_all(reason)
         for connection in self._links:
             await connection.go_on()
 
@@ -394,6 +480,6 @@ class Device:
             async with asyncio.timeout(FLUSH_S):
                 await self._context.bus.flush()
         self._context.conditions.changed = lambda: None
-        for handle in (*self._commanded, *self._declared):
+        for handle in (*self._commanded, *self._on_demand, *self._declared):
             handle.close()
         self._publishers.close()

@@ -32,11 +32,13 @@ class OnDemand:
         """Watch for listeners."""
         self._watch = self._bus.watch_listeners(self._key_expr, self._on_any)
 
-    def close(self) -> None:
-        """Declare nothing any more, and tell nobody; idempotent."""
+    def close(self, *, tell: bool = False) -> None:
+        """Declare nothing any more; idempotent. tell: as if the last listener had gone, instead of nobody."""
         watch, self._watch = self._watch, None
         if watch is not None:
             watch.close()
+        if tell:
+            self._tell_gone()
         self._withdraw()
         self._listened.clear()
 
@@ -47,9 +49,12 @@ class OnDemand:
         if anybody:
             self._publishers = {key: self._bus.frames(key, partial(self._on_key, key)) for key in self._keys}
             return
+        self._tell_gone()
+        self._withdraw()
+
+    def _tell_gone(self) -> None:
         for key in sorted(self._listened):
             self._on_key(key, False)
-        self._withdraw()
 
     def _on_key(self, key: str, anybody: bool) -> None:
         publisher = self._publishers.get(key)

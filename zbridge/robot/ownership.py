@@ -208,6 +208,10 @@ class Ownership:
         """The bus has come, or come back."""
         self._asked = asyncio.Event()
         """Another gateway that serves the robot has asked for claims."""
+        self._was_asked = False
+        """Whether another gateway that serves the robot has asked since this one has served it."""
+        self._untold = LOOKS
+        """Looks for which latched stops are kept from being lost with this gateway's claim."""
         self._close_until = -math.inf
         """Other gateways are looked for every CLOSE_S until then."""
         self._watch: Handle | None = None
@@ -227,8 +231,7 @@ class Ownership:
         await self._settle()
         others, self._looks = _Others(self._keys.robot), 1
         while True:
-            bus_gone = self._was_connected and not self._connected.is_set()
-            if bus_gone or await self._sees(others):
+            if self._bus_gone or await self._sees(others):
                 found = Input.SEEN
             else:
                 found = Input.CLEAR if self._looks > 1 else Input.LAST_CLEAR
@@ -246,28 +249,50 @@ class Ownership:
         self._standing = lambda: served.standing
         if self._state is State.YIELDED:
             await served.step_aside()
+        self._untold = LOOKS
         while True:
             await self._next_look()
-            if self.hands_over or self._waits:
-                continue
-            own = self._claim()
-            try:
-                claims = await self._claims()
-            except BusError:
-                continue
-            serving = {zid: claim for zid, claim in claims.items() if claim.held_s}
-            if serving:
-                self._close_until = -math.inf if all(claim.leaving for claim in serving.values()) else math.inf
-            served.heard(serving)
-            state, found = self._state, Input.BEST
-            if self._better(own, serving):
-                found = Input.OUTBID_CONNECTED if served.must_stay else Input.OUTBID
-            if self._handle(found) is State.LOOKING:
+            if not self.hands_over and not self._waits and await self._meet(served) is State.LOOKING:
                 log.error("another gateway serves %s: leaving it alone", self._keys.robot)
                 return
-            if self._state is not state:
-                log.error("%s: %s", self._keys.robot, _TURNS[self._state])
-                await (served.step_in() if self._state is State.OWNING else served.step_aside())
+
+    async def _meet(self, served: Served) -> State:
+        """Compare the own claim with those of others, and follow from it; return the new state."""
+        own, state = self._claim(), self._state
+        try:
+            claims = await self._claims()
+        except BusError:
+            return state
+        serving = {zid: claim for zid, claim in claims.items() if claim.held_s}
+        if serving:
+            goodbye = all(claim.leaving for claim in serving.values())
+            self._close_until, self._looks = (-math.inf, 1) if goodbye else (math.inf, LOOKS)
+        elif state is State.YIELDED and not self._owner_gone():
+            return state
+        found = Input.BEST
+        if self._better(own, serving):
+            found = Input.OUTBID_CONNECTED if served.must_stay else Input.OUTBID
+        if found is Input.OUTBID and self._keeps_latches(own):
+            return state
+        if self._handle(found) is State.LOOKING:
+            return self._state
+        if self._state is not state:
+            log.error("%s: %s", self._keys.robot, _TURNS[self._state])
+            await (served.step_in() if self._state is State.OWNING else served.step_aside())
+        served.heard(serving)
+        return self._state
+
+    def _owner_gone(self) -> bool:
+        """Whether the better gateway is gone: after a goodbye one look without it is enough, else :data:`LOOKS`."""
+        if self._bus_gone:
+            return False
+        self._looks -= 1
+        return self._looks <= 0
+
+    def _keeps_latches(self, own: Claim) -> bool:
+        """Whether the other gateway may not have heard of our latched stops yet; true for so many looks at most."""
+        self._untold -= 1
+        return bool(own.latches) and not self._was_asked and self._untold >= 0
 
     def export(self) -> Exported | None:
         """Write the claim for a successor of this gateway; None where the robot is not owned."""
@@ -322,7 +347,7 @@ class Ownership:
         self._looks -= 1
 
     def _announce(self) -> None:
-        self._leaving = False
+        self._leaving = self._was_asked = False
         self._claimed = [self._bus.answer(self._keys.key(CLAIM), self._on_question)]
         self._show()
 
@@ -351,6 +376,10 @@ class Ownership:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(SETTLE_S):
                 await self._connected.wait()
+
+    @property
+    def _bus_gone(self) -> bool:
+        return self._was_connected and not self._connected.is_set()
 
     def _on_connected(self, up: bool) -> None:
         self._was_connected = self._was_connected or up
@@ -419,6 +448,7 @@ class Ownership:
             asker = _read_question(question.payload)
             if asker.serves and asker.zid != self._bus.zid:
                 self._asked.set()
+                self._was_asked = True
         question.answer(_write(self._claim()))
 
     TABLE: ClassVar[dict[State, dict[Input, tuple[Callable[[Ownership], None], State]]]] = {

@@ -53,11 +53,6 @@ class Presence:
     def __repr__(self) -> str:
         return f"<Presence {self._context.keys.robot} {self._links.first.state}>"
 
-    @property
-    def reached(self) -> bool:
-        """Whether the robot was ever reached."""
-        return self._greeted is not None
-
     def resume(self, session: Session[Any]) -> None:
         """Take a session for greeted: another process established it."""
         self._greeted, self._busy, self._doubtful = session, session.busy, session.doubtful

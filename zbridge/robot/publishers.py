@@ -13,6 +13,23 @@ from zbridge.protocol.kept import Budget
 from zbridge.robot.names import NAMES, NameBudget
 
 
+class _Muted:
+    """Stands for a publisher while nothing is published: remembers the last value of a key that keeps it."""
+
+    def __init__(self, key: str, topic: Topic, last: bytes | None) -> None:
+        self.key = key
+        self.last = last
+        self._keeps_last = topic.qos.keeps_last
+
+    def put(self, payload: bytes, attachment: bytes | None = None) -> bool:
+        if self._keeps_last:
+            self.last = payload
+        return True
+
+    def close(self) -> None:
+        pass
+
+
 class RobotPublishers:
     """Publishes on the keys of one robot. ``clock``: seconds."""
 
@@ -24,6 +41,8 @@ class RobotPublishers:
         self._conditions = conditions
         self._clock = clock
         self._names = NameBudget()
+        self.muted = False
+        """Whether nothing is published: another gateway serves the robot."""
 
     def __len__(self) -> int:
         return len(self.known)
@@ -45,8 +64,23 @@ class RobotPublishers:
             if _is_named(path) and not self._names.admit(path, self._clock()):
                 self._show_names()
                 return None
-            publisher = self.known[path] = self._bus.publisher(self._keys.key(path), topic)
+            publisher = self.known[path] = self._make(topic)
         return publisher
+
+    def _make(self, topic: Topic, last: bytes | None = None) -> Publisher:
+        key = self._keys.key(topic.path)
+        return _Muted(key, topic, last) if self.muted else self._bus.publisher(key, topic, last)
+
+    def mute(self, muted: bool) -> None:
+        """Give up every key, and publish nothing; ``mute(False)``: declare them again, with last values."""
+        self.muted = muted
+        for path, publisher in self.known.items():
+            topic = find(path)
+            assert topic is not None
+            publisher.close()
+            self.known[path] = self._make(topic, publisher.last)
+        if not muted:
+            self.repeat()
 
     def export(self, budget: Budget | None = None) -> list[list[object]]:
         """List the keys, each with the last value that it keeps. budget: of a deposit, which lacks large values."""
@@ -58,7 +92,7 @@ class RobotPublishers:
         for path, last in known:
             topic = find(path)
             if topic is not None and (not _is_named(path) or self._names.admit(path, self._clock())):
-                self.known[path] = self._bus.publisher(self._keys.key(path), topic, last)
+                self.known[path] = self._make(topic, last)
 
     def repeat(self) -> None:
         """Publish again the last values that are kept: who asked for them before they were restored got none."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from zbridge.bus import Handle, Publisher
+from zbridge.bus import Publisher
 from zbridge.control.context import RobotContext
 from zbridge.errors import ProtocolError, Refused
 from zbridge.fleet import payload as payloads
@@ -50,9 +50,8 @@ class Telemetry:
     def __repr__(self) -> str:
         return f"<Telemetry {self._context.keys.robot} {self._publishers!r}>"
 
-    def serve(self) -> list[Handle]:
-        """Publish on demand what is only published while somebody listens; read again when the bus is relieved."""
-        self._bus.on_relief(self._links.resume)
+    def serve(self) -> list[OnDemand]:
+        """Publish on demand what is only published while somebody listens."""
         keys = self._context.keys
         frames = {
             keys.key(f"@wire/{connection.name}/{direction}"): self._show_frames(connection, direction)
@@ -67,7 +66,7 @@ class Telemetry:
         opened = [OnDemand(self._bus, key_expr, listened) for key_expr, listened in families.items()]
         for each in opened:
             each.open()
-        return list(opened)
+        return opened
 
     def deliver(self, messages: list[Any]) -> None:
         """Publish what the robot sent; the newest wins where the bus is slower, unless it is told to block."""
@@ -99,7 +98,7 @@ class Telemetry:
                 self._untranslatable.value += 1
                 log.debug("%s: %s", self._context.keys.robot, error)
         self._published.value += states + sum(map(len, streams.values()))
-        if streams:
+        if streams and not publishers.muted:
             flowing = self._bus.put_all([(known[path], stream) for path, stream in streams.items()]) and flowing
         if not flowing:
             self._links.pause()

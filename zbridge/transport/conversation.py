@@ -116,6 +116,9 @@ class Conversation:
         self._surplus = surplus or Count()
         self._stalls = Stalls(self._clock, stalled)
         self._reading = Reading(loop, self._clock, share)
+        self.connected_at: float | None = None
+        """When the link came up, also of the process that had it before; None before it was ever up."""
+        self._heard_at = -math.inf
 
     def __repr__(self) -> str:
         return f"<Conversation {self.session!r}>"
@@ -124,6 +127,9 @@ class Conversation:
     def attached(self, link: Link) -> None:
         """Begin: the link is up."""
         self._link = self._observed = self._reading.link = link
+        self._heard_at = self._clock()
+        if self.connected_at is None:
+            self.connected_at = self._heard_at
         self._linked(link, True)
         if self._reading.held:
             link.hold()
@@ -132,7 +138,7 @@ class Conversation:
 
     def received(self, data: bytes) -> None:
         """Take bytes from the link."""
-        begun = self._clock()
+        begun = self._heard_at = self._clock()
         try:
             self._before()
             messages = self.session.receive(data, begun)
@@ -146,7 +152,7 @@ class Conversation:
     @_then_pump
     def received_datagram(self, datagram: bytes) -> None:
         """Take a datagram from the link."""
-        begun = self._clock()
+        begun = self._heard_at = self._clock()
         if self._reading.rests:
             self._surplus.value += 1
             return
@@ -253,6 +259,16 @@ class Conversation:
         return self._link is not None and not self._link.ready
 
     @property
+    def unheard_s(self) -> float:
+        """Seconds since anything came by the link, or it came up."""
+        return self._clock() - self._heard_at
+
+    @property
+    def connected_s(self) -> float:
+        """Age of the connection in seconds; 0 where there is none."""
+        return self._clock() - self.connected_at if self._link is not None and self.connected_at is not None else 0.0
+
+    @property
     def silent_s(self) -> float:
         """Seconds for which the peer's machine has not answered."""
         return self._link.silent_s if self._link is not None else 0.0
@@ -321,7 +337,11 @@ class Conversation:
         budget: of a deposit; the conversation need not be held then.
         """
         assert self._link is not None
-        return {"session": self.session.export(budget), "link": self._link.hand_over(parcel)}
+        return {
+            "session": self.session.export(budget),
+            "link": self._link.hand_over(parcel),
+            "connected_at": self.connected_at,
+        }
 
     def release(self) -> None:
         """Forget the connection, which another process has now: the peer notices nothing."""

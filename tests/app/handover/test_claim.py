@@ -13,12 +13,13 @@ async def test_a_claim_that_is_withdrawn_for_the_successor_is_still_deposited_an
     ownership = Ownership(FakeBus("1"), KeySpace("fleet", "r1"), clock=lambda: 5.0)
     part = ClaimPart(ownership)
     assert part.hand_over(Parcel()) == {}
-    ownership.inherit({"since": 2.0, "has": True})
-    assert part.hand_over(Parcel()) == {"since": 2.0, "has": True}
+    claim = {"since": 2.0, "yielded": False, "close_until": 4.0}
+    ownership.inherit(claim)
+    assert part.hand_over(Parcel()) == claim
     part.withdraw()
     assert ownership.export() is None
-    assert part.hand_over(Parcel()) == {"since": 2.0, "has": True}, "the successor may die before it has deposited any"
+    assert part.hand_over(Parcel()) == claim, "the successor may die before it has deposited any"
     await part.go_on()
-    assert ownership.export() == {"since": 2.0, "has": True}
+    assert ownership.export() == claim
     ownership.release()
     assert part.hand_over(Parcel()) == {}

@@ -39,6 +39,7 @@ class ClaimPart:
         self._ownership.hands_over = self._withdrawn = False
         if self._claim is not None and self._ownership.export() is None:
             self._ownership.inherit(self._claim)
+            self._ownership.begin()
 
     def withdraw(self) -> None:
         """Leave the claim, and the liveliness token, to the successor's."""

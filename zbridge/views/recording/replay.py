@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +23,7 @@ from zbridge.fleet.topics import Delivery, KeySpace, is_name, split_key
 from zbridge.hq import Listener, ListenerPlan, RobotSubscription
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import SessionTable
-from zbridge.robot.ownership import Ownership
+from zbridge.robot.ownership import Claim, Ownership, Standing
 from zbridge.views.recording.channels import MSGPACK, is_wire
 from zbridge.views.recording.player import Player
 from zbridge.views.recording.reader import Message, Reader, open_recording
@@ -187,7 +187,7 @@ class Replay:
             ownership.release()
 
     async def _watch(self, ownership: Ownership, name: str) -> None:
-        await ownership.watch(lambda: False, lambda others: None)
+        await ownership.watch(_Replayed())
         raise ZbridgeError(f"a gateway serves {name}: the replay leaves the name to it")
 
     # The player's thread
@@ -292,6 +292,22 @@ class AsRecorded:
             return sample
         shown = msgspec.structs.replace(status, protocol=self._robot.recorded_protocol)
         return Sample(sample.key, payloads.encode(shown), sample.attachment)
+
+
+class _Replayed:
+    """What a replay has of a robot: less than any gateway that has a healthy one."""
+
+    standing = Standing()
+    must_stay = False
+
+    def heard(self, claims: Mapping[str, Claim]) -> None:
+        pass
+
+    async def step_aside(self) -> None:
+        pass
+
+    async def step_in(self) -> None:
+        pass
 
 
 _STATUS = f"/{topics.STATUS.path}"

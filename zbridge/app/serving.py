@@ -1,0 +1,160 @@
+"""Serves one robot for as long as this process owns it, and stands aside while another gateway serves it better.
+
+Theory of operation. The ownership looks for other gateways, and calls :meth:`Serving.step_aside` and
+:meth:`Serving.step_in`. Aside, everything that is the owner's on the bus is withdrawn: the robot's keys, the camera's,
+the session table, the answer to restarts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
+from typing import Any
+
+from zbridge.bus import Handle
+from zbridge.control.conditions import Conditions
+from zbridge.control.latch_store import LatchStore
+from zbridge.errors import Held
+from zbridge.fleet.messages import Latch
+from zbridge.robot.device import Device
+from zbridge.robot.ownership import Claim, Ownership, Standing
+
+log = logging.getLogger("zbridge.app.gateway")
+
+TELL_S = 60.0
+"""Seconds between two log lines about other gateways that serve the same robot."""
+SERVED_ELSEWHERE = "served by another gateway"
+SECOND_CONNECTION = "a second connection is open; ending that gateway makes the robot deaf"
+_NAMED = 3
+"""Other gateways that a log line names."""
+_RIVALS = "rivals"
+
+Begin = Callable[[], Awaitable[None]]
+
+
+class Serving:
+    """One robot that is served; ``run`` does it.
+
+    store: keeps what the owner says while this gateway is aside. show: declares what the owner of a robot answers
+    besides the device. camera: publishes the camera's images until it is cancelled.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        device: Device,
+        ownership: Ownership,
+        store: LatchStore,
+        conditions: Conditions,
+        show: Callable[[], Iterable[Handle]],
+        camera: Callable[[], Coroutine[Any, Any, None]] | None = None,
+    ) -> None:
+        self._robot = robot
+        self._device = device
+        self._ownership = ownership
+        self._store = store
+        self._conditions = conditions
+        self._show = show
+        self._camera = camera
+        self._shown: list[Handle] = []
+        self._filming: asyncio.Task[None] | None = None
+        self._camera_failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._told_at = -math.inf
+        self._owners_latches: tuple[Latch, ...] = ()
+
+    def __repr__(self) -> str:
+        return f"<Serving {self._device!r}>"
+
+    @property
+    def state(self) -> str:
+        """The state of the robot, as on ``status`` of the gateway that serves it."""
+        return SERVED_ELSEWHERE if self._ownership.yielded else self._device.state
+
+    async def run(self, begin: Begin | None = None) -> None:
+        """Serve until another gateway has to take the robot, or a successor has it. begin: see :meth:`Device.run`."""
+        if not self._ownership.yielded:
+            self._open()
+        work = (self._device.run(begin), self._ownership.watch(self), self._camera_failed)
+        tasks = [asyncio.ensure_future(each) for each in work]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            self._ownership.leave()
+            for task in tasks:
+                task.cancel()
+            await asyncio.shield(asyncio.gather(*tasks, self._close(), return_exceptions=True))
+            self._conditions.set(_RIVALS, None)
+
+    # What the ownership calls
+
+    @property
+    def standing(self) -> Standing:
+        """How this gateway stands with the robot."""
+        return self._device.standing
+
+    @property
+    def must_stay(self) -> bool:
+        """Whether there is a connection to the robot that must not be closed."""
+        return self._device.must_stay
+
+    def heard(self, claims: Mapping[str, Claim]) -> None:
+        """Take the latched stops of other gateways, and report them."""
+        if self._ownership.yielded:
+            owners = [claim.latches for claim in claims.values() if not claim.yielded]
+            self._owners_latches = owners[0] if owners else self._owners_latches
+            self._store.mirror(self._owners_latches)
+            self._conditions.set(_RIVALS, None)
+            return
+        for claim in claims.values():
+            self._device.merge_latches(claim.latches)
+        self._report(claims)
+
+    async def step_aside(self) -> None:
+        """Stop the robot, and leave it to the gateway with the better claim."""
+        await self._device.step_aside()
+        await self._close()
+
+    async def step_in(self) -> None:
+        """Serve the robot again, with the latched stops of the gateway that served it meanwhile."""
+        self._device.merge_latches(self._owners_latches)
+        await self._device.step_in()
+        self._open()
+
+    def _open(self) -> None:
+        self._shown = list(self._show())
+        if self._camera is not None:
+            self._filming = asyncio.ensure_future(self._camera())
+            self._filming.add_done_callback(self._on_camera)
+
+    def _on_camera(self, task: asyncio.Task[None]) -> None:
+        """End the whole gateway with what the camera's part raised."""
+        if not task.cancelled() and (error := task.exception()) is not None and not self._camera_failed.done():
+            self._camera_failed.set_exception(error)
+
+    async def _close(self) -> None:
+        shown, self._shown = self._shown, []
+        for handle in shown:
+            handle.close()
+        filming, self._filming = self._filming, None
+        if filming is not None:
+            filming.cancel()
+            await asyncio.gather(filming, return_exceptions=True)
+
+    def _report(self, claims: Mapping[str, Claim]) -> None:
+        """Show other gateways: on ``status`` always, on ``control`` and in the log every TELL_S."""
+        zids = [zid for zid, claim in claims.items() if not claim.yielded]
+        more = f" and {len(zids) - _NAMED} more" if len(zids) > _NAMED else ""
+        text = f"another gateway serves this robot too: {', '.join(zids[:_NAMED])}{more}"
+        if claims and not zids:
+            text = SECOND_CONNECTION
+        self._conditions.set(_RIVALS, text if claims else None)
+        if claims and time.monotonic() - self._told_at >= TELL_S:
+            self._told_at = time.monotonic()
+            log.error("%s: %s", self._robot, text)
+            for zid in zids[:_NAMED]:
+                self._device.refuse("claim", Held("this gateway serves the robot"), zid)

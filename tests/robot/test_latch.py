@@ -15,6 +15,8 @@ from zbridge.bus import Answer, Lane
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Latch
+from zbridge.protocol.kept import Budget
+from zbridge.transport import Parcel
 
 pytestmark = pytest.mark.jumping
 
@@ -195,6 +197,25 @@ async def test_nobody_is_waited_for_longer_than_a_second() -> None:
         assert asks(rig) == "not_ready"
         await asyncio.sleep(0.02)
         assert asks(rig) == "ok"
+
+
+@pytest.mark.parametrize(("crashed", "answer"), [(False, "ok"), (True, "not_ready")])
+async def test_a_successor_knows_what_the_gateway_before_it_knew_unless_that_died(
+    *, crashed: bool, answer: str
+) -> None:
+    async with established() as rig:
+        await rig.device.prepare("gateway restarted", 1.0)
+        rig.device.hold()
+        given = rig.device.keep(Parcel(), Budget(1000)) if crashed else rig.device.hand_over(Parcel())
+        heir = Rig(bus=SlowBus())
+        heir.device.take_over(msgpack.unpackb(msgpack.packb(given)), Parcel())
+        task = asyncio.ensure_future(heir.device.run(heir.settle))
+        await heir.settle()
+        await heir.settle()
+        assert asks(heir) == answer
+        await asyncio.sleep(1.1)
+        task.cancel()
+        await asyncio.wait([task])
 
 
 async def test_what_was_written_down_is_in_force_before_anything_is_served_and_changes_are_written() -> None:

@@ -38,6 +38,10 @@ class Notes(Nobody):
     def __init__(self) -> None:
         self.told: list[Any] = []
         self.device: Any = None
+        self.at_once: list[bool] = []
+
+    def changed(self, *, at_once: bool = False) -> None:
+        self.at_once.append(at_once)
 
     def began(self, device: Any) -> None:
         self.device = device
@@ -72,6 +76,15 @@ async def test_a_robot_that_is_driven_or_drives_itself_counts_as_driven(rig: Rig
     last = rig.device.last_stop()
     assert last.driven
     assert [frame.data for frame in last.frames] == [NONE, STOP]
+
+
+async def test_an_observer_is_told_at_once_of_a_command_that_may_change_how_the_robot_is_stopped() -> None:
+    notes = Notes()
+    async with established(observer=notes) as rig:
+        for words, at_once in [("left", False), ("autonomous", True), ("left", False), ("raw", True), ("text", False)]:
+            notes.at_once = []
+            await rig.play(words)
+            assert notes.at_once == [at_once], words
 
 
 async def test_an_observer_is_told_of_the_link_and_of_every_read() -> None:

@@ -62,8 +62,10 @@ class Enforcer:
         self._standstill = standstill
         self._audit = audit
         self._limits = limits
-        self.settled: Callable[[], object] = lambda: None
-        """Called after :meth:`settle`: whether the robot is driven may have changed."""
+        self.settled: Callable[..., object] = lambda *, at_once: None
+        """Called after :meth:`settle`: whether the robot is driven, or (``at_once``) how it is stopped, may be new."""
+        self._stops_anew = False
+        """Whether a command has just changed how the robot is stopped."""
         self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
         self._fleet_stop = KeySpace(context.keys.realm, "*").key(topics.CMD_STOP.path)
         self._loop = asyncio.get_running_loop()
@@ -123,6 +125,7 @@ class Enforcer:
 
     def commanded(self, command: FleetMessage) -> None:
         """Note that the robot was told something that may move it: a mode, or a raw message."""
+        self._stops_anew = isinstance(command, Mode | Raw)
         if isinstance(command, Mode):
             self.authority.mode_chosen(autonomous=command.mode == "autonomous")
         elif isinstance(command, Raw):
@@ -174,7 +177,8 @@ class Enforcer:
         deadline = self.authority.deadline()
         if deadline is not None and deadline < self._timer_at:
             self._arm(deadline)
-        self.settled()
+        stops_anew, self._stops_anew = self._stops_anew, False
+        self.settled(at_once=stops_anew)
 
     def keep_time(self) -> None:
         """Do what is due, before anything is read or written: the process may have been frozen, the machine asleep."""

@@ -424,6 +424,8 @@ class Device:
             link["session"][PARTIAL] = list(partial_frame)
         for connection, link in zip(self._links, given["links"], strict=True):
             connection.take_over(link, parcel)
+        if not self._crashed:
+            self._latch_news.inherited()
         self._publishers.restore(given["published"])  # a new session gives up the names of the one before it
         if any(given["links"]):
             self._context.robot.restore(given["robot"])

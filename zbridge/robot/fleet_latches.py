@@ -57,6 +57,10 @@ class FleetLatchNews:
             self._returned.clear()
             await asyncio.sleep(self._chance() * SPREAD_S)
 
+    def inherited(self) -> None:
+        """Record that the gateway before handed over what it knows: leases need not wait for the first answers."""
+        self._leases.wait(None)
+
     def returned(self) -> None:
         """Record that the bus is there, or has returned: grant no lease before the others were asked again.
 

@@ -79,8 +79,11 @@ class Observer(Protocol):
     def read(self, name: str, resume: Resume) -> None:
         """Note that the bytes of a read of this link have been cut into frames."""
 
-    def changed(self) -> None:
-        """Note that :meth:`Observed.last_stop` may give something else from now on. Called for every command."""
+    def changed(self, *, at_once: bool = False) -> None:
+        """Note that :meth:`Observed.last_stop` may give something else from now on. Called for every command.
+
+        at_once: after a command on which the way to stop the robot may depend, as its mode.
+        """
 
 
 class Nobody:
@@ -98,5 +101,5 @@ class Nobody:
     def read(self, name: str, resume: Resume) -> None:
         """Do nothing."""
 
-    def changed(self) -> None:
+    def changed(self, *, at_once: bool = False) -> None:
         """Do nothing."""

@@ -141,6 +141,15 @@ async def test_another_stop_is_told_with_the_command_that_made_it(scene: Scene) 
     assert scene.told() == [Beat(scene.device.now)]
 
 
+async def test_a_stop_that_a_command_changed_is_told_at_once_however_many_commands_come(scene: Scene) -> None:
+    scene.reporter.changed()
+    scene.device.now = LastStop(frames=(StopFrame(b"mode"), StopFrame(b"stop")), state="established")
+    scene.reporter.changed()
+    assert scene.told() == [], "looked at a moment ago"
+    scene.reporter.changed(at_once=True)
+    assert scene.told() == [Beat(scene.device.now)]
+
+
 async def test_a_link_comes_with_its_sockets_and_goes_at_once(scene: Scene, sock: socket.socket) -> None:
     link = FakeLink()
     link.descriptors = (sock.fileno(),)

@@ -178,14 +178,17 @@ class Reporter:
         if name in self._at:
             self._memory.cut(self._at[name], resume(PARTIAL_BYTES))
 
-    def changed(self) -> None:
-        """Beat at once if a program has begun to drive the robot, or has ended, or its link is another one."""
+    def changed(self, *, at_once: bool = False) -> None:
+        """Beat at once if a program has begun to drive the robot, or has ended, or its link is another one.
+
+        at_once: also if the robot is stopped in another way.
+        """
         device, told = self._device, self._told
         if device is None:
             return
         if device.driven is not told.driven or device.state != told.state:
             self._beat()
-        elif (now := self._loop.time()) >= self._looked_at + LOOK_S:
+        elif (now := self._loop.time()) >= self._looked_at + LOOK_S or at_once:
             self._looked_at = now
             if device.last_stop() != told:
                 self._beat()

@@ -8,7 +8,6 @@ import pytest
 
 from tests.e2e.processes import NotHereError, apart, module
 
-
 TRIES = 4
 """Cuts of which one at least must hold something up that moves a robot which looks at no age."""
 

@@ -115,7 +115,7 @@ class Device:
         self._share = share
         self._shared_address = shared_address
         self._observer = observer or Nobody()
-        self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock)
+        self._publishers = publishers = RobotPublishers(bus, keys, conditions, clock, self._observer.published)
         self._links = links = Links()
         self._context = context = RobotContext(
             robot,

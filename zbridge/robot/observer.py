@@ -85,6 +85,9 @@ class Observer(Protocol):
         at_once: after a command on which the way to stop the robot may depend, as its mode.
         """
 
+    def published(self) -> None:
+        """Note that a key that keeps its last value was published for the first time."""
+
 
 class Nobody:
     """The observer of a robot that nobody else looks after."""
@@ -102,4 +105,7 @@ class Nobody:
         """Do nothing."""
 
     def changed(self, *, at_once: bool = False) -> None:
+        """Do nothing."""
+
+    def published(self) -> None:
         """Do nothing."""

@@ -31,15 +31,23 @@ class _Muted:
 
 
 class RobotPublishers:
-    """Publishes on the keys of one robot. ``clock``: seconds."""
+    """Publishes on the keys of one robot. clock: seconds. kept: called for each new key that keeps its last value."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, conditions: Conditions, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        conditions: Conditions,
+        clock: Callable[[], float],
+        kept: Callable[[], object] = lambda: None,
+    ) -> None:
         self.known: dict[str, Publisher] = {}
         """The publishers there are, by path."""
         self._bus = bus
         self._keys = keys
         self._conditions = conditions
         self._clock = clock
+        self._kept = kept
         self._names = NameBudget()
         self.muted = False
         """Whether nothing is published: another gateway serves the robot."""
@@ -65,6 +73,8 @@ class RobotPublishers:
                 self._show_names()
                 return None
             publisher = self.known[path] = self._make(topic)
+            if topic.qos.keeps_last:
+                self._kept()
         return publisher
 
     def _make(self, topic: Topic, last: bytes | None = None) -> Publisher:

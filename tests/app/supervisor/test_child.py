@@ -276,6 +276,26 @@ async def test_another_stop_comes_with_another_deposit(scene: Scene, sock: socke
     assert isinstance(scene.told()[0], Kept), "a robot that drives itself is stopped by another session than before"
 
 
+async def test_what_is_published_for_the_first_time_is_deposited_soon_and_once(
+    scene: Scene, sock: socket.socket
+) -> None:
+    linked(scene, sock)
+    said = ["nothing"]
+
+    def keep(parcel: Parcel, budget: Budget) -> Given:
+        parcel.put(sock.fileno())
+        return msgspec.structs.replace(GIVEN, claim={"since": said[-1]})
+
+    scene.reporter.keep = keep
+    deposit(scene, "established")
+    said.append("what is said once in a connection")
+    for _ in range(100):
+        scene.reporter.published()
+    (kept,) = await scene.soon(2 * child.LOOK_S)
+    assert isinstance(kept, Kept)
+    assert b"said once" in scene.memory.deposit(kept.area, kept.size)
+
+
 @pytest.mark.parametrize("fault", ["a name that is not UTF-8", "too large", "raises"])
 async def test_a_deposit_that_cannot_be_made_is_told_once_and_the_beats_go_on(
     scene: Scene, sock: socket.socket, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, fault: str

@@ -48,7 +48,7 @@ BEAT_S = 1.0
 DRIVEN_BEAT_S = 0.2
 """The same while the robot is driven."""
 LOOK_S = 0.05
-"""Least time between two looks at the frames of the stop, while commands come in."""
+"""Least time between two looks at the frames of the stop, while commands come in, and before a deposit."""
 ANSWER_S = 10.0
 """Longest wait for the start of a successor."""
 KEEP_S = 0.9
@@ -99,6 +99,7 @@ class Reporter:
         self.keep: Keep = lambda parcel, budget: None
         """Set by the gateway's process."""
         self._timer: asyncio.TimerHandle | None = None
+        self._keep_timer: asyncio.TimerHandle | None = None
         self._answer: asyncio.Future[Started] | None = None
 
     def __repr__(self) -> str:
@@ -113,8 +114,9 @@ class Reporter:
 
     def close(self) -> None:
         """Tell nothing more; idempotent. The supervisor sees the end of the process."""
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._keep_timer):
+            if timer is not None:
+                timer.cancel()
         if self._post.fileno() >= 0:
             self._loop.remove_reader(self._post.fileno())
             self._post.close()
@@ -192,6 +194,15 @@ class Reporter:
             self._looked_at = now
             if device.last_stop() != told:
                 self._beat()
+
+    def published(self) -> None:
+        """Deposit soon: a robot may say once in a connection what was published."""
+        if self._keep_timer is None:
+            self._keep_timer = self._loop.call_later(LOOK_S, self._keep_soon)
+
+    def _keep_soon(self) -> None:
+        self._keep_timer = None
+        self._keep()
 
     def _beat(self) -> None:
         if self._timer is not None:

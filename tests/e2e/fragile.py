@@ -177,7 +177,7 @@ async def main() -> None:
         "alive": robot.alive and not getattr(robot, "stuck", False),
         "left": left,
         "moving": robot.machine.moving if hasattr(robot, "machine") else robot.robot.moving,
-        **{name: [*map(shown, getattr(robot, name, ()))] for name in ("received", "misread", "piled")},
+        **{name: [*map(shown, getattr(robot, name, ()))] for name in ("received", "misread", "piled", "ignored")},
     }
     print(json.dumps(report))
 
@@ -206,7 +206,12 @@ def charges(violations: Iterable[str], late_s: float = 0.0) -> list[str]:
 
 def disturbed(report: dict[str, Any]) -> bool:
     """Tell whether a robot lost a packet of the handshake, being late itself: it understands nothing after that."""
-    return any(packet_id in _HANDSHAKE for _, _, packet_id, _ in report["piled"])
+    return any(packet_id in _HANDSHAKE for _, _, packet_id, _ in lost(report))
+
+
+def lost(report: dict[str, Any]) -> list[Any]:
+    """Give what the robot lost by reading late: what piled up, and what one of 1.1 or 1.2 ignored after that."""
+    return [*report["piled"], *report["ignored"]]
 
 
 class Fragile(Part):

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tests.e2e import mixed
+from tests.e2e.fragile import lost
 from tests.e2e.mixed import Arrival, Judgement, Put, Run
 from tests.e2e.processes import report
 
@@ -98,7 +99,7 @@ class Mixture(Run):
         self.judgement.unanswered[what] += not replies or "code" in replies[0]
 
     def arrivals(self, report: dict[str, Any]) -> list[Arrival]:
-        return [(packet_id, body) for _, _, packet_id, body in report["received"] + report["piled"]]
+        return [(packet_id, body) for _, _, packet_id, body in report["received"] + lost(report)]
 
     def may_miss(self, arrival: Arrival) -> bool:
         return (
@@ -108,9 +109,9 @@ class Mixture(Run):
     def compare(self, report: dict[str, Any]) -> None:
         super().compare(report)
         judgement = self.judgement
-        piled = Counter(packet_id for _, _, packet_id, _ in report["piled"])
+        unread = Counter(packet_id for _, _, packet_id, _ in lost(report))
         for what, packet_id in ASKED.items():
-            if judgement.unanswered[what] > piled[packet_id]:  # what the robot itself lost it cannot answer
+            if judgement.unanswered[what] > unread[packet_id]:  # what the robot itself lost it cannot answer
                 judgement.faults.append(f"{judgement.unanswered[what]} answers: {what}")
         stops = sum(packet_id == 13 for packet_id, _ in self.arrivals(report))
         wanted = judgement.sent["stop"] + judgement.sent["neutral"]

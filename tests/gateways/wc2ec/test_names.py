@@ -36,8 +36,8 @@ class CountingBus(FakeBus):
         super().__init__("1")
         self.sensors: list[str] = []
 
-    def publisher(self, key: str, topic: Topic) -> Publisher:
-        publisher = super().publisher(key, topic)
+    def publisher(self, key: str, topic: Topic, last: bytes | None = None) -> Publisher:
+        publisher = super().publisher(key, topic, last)
         name, close = key.rpartition("/")[2], publisher.close
 
         def closed() -> None:

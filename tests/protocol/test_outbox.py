@@ -206,3 +206,19 @@ def test_a_frame_that_goes_first_may_be_taken_back_until_it_was_given_out() -> N
     assert outbox.take(0.0) is first
     assert not outbox.withdraw(first)
     assert drained(outbox, 0.01, 1.0) == [(0.01, second)]
+
+
+def test_while_it_is_muted_nothing_but_the_handshake_leaves_or_waits() -> None:
+    outbox = Outbox(gap_s=0.0)
+    outbox.put(b"waits")
+    outbox.set("motion", (b"push",), 0.0, period_s=0.1)
+    outbox.mute(True)
+    outbox.put(b"comes")
+    outbox.set("motion", (b"push",), 0.0, period_s=0.1)
+    outbox.set("stop", (b"stop",), 0.0, until=1.0, urgent=True)
+    outbox.put_exempt(b"hello")
+    assert drained(outbox, 0.0, 5.0) == [(0.0, b"hello")]
+    outbox.mute(False)
+    assert drained(outbox, 5.0, 9.0) == [], "what came meanwhile is forgotten"
+    outbox.put(b"after")
+    assert drained(outbox, 9.0, 9.0) == [(9.0, b"after")]

@@ -25,6 +25,8 @@ def latch(bench: Bench, robot: str, stop_id: bytes) -> None:
         return latched(bench, "r1" if robot == "*" else robot, stop_id)
 
     until(shown, what=f"{robot} latched")
+    if robot != "*":
+        until(lambda: stop_id in bench.fleet.last(f"{robot}/control")["stops"], what="it is written down")
 
 
 def latched(bench: Bench, robot: str, stop_id: bytes) -> bool:

@@ -229,3 +229,29 @@ async def test_what_was_written_down_is_in_force_before_anything_is_served_and_c
         unlatch(rig, IDS[0])
         assert [each.id for each in written[-1].latches] == [IDS[1]]
         assert written[-1].released == (IDS[0],)
+
+
+async def test_a_latched_stop_is_confirmed_when_it_is_written_down_and_the_robot_is_stopped_before() -> None:
+    writing: list[asyncio.Future[None]] = []
+
+    def keep(latches: Latches) -> asyncio.Future[None] | None:
+        if len(latches.in_force) == len(writing):
+            return None
+        writing.append(asyncio.get_running_loop().create_future())
+        return writing[-1]
+
+    async with established(keep_latches=keep) as rig:
+        latch(rig, IDS[0])
+        await asyncio.sleep(0.1)
+        assert STOP in rig.written()
+        stop(rig, IDS[2])
+        latch(rig, IDS[1])
+        shown = rig.last("control")
+        assert (shown["state"], [each["id"] for each in shown["latches"]]) == ("latched", IDS[:2])
+        assert shown["stops"] == [IDS[2]], "a plain stop needs no disk"
+        writing[0].set_result(None)
+        await rig.settle()
+        assert rig.last("control")["stops"] == [IDS[2]], "the other one is on its way"
+        writing[1].set_result(None)
+        await rig.settle()
+        assert rig.last("control")["stops"] == [IDS[0], IDS[2], IDS[1]]

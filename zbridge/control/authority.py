@@ -70,6 +70,8 @@ class Authority:
         self.latches = latches if latches is not None else Latches()
         self._stops: deque[bytes] = deque(maxlen=STOPS)
         """The ids of the last stops that had one."""
+        self._unkept: set[bytes] = set()
+        """The ids of latched stops that are not yet where they survive this process."""
         self._state = State.LATCHED if self.latches else State.FREE
         self._holders = Holders(random)
         self._autonomous = False
@@ -199,6 +201,7 @@ class Authority:
             latch = latch_of(stop, fleet=fleet)
             self.latches.add(latch)
             if latch.id in self.latches:
+                self._unkept.add(latch.id)
                 self._latch(latch)
                 return
         self.stop("stop")
@@ -226,6 +229,10 @@ class Authority:
         self.latches.restore(state)
         if self.latches:
             self._state = State.LATCHED
+
+    def latches_kept(self) -> None:
+        """Record that all latched stops survive this process, or cannot: ``control`` confirms them from now on."""
+        self._unkept.clear()
 
     def _latch(self, latch: Latch) -> None:
         self._handle(Input.LATCH, latch.reason or "stop", EventKind.LATCHED, latch.who)
@@ -286,7 +293,7 @@ class Authority:
             expires_in_s=self._expires_in_s(now),
             refusals=self._refusals.shown(),
             latches=self.latches.in_force,
-            stops=tuple(self._stops),
+            stops=tuple(stop_id for stop_id in self._stops if stop_id not in self._unkept),
         )
 
     def _handle(self, said: Input, *arguments: object, **options: object) -> Lease | None:

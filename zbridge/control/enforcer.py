@@ -31,6 +31,8 @@ from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Latch, Mod
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
+Keep = Callable[[Latches], "asyncio.Future[None] | None"]
+
 SUSPENDED_S = 0.1
 """A machine that was suspended for longer stops its robots, and ends their leases."""
 _CONTROL_S = 0.05
@@ -40,7 +42,8 @@ _CONTROL_S = 0.05
 class Enforcer:
     """Carries out the decisions of one robot's authority.
 
-    limits: None where drives are not limited. keep: writes the latched stops down, so that they survive a restart.
+    limits: None where drives are not limited. keep: writes the latched stops down, so that they survive this process;
+    returns what ends when that is done, None where it is.
     """
 
     def __init__(
@@ -50,10 +53,12 @@ class Enforcer:
         standstill: Standstill,
         audit: Audit,
         limits: MotionLimits | None = None,
-        keep: Callable[[Latches], object] = lambda latches: None,
+        keep: Keep = lambda latches: None,
     ) -> None:
         self.authority = authority
         self._keep = keep
+        self._keeping = 0
+        """Writings of latched stops that have not ended."""
         self.gate = CommandGate(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
         self._context = context
@@ -196,7 +201,7 @@ class Enforcer:
     def beat(self) -> None:
         """Publish ``control``, and write down what was folded. To be called once a second."""
         self._count_kept_back()
-        self._keep(self.authority.latches)
+        self._keep_latches()
         self.report()
         self._audit.flush()
 
@@ -234,8 +239,23 @@ class Enforcer:
         if event.stops:
             self._send_stop()
         if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-            self._keep(self.authority.latches)
+            self._keep_latches()
         self._audit.write(event)
+
+    def _keep_latches(self) -> None:
+        """Write the latched stops down; ``control`` confirms a new one when that has ended."""
+        writing = self._keep(self.authority.latches)
+        if writing is not None:
+            self._keeping += 1
+            writing.add_done_callback(self._on_kept)
+        elif not self._keeping:
+            self.authority.latches_kept()
+
+    def _on_kept(self, _: object) -> None:
+        self._keeping -= 1
+        if not self._keeping:
+            self.authority.latches_kept()
+            self.report()
 
     def _send_stop(self) -> None:
         session = self._context.robot.driving

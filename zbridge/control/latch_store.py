@@ -71,11 +71,15 @@ class LatchStore:
             latches.merge(standby.latches)
         return latches
 
-    def save(self, latches: Latches) -> None:
-        """Write what is in force, on a thread; the newest counts. Call it again to try again."""
+    def save(self, latches: Latches) -> asyncio.Future[None] | None:
+        """Write what is in force, on a thread; the newest counts. Call it again to try again.
+
+        Returns what ends when everything is written, or could not be; None where nothing is to be written.
+        """
         self._put(self._own, latches.record)
         if self._standby in self._written:  # it is in the own file now
             self._put(self._standby, LatchRecord())
+        return self._writing
 
     def mirror(self, latches: Sequence[Latch]) -> None:
         """Write what the gateway that owns the robot says, on a thread."""

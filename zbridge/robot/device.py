@@ -19,7 +19,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
-from zbridge.control.enforcer import Enforcer
+from zbridge.control.enforcer import Enforcer, Keep
 from zbridge.control.faults import Faults
 from zbridge.control.latch import Latches
 from zbridge.control.lease_server import LeaseServer
@@ -93,7 +93,7 @@ class Device:
         clock_ns: Callable[[], int] = time.time_ns,
         raw_ms: Callable[[], float] = clocks.raw_ms,
         suspended_s: Callable[[], float] = clocks.suspended_s,
-        keep_latches: Callable[[Latches], object] = lambda latches: None,
+        keep_latches: Keep = lambda latches: None,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import AsyncIterator, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Any
 
 from zbridge.bus import Bus, Sample
@@ -13,6 +13,7 @@ from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
+from zbridge.control.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -48,9 +49,21 @@ an earlier wish only after it has granted a later one, which must not end for it
 
 
 class Fleet:
-    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says."""
+    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says.
 
-    def __init__(self, bus: Bus, realm: str = "fleet", name: str | None = None) -> None:
+    clock_ms: the raw clock, which dates commands. attempts: numbers the requests for a lease of this bus session.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        realm: str = "fleet",
+        name: str | None = None,
+        *,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+    ) -> None:
+        self._machine = (clock_ms, attempts)
         self.realm = realm
         self.name = name
         self._bus = bus
@@ -62,7 +75,7 @@ class Fleet:
         """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-        return Robot(self._bus, KeySpace(self.realm, name), self.name)
+        return Robot(self._bus, KeySpace(self.realm, name), self.name, *self._machine)
 
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status.
@@ -150,8 +163,17 @@ class Fleet:
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        own: str | None = None,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+    ) -> None:
         super().__init__(bus, keys, topics.CONTROL)
+        self._clock_ms = clock_ms
+        self._attempts = attempts
         self._keys = keys
         self._own = own
 
@@ -183,9 +205,12 @@ class ControlFeed(StateFeed[Control]):
             priority=priority,
             lease_s=lease_s,
             deadman_s=deadman_s,
-            alive=f"operator.{escape(name)}.{self._bus.zid}.{next(_attempts)}",
+            alive=f"operator.{escape(name)}.{self._bus.zid}.{next(self._attempts)}",
         )
-        async with holding(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s) as driver:
+        clock_ms = self._clock_ms
+        async with holding(
+            self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms
+        ) as driver:
             yield driver
 
 
@@ -204,7 +229,14 @@ def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str
 class Robot:
     """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        own: str | None = None,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+    ) -> None:
         self.name = keys.robot
         self._own = own or default_who()
         self._bus = bus
@@ -220,7 +252,7 @@ class Robot:
         self.lidar: StateFeed[Switch] = StateFeed(bus, keys, topics.LIDAR)
         self.camera: StateFeed[Switch] = StateFeed(bus, keys, topics.CAMERA)
         self.devices: StateFeed[Devices] = StateFeed(bus, keys, topics.DEVICES)
-        self.control = ControlFeed(bus, keys, own)
+        self.control = ControlFeed(bus, keys, own, clock_ms, attempts)
 
     def __repr__(self) -> str:
         return f"<Robot {self._keys.realm}/{self.name}>"

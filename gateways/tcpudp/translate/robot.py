@@ -58,6 +58,8 @@ REPEAT_S = 0.25
 """Seconds after which a drive command is repeated while the robot moves."""
 STOP_REPEAT_S = 0.1
 """Seconds between the repetitions of a stop: a late datagram can restart motion."""
+NEUTRAL_S = 1.0
+"""Seconds for which a neutral is repeated."""
 IDLE_STOP_S = 0.25
 """Seconds between two stops to robots of 1.1 and 1.2 while nobody drives: after a stall they ignore the first one."""
 AUTONOMOUS = "autonomous"
@@ -162,7 +164,7 @@ class TcpUdpRobot(Robot):
         if not command.moving:
             session = self._connected()
             session.withdraw_autonomous()
-            self._rest(now, period_s=REPEAT_S, until=now + 1.0, urgent=session.sent_autonomous)
+            self._neutral(session, now)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
         packets: list[Packet] = []
@@ -180,6 +182,16 @@ class TcpUdpRobot(Robot):
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._rests_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
+
+    def _neutral(self, session: HqRole, now: float) -> None:
+        """Repeat neutral for a second. Where it is repeated already, at its own times: programs say it all the time."""
+        until = now + NEUTRAL_S
+        frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
+        if session.outbox.prolong(_MOTION, frames, period_s=REPEAT_S, until=until):
+            self._rests_until = max(self._rests_until, until)
+        else:
+            apart_s = IDLE_STOP_S / 2 if session.misreads else 0.0
+            self._rest(now, period_s=REPEAT_S, until=until, spacing_s=apart_s, urgent=session.sent_autonomous)
 
     def _mode(self, command: Mode, now: float) -> None:
         """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""

@@ -30,6 +30,8 @@ class World:
     def __init__(self, seed: int | str, *, keep_trace: bool = False) -> None:
         self.seed = seed
         self.now = 0.0
+        self.over = False
+        """Whether it is being taken apart: what the garbage of processes does is of no account."""
         self.lines: list[str] | None = [] if keep_trace else None
         self.events = 0
         self.errors: list[str] = []
@@ -55,6 +57,8 @@ class World:
 
     def note(self, who: str, what: str, *fields: Any) -> None:
         """Enter an event into the trace."""
+        if self.over:
+            return
         line = f"{self.now:.6f} {who} {what} {fields}"
         self._hash.update(line.encode())
         if self.lines is not None:

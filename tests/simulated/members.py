@@ -41,6 +41,9 @@ class Member:
         self.session: SimSession
         self.task: asyncio.Task[None] | None = None
         self.starts = 0
+        self.ending = False
+        self._graves: list[Any] = []
+        """What killed processes left: collected at the end, since its garbage would run code."""
 
     @property
     def running(self) -> bool:
@@ -53,9 +56,14 @@ class Member:
         return self.task is not None and self.process.alive and not self.task.done()
 
     def start(self) -> None:
-        """Start the process."""
+        """Start the process, once the one before has ended."""
         if self.alive:
+            if self.ending:
+                self.host.world.after(1.0, self.start)
             return
+        self.ending = False
+        if self.task is not None:
+            self._graves.append((self.process, self.task))
         self.starts += 1
         self.process = Process(self.host, self.name)
         self.process.rng = self.host.world.rng(f"{self.name} {self.starts}")
@@ -70,8 +78,9 @@ class Member:
         try:
             await self.run(bus)
         finally:
-            await bus.close()
-            self.host.world.note(self.name, "ended")
+            if self.session.process.alive:
+                await bus.close()
+                self.host.world.note(self.name, "ended")
 
     async def run(self, bus: SimBus) -> None:
         """Do the work of the process."""
@@ -82,6 +91,7 @@ class Member:
         if self.alive:
             assert self.process.loop is not None
             assert self.task is not None
+            self.ending = True
             self.host.world.note(self.name, "told to end")
             self.process.loop.call_soon(self.task.cancel)
 

@@ -34,6 +34,7 @@ class Obligations:
         self._said = False
         self._connected_at = 0.0
         self._ended_for: dict[str, float] = {}
+        self._granted_to: dict[str, float] = {}
         self._probe: dict[str, float] = {}
         self._dropped_at = -1.0
         self.reachable_long = False
@@ -50,6 +51,8 @@ class Obligations:
             self._disturbed[who] = self.world.now
         elif who == "robot":
             self._on_robot(what, fields)
+        elif what == "granted":
+            self._granted_to[who] = self.world.now
         elif what in ("lost", "released", "failed"):
             self._ended_for[who] = self.world.now
 
@@ -113,6 +116,8 @@ class Obligations:
                 return
             if not self.simulation.fabric.works(member.session, gateway.session):
                 return
+            if self._granted_to.get(asker, -1.0) < grant.at:
+                return  # its grant was lost on the way
             if self._ended_for.get(asker, -1.0) < grant.at and not any(
                 other.asker == asker and other.at > grant.at for other in self.checker.grants.values()
             ):

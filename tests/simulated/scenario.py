@@ -11,6 +11,7 @@ import gc
 import json
 import logging
 import os
+import shutil
 import sys
 import tempfile
 from collections import Counter
@@ -150,14 +151,16 @@ HQ_OPTIONS: dict[str, dict[str, Any]] = {"tcpudp": {}, "alf": {}, "wc2ec": {"hol
 def run(scenario: dict[str, Any], *, keep_trace: bool = False) -> Outcome:
     """Run a scenario once; the same scenario gives the same trace."""
     with _Quiet() as errors:
-        simulation = Simulation(json.loads(json.dumps(scenario)), keep_trace=keep_trace)
-        errors.world = simulation.world
-        try:
-            return simulation.run()
-        finally:
-            for path in sorted(simulation.folder.rglob("*"), reverse=True):
-                path.rmdir() if path.is_dir() else path.unlink()
-            simulation.folder.rmdir()
+        return _run(json.loads(json.dumps(scenario)), errors, keep_trace=keep_trace)
+
+
+def _run(scenario: dict[str, Any], errors: _Quiet, *, keep_trace: bool) -> Outcome:
+    simulation = Simulation(scenario, keep_trace=keep_trace)
+    errors.world = simulation.world
+    try:
+        return simulation.run()
+    finally:
+        shutil.rmtree(simulation.folder, ignore_errors=True)
 
 
 class _Quiet(logging.Handler):
@@ -179,6 +182,8 @@ class _Quiet(logging.Handler):
         world, self.world = self.world, None
         if world is not None:
             world.watchers.clear()
+            world.over = True
+        del world
         gc.enable()
         self._log.removeHandler(self)
         level, self._log.propagate, _ = self._before

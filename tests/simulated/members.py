@@ -72,6 +72,12 @@ class Member:
         loop.network = self.network
         self.session = SimSession(self.fabric, self.process, self.router)
         self.task = loop.create_task(self._main())
+        self.task.add_done_callback(self._look)
+
+    def _look(self, task: asyncio.Task[None]) -> None:
+        """An exception that ends a process is a violation."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self.host.world.errors.append(f"{self.name} ended: {error!r}")
 
     async def _main(self) -> None:
         bus = SimBus(self.session, Metrics())

@@ -119,6 +119,7 @@ class Listening(Described):
         self.address = address
         self.waiting: deque[End] = deque()
         network.listeners[address] = (process, self.arrive)
+        process.on_death.append(self.shut)
 
     def arrive(self, end: End) -> bool:
         self.network.listeners[self.address] = (self.process, self.arrive)
@@ -151,6 +152,7 @@ class Datagrams(Described):
         self.address = address
         self.waiting: deque[tuple[bytes, tuple[str, int]]] = deque(maxlen=256)
         network.datagram_sockets[address] = self.arrive
+        process.on_death.append(lambda: network.datagram_sockets.pop(address, None))
 
     def arrive(self, data: bytes, source: tuple[str, int]) -> None:
         self.waiting.append((data, source))

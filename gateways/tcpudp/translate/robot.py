@@ -128,7 +128,7 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         elif session.misreads:
-            self._rest(now, until=until, spacing_s=IDLE_STOP_S / 2)
+            self._rest(now, until=until)
             return
         self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
@@ -190,8 +190,7 @@ class TcpUdpRobot(Robot):
         if session.outbox.prolong(_MOTION, frames, period_s=REPEAT_S, until=until):
             self._rests_until = max(self._rests_until, until)
         else:
-            apart_s = IDLE_STOP_S / 2 if session.misreads else 0.0
-            self._rest(now, period_s=REPEAT_S, until=until, spacing_s=apart_s, urgent=session.sent_autonomous)
+            self._rest(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
 
     def _mode(self, command: Mode, now: float) -> None:
         """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""
@@ -226,12 +225,13 @@ class TcpUdpRobot(Robot):
     def _send(self, message: Packet) -> None:
         self._connected().send(message)
 
-    def _rest(
-        self, now: float, *, until: float, period_s: float = math.inf, spacing_s: float = 0.0, urgent: bool = False
-    ) -> None:
+    def _rest(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
         """Repeat the packets of a stop; raise Refused if the robot may be sent none of them."""
-        session = self._connected()
+        session, spacing_s = self._connected(), 0.0
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
+        if session.misreads and len(frames) > 1:  # each of the pair must be read alone
+            spacing_s = IDLE_STOP_S / 2
+            period_s = max(period_s, spacing_s)
         session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
         self._rests_until = until
 

@@ -11,6 +11,8 @@ import msgpack
 
 TOLERANCE = {"tcpudp": 1e-6, "alf": 0.0051, "wc2ec": 1e-6}
 """By how much a value at the robot may differ from the one that was given, fractions of full scale."""
+MAX_AGE_S = 0.4
+"""Seconds after which a dated command is stale, unless the deadman is less."""
 WHEEL_FULL = 10.0
 """rad/s of a wheel at full scale, as the scenarios configure it."""
 
@@ -80,7 +82,8 @@ class Grant:
         """Follow a command that reached the gateway: when motion must wait for neutral."""
         late_s = now - command.put_at
         self.base_s = min(self.base_s, late_s)
-        if late_s < 0.3:
+        late_s -= self.base_s
+        if not command.dated or late_s < MAX_AGE_S + 0.1:
             self.renewed_at = now
         if command.kind == "mode":
             self.autonomous = command.value > 0
@@ -90,6 +93,8 @@ class Grant:
                 self.held_back = False
             self.last_motion, self.autonomous = None, False
             return
+        if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) - 0.05:
+            return  # refused as stale, or nearly: it begins nothing
         last = self.last_motion
         if last is not None:
             since_s = now - (last.put_at if last.dated else last.received[self.gateway])

@@ -26,6 +26,7 @@ def main() -> int:
     parser.add_argument("--replay", type=Path, help="run a kept scenario (JSON) and print its trace")
     parser.add_argument("--trace", action="store_true", help="print the trace of the first scenario")
     parser.add_argument("--keep", type=Path, help="a folder: shrink what fails, and write it there")
+    parser.add_argument("--first", action="store_true", help="end with the first scenario that fails")
     parser.add_argument("--twice", action="store_true", help="run each scenario twice and compare the traces")
     parser.add_argument("--verbose", action="store_true", help="print the counts of what was reached")
     options = parser.parse_args()
@@ -60,6 +61,8 @@ def campaign(options: Any) -> int:
         if outcome.violations:
             failed += 1
             report(seed, made, outcome, options.keep)
+        if failed and options.first:
+            break
     spent = time.process_time() - begun
     print(f"{ran} scenarios, {simulated / 3600:.2f} simulated hours in {spent:.0f} s of one core: ", end="")
     print(f"{simulated / 60 / spent:.2f} simulated hours a minute; {failed} failed")

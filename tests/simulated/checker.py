@@ -96,11 +96,24 @@ class Checker:
             for known in self.latches.values():
                 known.pop(request.get("id", b""), None)
         elif answer.get("ok") and verb in ("acquire", "takeover"):
-            self._grant(Grant(gateway, asker, answer, request, self.world.now), request)
-        elif answer.get("ok") and verb == "release" and gateway in self.current:
-            self.end(gateway, "released")
+            grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
+            stands = last is not None and last.ended_at is None and last.shown
+            if verb == "acquire" and stands and not request.get("priority"):
+                self.violate("held", f"{grant} granted while {last} stands")
+            self._grant(grant, request)
+        elif verb == "release" and gateway in self.current:
+            self._released(self.current[gateway], answer, asker)
         elif answer.get("ok") and verb == "renew" and gateway in self.current:
             self.current[gateway].renewed_at = self.world.now
+
+    def _released(self, grant: Grant, answer: dict[str, Any], asker: str) -> None:
+        """Only the holder ends its lease, and may do so."""
+        if answer.get("ok") and asker != grant.asker and grant.ended_at is None:
+            self.violate("forged", f"{asker} released {grant}")
+        elif not answer.get("ok") and answer.get("code") == "malformed" and asker == grant.asker:
+            self.violate("forged", f"{asker} may not release {grant}: {answer.get('reason')}")
+        if answer.get("ok"):
+            self.end(grant.gateway, "released")
 
     def _grant(self, grant: Grant, request: dict[str, Any]) -> None:
         now = self.world.now
@@ -172,7 +185,7 @@ class Checker:
         kind = key.partition("@cmd/")[2].partition("/")[0]
         if kind in ("drive", "motor", "mode") and attachment:
             command = Command(key, payload, read(attachment), who, self.world.now)
-            self._commands[key, payload, attachment] = command
+            self._commands.setdefault((key, payload, attachment), command)
             if who in self.gateways and kind != "mode" and command.value:
                 self._of_program(who, command)
         elif kind == "stop":
@@ -258,6 +271,8 @@ class Checker:
         grant = self.grants.get(command.lease or b"")
         if grant is None or grant.gateway != gateway:
             return "no-lease", "without a lease of this gateway"
+        if command.who != grant.asker:
+            return "forged", f"{command.who} used the lease of {grant.asker}"
         if grant.over(now, SLACK_S):
             return "lease-ended", f"its lease ended {now - (grant.ended_at or 0):.2f} s ago: {grant.why}"
         if received < grant.at:

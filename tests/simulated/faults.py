@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import msgpack
+
 if TYPE_CHECKING:
     from tests.simulated.scenario import Simulation
 
@@ -37,6 +39,7 @@ class Faults:
         self._waiting: dict[str, list[dict[str, Any]]] = {}
         self.reached: dict[str, int] = {}
         self._over = False
+        self._overheard: tuple[str, str, bytes, bytes] | None = None
         self.world.watchers.append(self._watch)
 
     def plan(self, steps: list[dict[str, Any]]) -> None:
@@ -48,6 +51,10 @@ class Faults:
                 self.world.at(step["t"], lambda step=step: self.do(step))
 
     def _watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        if what == "puts" and fields[0].endswith("@cmd/drive") and fields[2]:
+            grant = self._simulation.checker.grants.get(msgpack.unpackb(fields[2])["lease"])
+            if grant is not None and grant.asker == who:
+                self._overheard = (who, *fields)
         if not self._waiting:
             return
         for state in [state for state in self._waiting if REACHED[state](who, what, fields)]:
@@ -163,6 +170,24 @@ class Faults:
             paths.loss = 0.0
 
         self._later(step, undo)
+
+    def _forge(self, step: dict[str, Any]) -> None:
+        """Somebody who overheard a drive alters it, repeats it late, and asks for the end of the lease."""
+        overheard = self._overheard
+        driver = next((each for each in self._simulation.drivers if overheard and each.name != overheard[0]), None)
+        if overheard is None or driver is None or not driver.running or driver.bus is None:
+            return
+        _, key, payload, attachment = overheard
+        bus, shown = driver.bus, msgpack.unpackb(attachment)
+        altered = msgpack.packb({**msgpack.unpackb(payload), "forward": 0.98765})
+        later = msgpack.packb({**shown, "seq": shown["seq"] + 1000})
+        bus.put(key, altered, attachment, droppable=False)
+        bus.put(key, altered, later, droppable=False)
+        bus.put(key, payload, attachment, droppable=False)
+        for after_s in (0.7, 1.3):
+            driver.process.after(after_s, lambda: bus.put(key, payload, attachment, droppable=False))
+        ask = bus.ask("fleet/r1/@rpc/control/release", later)
+        driver.process.loop.create_task(ask)
 
     def _jump(self, step: dict[str, Any]) -> None:
         """Let the wall clock jump."""

@@ -116,6 +116,8 @@ def _acts(rng: random.Random, made: dict[str, Any]) -> list[dict[str, Any]]:
             step["releases"] = rng.random() < 0.7
             if autonomous and rng.random() < 0.25:
                 step |= {"mode": "autonomous", "silent": True}
+            if rng.random() < 0.15:
+                step |= {"for": 0.05, "neutral": False, "releases": False}  # one command, and silence
             if rng.random() < 0.25:
                 step = {"t": step["t"], "who": who, "do": rng.choice(("stop", "stop", "latch", "unlatch", "unlatch"))}
                 step["fleet"] = rng.random() < 0.3
@@ -143,7 +145,7 @@ def _faults(rng: random.Random, made: dict[str, Any], profile: str) -> list[dict
 
 KINDS = {
     "link": ("cut", "cut", "pause robot", "reset", "slow", "lose"),
-    "bus": ("cut bus", "cut bus", "unlink", "router", "news", "duplicate", "slow bus", "pause driver"),
+    "bus": ("cut bus", "cut bus", "unlink", "router", "news", "duplicate", "slow bus", "pause driver", "forge"),
     "ownership": ("cut bus", "cut routers", "cut routers", "unlink", "kill", "end", "pause gateway", "news", "cut"),
     "hq": ("cut hq", "pause program", "pause gateway", "reset hq", "cut bus", "lose", "kill"),
     "restart": ("kill", "kill", "end", "end", "pause robot", "cut"),
@@ -157,6 +159,7 @@ KINDS["tcpudp"] = KINDS["alf"] = KINDS["wc2ec"] = (
     "lose",
     "pause gateway",
 )
+KINDS["hq"] += ("forge",)
 KINDS["mixed"] = tuple({kind: None for kinds in tuple(KINDS.values()) for kind in kinds}) + ("jump", "suspend")
 
 

@@ -168,10 +168,10 @@ class DriverMember(Member):
         """Whether it learns of the loss of its lease."""
         self._attempts = itertools.count(1)
         self._count = 0
-        self._bus: SimBus | None = None
+        self.bus: SimBus | None = None
 
     async def run(self, bus: SimBus) -> None:
-        self._bus, self.busy = bus, False
+        self.bus, self.busy = bus, False
         await asyncio.Event().wait()
 
     def value(self) -> float:
@@ -182,7 +182,7 @@ class DriverMember(Member):
 
     def do(self, step: dict[str, Any]) -> None:
         """Begin a step, in a task of its own."""
-        if not self.alive or self._bus is None:
+        if not self.alive or self.bus is None:
             return
         loop = self.process.loop
         assert loop is not None
@@ -208,8 +208,8 @@ class DriverMember(Member):
         self.host.world.note(self.name, what, *fields)
 
     async def _other(self, step: dict[str, Any]) -> None:
-        assert self._bus is not None
-        fleet = Fleet(self._bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
+        assert self.bus is not None
+        fleet = Fleet(self.bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
         robot = fleet[ROBOT]
         if step["do"] == "stop":
             await robot.stop()
@@ -221,8 +221,8 @@ class DriverMember(Member):
 
     async def _drive(self, step: dict[str, Any]) -> None:
         """Acquire, drive for a while, and give the robot back: with the Python client."""
-        assert self._bus is not None
-        fleet = Fleet(self._bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
+        assert self.bus is not None
+        fleet = Fleet(self.bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
         control = fleet[ROBOT].control
         try:
             async with control(
@@ -274,8 +274,8 @@ class DriverMember(Member):
     # A client of its own, as docs/keys.md describes it: no liveliness token, and dates only where asked to
 
     async def _drive_raw(self, step: dict[str, Any]) -> None:
-        assert self._bus is not None
-        bus, key = self._bus, f"fleet/{ROBOT}/"
+        assert self.bus is not None
+        bus, key = self.bus, f"fleet/{ROBOT}/"
         question: dict[str, Any] = {"who": self.name, "deadman_s": step.get("deadman_s", 0.5), "lease_s": 3.0}
         dated = self.options.get("dated", False)
         if dated:
@@ -292,7 +292,7 @@ class DriverMember(Member):
             self.busy = False
 
     async def _push_raw(self, step: dict[str, Any], lease: dict[str, Any], dated: bool) -> None:
-        bus, loop = self._bus, asyncio.get_running_loop()
+        bus, loop = self.bus, asyncio.get_running_loop()
         ends_at, number = loop.time() + step.get("for", 2.0), 0
         while True:
             over = loop.time() >= ends_at

@@ -59,8 +59,10 @@ def caught_by(mutant: Mutant, folder: Path, seconds: float, seed: int) -> str | 
     )
     if ran.returncode == 0:
         return None
-    lines = (ran.stdout or ran.stderr).strip().splitlines()
-    return lines[1].strip()[:150] if len(lines) > 1 else lines[0]
+    lines = ran.stdout.strip().splitlines()
+    if len(lines) < 2 or not lines[0].startswith("seed"):
+        raise SystemExit(f"{mutant.name}: the simulation itself failed: {ran.stderr[-500:]}")
+    return lines[1].strip()[:150]
 
 
 if __name__ == "__main__":

@@ -78,12 +78,23 @@ class Obligations:
 
     def _on_control(self, gateway: str, control: dict[str, Any]) -> None:
         self._control[gateway] = control
+        last = self.checker.current.get(gateway)
+        if last is not None and last.shown and control.get("lease") != last.lease:
+            self._ended_unexplained(last)
+            self.checker.end(gateway, "as control says")
         grant = self.checker.grants.get(control.get("lease") or b"")
         if grant is None:
             return
         grant.shown = True
         if grant.over(self.world.now, TOLD_S) and self._undisturbed(gateway, grant.ended_at or 0.0):
             self.checker.violate("control", f"{gateway} shows {grant}, which has ended: {grant.why}")
+
+    def _ended_unexplained(self, grant: Grant) -> None:
+        """A lease whose holder drives does not end for no reason: one gateway, and nothing that ended it."""
+        alone = sum(each.serves for each in self.simulation.gateways) == 1
+        driven = grant.last_motion is not None and self.world.now - grant.last_motion.put_at < 0.5
+        if grant.ended_at is None and alone and driven and self._undisturbed(grant.gateway, grant.at):
+            self.checker.violate("lost-lease", f"{grant} ended for no reason while it was used")
 
     def _undisturbed(self, who: str, since: float) -> bool:
         """Whether a process ran all the time since then."""

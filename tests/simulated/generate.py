@@ -112,6 +112,7 @@ def _acts(rng: random.Random, made: dict[str, Any]) -> list[dict[str, Any]]:
             step["deadman_s"] = rng.choice((0.3, 0.5, 1.0))
             step["hz"] = rng.choice((3.0, 5.0, 10.0, 10.0, 20.0))
             step["takeover"] = rng.random() < 0.25
+            step["wiggles"] = rng.random() < 0.3
             step["neutral"] = rng.random() < 0.7
             step["releases"] = rng.random() < 0.7
             if autonomous and rng.random() < 0.25:
@@ -190,6 +191,6 @@ def _aim(rng: random.Random, made: dict[str, Any], step: dict[str, Any]) -> None
     else:
         step["target"] = driver["name"] if target == "driver" else gateway["name"]
     if kind == "slow":
-        step["by"] = rng.choice((0.05, 0.2))
+        step["by"] = rng.choice((0.05, 0.2, 0.35))
     if kind == "news":
         step["late"], step["lost"] = rng.choice((0.5, 3.0)), rng.choice((0.0, 0.0, 0.5))

@@ -244,6 +244,10 @@ class DriverMember(Member):
         finally:
             self.busy = False
 
+    def _wiggles(self, step: dict[str, Any]) -> bool:
+        """Whether the stick is centred now, as people do while they drive."""
+        return bool(step.get("wiggles")) and self.process.rng.random() < 0.3
+
     async def _push(self, drive: Any, step: dict[str, Any]) -> None:
         loop = asyncio.get_running_loop()
         ends_at, hz = loop.time() + step.get("for", 2.0), step.get("hz", 10.0)
@@ -253,7 +257,7 @@ class DriverMember(Member):
         while loop.time() < ends_at and not drive.lost.is_set():
             try:
                 if not step.get("silent"):
-                    value = self.value()
+                    value = 0.0 if self._wiggles(step) else self.value()
                     self.note("gives", value)
                     await drive(forward=value)
             except NeutralFirst:
@@ -296,7 +300,7 @@ class DriverMember(Member):
         ends_at, number = loop.time() + step.get("for", 2.0), 0
         while True:
             over = loop.time() >= ends_at
-            value = 0.0 if over else self.value()
+            value = 0.0 if over or self._wiggles(step) else self.value()
             self.note("gives", value)
             number += 1
             payload = msgpack.packb({"forward": value, "left": 0.0, "turn": 0.0})

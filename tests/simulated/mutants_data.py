@@ -173,13 +173,6 @@ MUTANTS = (
     ),
     # stops and standing still
     Mutant(
-        "no stop is repeated",
-        "tcpudp",
-        STANDSTILL,
-        "        self._send(now, now + STOP_REPEAT_S)",
-        "        self._send(now, now)",
-    ),
-    Mutant(
         "no idle stops",
         "tcpudp",
         STANDSTILL,

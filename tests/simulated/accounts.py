@@ -51,6 +51,7 @@ class Grant:
         self.gateway = gateway
         self.asker = asker
         self.at = now
+        self.who = str(request.get("who"))
         self.lease_s: float = answer.get("expires_in_s") or 3.0
         self.alive: str | None = request.get("alive")
         self.dated = "t" in request and answer.get("max_age_s") is not None

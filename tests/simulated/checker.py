@@ -20,6 +20,8 @@ SLACK_S = 0.06
 """What is on its way through a gateway when a lease ends may be written so long."""
 WRITTEN_S = 0.02
 """Seconds that writing a latched stop takes."""
+KNOWN_S = 8.0
+"""Two gateways that see each other for so long know the same latched stops."""
 MEET_S = 3.0
 """Two gateways that see each other for so long: exactly one grants."""
 MOST = 20
@@ -48,6 +50,8 @@ class Checker:
         self._gives: dict[str, deque[tuple[float, float]]] = {
             each.name: deque(maxlen=200) for each in simulation.programs
         }
+        self._taken_at: dict[str, float] = {}
+        """By the name of a holder, when a stop or a takeover ended its lease."""
         self._wrote_motion: dict[str, float] = {}
         self._met: dict[frozenset[str], float] = {}
         self._handlers = {
@@ -124,6 +128,7 @@ class Checker:
         grant.deadman_s = min(request.get("deadman_s") or most_s, most_s)
         grant.base_s = now - request.get("asked at", now)
         self.end(grant.gateway, "superseded")
+        self._neutral_between(self._taken_at.pop(grant.who, None), grant)
         self.grants[grant.lease] = self.current[grant.gateway] = grant
         if any(now - at > SLACK_S for at in self.latches[grant.gateway].values()):
             self.violate("latched", f"{grant} granted while latched")
@@ -132,11 +137,22 @@ class Checker:
                 self.violate("one-gateway", f"{grant} granted while {last} stands")
         self.obligations.granted(grant)
 
+    def _neutral_between(self, taken_at: float | None, grant: Grant) -> None:
+        """An HQ program whose robot was taken says neutral before it drives again."""
+        programs = self.simulation.programs
+        if taken_at is None or len(programs) != 1 or not grant.who.startswith("hq."):
+            return
+        said = self._gives[programs[0].name]
+        if not any(value == 0.0 and at > taken_at - 0.2 for at, value in said):
+            self.violate("hq-neutral", f"{grant}: nothing neutral was said since the robot was taken")
+
     def end(self, gateway: str, why: str) -> None:
         """Note the end of a gateway's lease."""
         grant = self.current.get(gateway)
         if grant is not None and grant.ended_at is None:
             grant.end(self.world.now, why)
+            if why in ("stop", "superseded"):
+                self._taken_at[grant.who] = self.world.now
             self.counts[f"lease ended: {why}"] += 1
             self.obligations.lease_ended(grant)
 
@@ -180,8 +196,19 @@ class Checker:
                 pair = frozenset((one, other))
                 if a.running and b.running and self.simulation.fabric.works(a.session, b.session):
                     self._met.setdefault(pair, self.world.now)
+                    self._share_latches(one, other)
                 else:
                     self._met.pop(pair, None)
+
+    def _share_latches(self, one: str, other: str) -> None:
+        """Two gateways of one robot that met for long know of each other's latches."""
+        now = self.world.now
+        if self._met_for(one, other) < KNOWN_S:
+            return
+        for here, there in ((one, other), (other, one)):
+            for stop_id, at in self.latches[here].items():
+                if now - at > KNOWN_S:
+                    self.latches[there].setdefault(stop_id, now)
 
     def _met_for(self, one: str, other: str) -> float:
         return self.world.now - self._met.get(frozenset((one, other)), self.world.now)

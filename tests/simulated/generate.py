@@ -15,6 +15,8 @@ PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf
 SECONDS = (25.0, 60.0)
 _WHEELS = {"differential": {"left": ["left"], "right": ["right"], "wheel_radius_m": 0.05, "track_m": 0.3}}
 _STATES = tuple(REACHED)
+_DRIVEN = ("moving", "moving", "mode read", "drive received", "stopping", "stop unwritten")
+"""The states in which a fault of the robot or its link hurts."""
 
 
 def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
@@ -137,8 +139,11 @@ def _faults(rng: random.Random, made: dict[str, Any], profile: str) -> list[dict
             "for": round(rng.choice((0.1, 0.3, 0.7, 1.5, 2.5, 5.0, 12.0)) * rng.uniform(0.7, 1.3), 2),
         }
         _aim(rng, made, step)
+        hits_robot = "robot" in (step.get("target"), *step.get("between", ()))
+        if hits_robot:
+            step["for"] = round(rng.choice((0.7, 2.5, 4.0, 7.0)) * rng.uniform(0.7, 1.3), 2)
         if rng.random() < 0.6:
-            step["when"] = rng.choice(_STATES)
+            step["when"] = rng.choice(_DRIVEN if hits_robot else _STATES)
             step["after"] = round(rng.choice((0.0, 0.0002, 0.001, 0.005, 0.05, 0.3)), 4)
         steps.append(step)
     return steps
@@ -152,14 +157,8 @@ KINDS = {
     "restart": ("kill", "kill", "end", "end", "pause robot", "cut"),
     "latch": ("kill", "end", "cut bus", "unlink", "news", "pause gateway", "duplicate"),
 }
-KINDS["tcpudp"] = KINDS["alf"] = KINDS["wc2ec"] = (
-    "pause robot",
-    "pause robot",
-    "cut",
-    "reset",
-    "lose",
-    "pause gateway",
-)
+_ROBOT = ("pause robot", "pause robot", "pause robot", "cut", "cut", "reset", "lose", "pause gateway")
+KINDS["tcpudp"] = KINDS["alf"] = KINDS["wc2ec"] = _ROBOT
 KINDS["hq"] += ("forge",)
 KINDS["mixed"] = tuple({kind: None for kinds in tuple(KINDS.values()) for kind in kinds}) + ("jump", "suspend")
 

@@ -118,7 +118,7 @@ def _acts(rng: random.Random, made: dict[str, Any]) -> list[dict[str, Any]]:
             step["neutral"] = rng.random() < 0.7
             step["releases"] = rng.random() < 0.7
             if autonomous and rng.random() < 0.25:
-                step |= {"mode": "autonomous", "silent": True}
+                step |= {"mode": "autonomous", "silent": True, "then": rng.choice((None, "none", "manual"))}
             if rng.random() < 0.15:
                 step |= {"for": 0.05, "neutral": False, "releases": False}  # one command, and silence
             if rng.random() < 0.25:

@@ -268,6 +268,10 @@ class DriverMember(Member):
             except Refused:
                 await asyncio.sleep(0.2)
             await asyncio.sleep(1 / hz)
+        if step.get("then") and not drive.lost.is_set():
+            self.note("gives mode", step["then"])
+            await drive.mode(step["then"])
+            await asyncio.sleep(0.5)
         if drive.lost.is_set():
             self.note("lost")
         elif step.get("neutral", True):

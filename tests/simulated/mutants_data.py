@@ -189,9 +189,9 @@ MUTANTS = (
     Mutant(
         "autonomous mode survives a stall",
         "tcpudp",
-        TCPUDP,
-        "if paired else (ClientJoystickStop(),)",
-        "if paired and self._chosen == AUTONOMOUS else (ClientJoystickStop(),)",
+        "gateways/tcpudp/session/hq_role.py",
+        "        if type(frame) is _Chosen and frame.autonomous:\n            self.sent_autonomous = True",
+        "        if type(frame) is _Chosen:\n            self.sent_autonomous = frame.autonomous",
     ),
     Mutant(
         "stop does not end mode 3",

@@ -256,7 +256,8 @@ class Checker:
         command.received[gateway] = now
         self._recent[gateway].append(command)
         grant = self.current.get(gateway)
-        if grant is not None and command.lease == grant.lease and grant.ended_at is None:
+        theirs = grant is not None and command.lease == grant.lease and command.who == grant.asker
+        if grant is not None and theirs and grant.ended_at is None:
             grant.received(command, now)
 
     # What is written to the robot

@@ -118,7 +118,8 @@ class Obligations:
 
         def look() -> None:
             shown = self._control.get(grant.gateway, {}).get("lease")
-            if shown == grant.lease and self._undisturbed(grant.gateway, grant.ended_at or 0.0):
+            running = self._undisturbed(grant.gateway, grant.ended_at or 0.0) and self._serves(grant.gateway)
+            if shown == grant.lease and running:
                 self.checker.violate("control", f"{grant.gateway} still shows {grant}: {grant.why}")
 
         self.world.after(TOLD_S, look)

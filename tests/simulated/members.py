@@ -207,9 +207,14 @@ class DriverMember(Member):
         """Enter something into the program's log."""
         self.host.world.note(self.name, what, *fields)
 
+    def _fleet(self) -> Fleet:
+        assert self.bus is not None
+        clock_ms, secret = self.host.raw_ms, self.process.rng.randbytes
+        return Fleet(self.bus, name=self.name, clock_ms=clock_ms, attempts=self._attempts, secret=secret)
+
     async def _other(self, step: dict[str, Any]) -> None:
         assert self.bus is not None
-        fleet = Fleet(self.bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
+        fleet = self._fleet()
         robot = fleet[ROBOT]
         if step["do"] == "stop":
             await robot.stop()
@@ -222,7 +227,7 @@ class DriverMember(Member):
     async def _drive(self, step: dict[str, Any]) -> None:
         """Acquire, drive for a while, and give the robot back: with the Python client."""
         assert self.bus is not None
-        fleet = Fleet(self.bus, clock_ms=self.host.raw_ms, attempts=self._attempts)
+        fleet = self._fleet()
         control = fleet[ROBOT].control
         try:
             async with control(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Any
 
@@ -52,6 +53,7 @@ class Fleet:
     """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says.
 
     clock_ms: the raw clock, which dates commands. attempts: numbers the requests for a lease of this bus session.
+    secret: returns so many random bytes.
     """
 
     def __init__(
@@ -62,8 +64,10 @@ class Fleet:
         *,
         clock_ms: Callable[[], float] = raw_ms,
         attempts: Iterator[int] = _attempts,
+        secret: Callable[[int], bytes] = os.urandom,
     ) -> None:
-        self._machine = (clock_ms, attempts)
+        self._machine = (clock_ms, attempts, secret)
+        self._secret = secret
         self.realm = realm
         self.name = name
         self._bus = bus
@@ -148,7 +152,7 @@ class Fleet:
         return await stops.unlatch_fleet(self._bus, self.realm, names, self._own)
 
     async def _stop(self, names: Iterable[str] | None, reason: str | None, *, latch: bool) -> dict[str, Outcome]:
-        stop = stops.new_stop(self._own, reason, latch=latch)
+        stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
         if names is None:
             await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
             names = filter(is_name, await settled(self._gateways, lambda seen: seen))
@@ -236,8 +240,10 @@ class Robot:
         own: str | None = None,
         clock_ms: Callable[[], float] = raw_ms,
         attempts: Iterator[int] = _attempts,
+        secret: Callable[[int], bytes] = os.urandom,
     ) -> None:
         self.name = keys.robot
+        self._secret = secret
         self._own = own or default_who()
         self._bus = bus
         self._keys = keys
@@ -293,11 +299,15 @@ class Robot:
 
         Raises BusError if no gateway does within 3 s, Refused if the robot cannot be stopped or reached.
         """
-        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=False))
+        await stops.stop_robot(
+            self._bus, self._keys, stops.new_stop(self._own, reason, latch=False, secret=self._secret)
+        )
 
     async def latch(self, reason: str | None = None) -> None:
         """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
-        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=True))
+        await stops.stop_robot(
+            self._bus, self._keys, stops.new_stop(self._own, reason, latch=True, secret=self._secret)
+        )
 
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.

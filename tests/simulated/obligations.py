@@ -14,6 +14,8 @@ REST_S = 1.5
 """Longest time to rest, once the robot and its link work; docs/what-happens.md."""
 TOLD_S = 0.25
 """Longest time until ``control`` shows news."""
+HEARTBEAT_S = 2.5
+"""Seconds without ``status`` that are too many."""
 STATUS_S = 1.4
 """A gateway that serves its robot publishes ``status`` so often."""
 
@@ -26,6 +28,8 @@ class Obligations:
         self.simulation = checker.simulation
         self.world = checker.world
         self._status_at: dict[str, float] = {}
+        self._tokens: dict[str, float] = {}
+        """By gateway, since when its token says that it serves the robot."""
         self._control: dict[str, dict[str, Any]] = {}
         self._disturbed: dict[str, float] = {}
         """By process, when it was last paused, resumed or started."""
@@ -51,9 +55,12 @@ class Obligations:
             elif fields[0].endswith("/control"):
                 self._on_control(who, read(fields[1]))
         elif what == "killed" and who in self.checker.gateways:
+            self._tokens.pop(who, None)
             self._disturbed[who] = self._disturbed_dead = self.world.now
         elif what in ("paused", "resumed", "started", "told to end", "was suspended"):
             self._disturbed[who] = self.world.now
+        elif what in ("announces", "withdraws") and fields[0].endswith("/@alive/gateway"):
+            self._tokens[who] = self.world.now if what == "announces" else float("inf")
         elif who == "robot":
             self._on_robot(what, fields)
         elif what == "granted":
@@ -162,7 +169,17 @@ class Obligations:
         self.checker.expire()
         self.checker.meet()
         self._look_at_robot()
+        self._look_for_heartbeats()
         self.world.after(TICK_S, self._tick)
+
+    def _look_for_heartbeats(self) -> None:
+        """A gateway that serves its robot publishes ``status`` once a second."""
+        now = self.world.now
+        for gateway, since in self._tokens.items():
+            said = max(self._status_at.get(gateway, 0.0), since)
+            if now - said > HEARTBEAT_S and self._undisturbed(gateway, now - HEARTBEAT_S - 1.0):
+                self.checker.violate("heartbeat", f"{gateway} published no status for {now - said:.1f} s")
+                self._status_at[gateway] = now
 
     def _works(self) -> str | None:
         """Return the gateway that serves the robot and reaches it now, by a connection that is established."""

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.bus import SOON_S
-from tests.simulated import simulated
+from tests.simulated_robot import simulated
 from zbridge.app import Gateway, plan
 from zbridge.bus import BusSettings
 from zbridge.bus.zenoh import ZenohBus, zenoh_config

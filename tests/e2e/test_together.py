@@ -14,7 +14,7 @@ from tests.benchmarks.fleet_robots import READING, REGISTERED
 from tests.e2e.conftest import HOST, WAIT_S, end, start
 from tests.e2e.secure import SecureBus
 from tests.e2e.test_secure_gateway import member
-from tests.simulated import simulated
+from tests.simulated_robot import simulated
 from zbridge.app.roles import Member, Roles
 from zbridge.bus.tls.files import folder_tls
 from zbridge.client import Fleet

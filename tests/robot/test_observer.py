@@ -119,7 +119,7 @@ def deposited(rig: Rig, budget: Budget) -> Any:
 
 
 @contextlib.asynccontextmanager
-async def heir_of(deposit: Any, monkeypatch: pytest.MonkeyPatch, *partials: Partial) -> AsyncIterator[Rig]:
+async def heir_of(deposit: Any, *partials: Partial) -> AsyncIterator[Rig]:
     """Run the device of another process, which attaches a link when it has taken over."""
 
     async def take_over(address: object, given: object, parcel: Parcel, conversation: Conversation) -> None:
@@ -131,8 +131,7 @@ async def heir_of(deposit: Any, monkeypatch: pytest.MonkeyPatch, *partials: Part
     async def begin() -> None:
         assert heir.links == [], "no connection is touched before the word to go"
 
-    monkeypatch.setattr("zbridge.robot.connection.take_over", take_over)
-    heir = Rig()
+    heir = Rig(take_over=take_over)
     heir.device.take_over(deposit, Parcel(), partials)
     task = asyncio.ensure_future(heir.device.run(begin))
     await heir.settle()
@@ -142,12 +141,10 @@ async def heir_of(deposit: Any, monkeypatch: pytest.MonkeyPatch, *partials: Part
         await task
 
 
-async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(rig: Rig) -> None:
     rig.command("drive", {"left": 1.0})
     rig.command("text", {"text": "hi"})
-    async with heir_of(deposited(rig, Budget(1000)), monkeypatch) as heir:
+    async with heir_of(deposited(rig, Budget(1000))) as heir:
         await asyncio.sleep(5.0)
         assert heir.last("status")["state"] == "established"
         assert len(heir.link.written) >= 5
@@ -158,12 +155,10 @@ async def test_who_goes_on_sends_the_stop_first_and_nothing_of_what_waited(
         assert heir.link.written[-1] == LEFT
 
 
-async def test_who_goes_on_publishes_again_what_the_dead_process_had_published_last(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_who_goes_on_publishes_again_what_the_dead_process_had_published_last(rig: Rig) -> None:
     rig.sends(LIDAR_ON)
     lidar = rig.bus.values("fleet/r1/lidar")[-1]
-    async with heir_of(deposited(rig, Budget(1000)), monkeypatch) as heir:
+    async with heir_of(deposited(rig, Budget(1000))) as heir:
         assert heir.bus.values("fleet/r1/lidar") == [lidar], "a listener of the same process asked too early"
 
 
@@ -182,21 +177,17 @@ async def test_nobody_is_given_the_lease_before_the_word_to_go(rig: Rig) -> None
         await task
 
 
-async def test_a_large_published_value_is_left_out_of_a_deposit_and_its_key_stays(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_large_published_value_is_left_out_of_a_deposit_and_its_key_stays(rig: Rig) -> None:
     size = len(rig.bus.values("fleet/r1/status")[-1])
     budget = Budget(size - 1)
-    async with heir_of(deposited(rig, budget), monkeypatch) as heir:
+    async with heir_of(deposited(rig, budget)) as heir:
         assert budget.left_out["status"] == size
         assert "status" in heir.device._publishers.known
     assert deposited(rig, Budget(size))["published"][0][1] is not None
 
 
-async def test_the_rest_of_a_frame_whose_beginning_was_lost_is_skipped_and_the_next_one_read(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with heir_of(deposited(rig, Budget(1000)), monkeypatch, Partial(skip=5)) as heir:
+async def test_the_rest_of_a_frame_whose_beginning_was_lost_is_skipped_and_the_next_one_read(rig: Rig) -> None:
+    async with heir_of(deposited(rig, Budget(1000)), Partial(skip=5)) as heir:
         heir.sends(b"\0\0\0")
         heir.sends(b"\0\0" + POSITION)
         assert heir.last("pose")["x"] == pytest.approx(1.0)

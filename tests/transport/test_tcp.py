@@ -12,7 +12,7 @@ from tests.ports import free_port
 from tests.transport.recorder import LOCAL, SOON_S, Recorder, connected, socket_of, udp_socket, until
 from zbridge.errors import LinkError
 from zbridge.protocol.address import Address
-from zbridge.transport import tcp, tcp_options
+from zbridge.transport import kernel, tcp, tcp_options
 from zbridge.transport.link import STALLED_S, Link
 from zbridge.transport.tcp import TcpLink, connect, listen
 
@@ -224,7 +224,7 @@ async def test_a_platform_that_tells_nothing_is_said_once_and_has_no_gate(monkey
     def unknown(*_: object) -> bytes:
         raise OSError("Inappropriate ioctl for device")
 
-    monkeypatch.setattr(tcp_options.fcntl, "ioctl", unknown)
+    monkeypatch.setattr(kernel.fcntl, "ioctl", unknown)
     monkeypatch.setattr(tcp_options, "_unwatched_warned", False)
     for _ in range(2):
         async with connected() as pair:

@@ -11,9 +11,7 @@ import asyncio
 import contextlib
 import logging
 import math
-import secrets
 import socket
-import time
 from collections.abc import Coroutine
 from functools import partial
 from typing import Any
@@ -25,6 +23,7 @@ from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
 from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
 from zbridge.app.prometheus import serve_metrics
+from zbridge.app.runtime import RUNTIME, Runtime
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
 from zbridge.app.tasks import together, until
 from zbridge.bus import Bus, Handle, IncomingQuery
@@ -50,7 +49,7 @@ from zbridge.robot.device import Device
 from zbridge.robot.observer import Observer
 from zbridge.robot.ownership import Ownership
 from zbridge.robot.settings import DevicePlan
-from zbridge.transport import Parcel, connect
+from zbridge.transport import Parcel, connect, take_over
 from zbridge.transport.fair_share import FairShare
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -74,7 +73,7 @@ class Gateway:
 
     metrics, sessions, conditions: of this gateway, shared by all parts. observer: a supervisor, told of the robot's
     links. predecessor: the channel to a gateway that hands everything over. successor: starts a process to which this
-    one can be handed over.
+    one can be handed over. runtime: the machine below.
     """
 
     def __init__(
@@ -85,8 +84,10 @@ class Gateway:
         observer: Observer | None = None,
         predecessor: socket.socket | None = None,
         successor: Successor | None = None,
+        runtime: Runtime = RUNTIME,
     ) -> None:
         self._plan = plan
+        self._runtime = runtime
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self._incoming = (
@@ -171,7 +172,7 @@ class Gateway:
         given = []
         if self._incoming is not None:
             await self._incoming.begun.wait()
-            given = [socket.socket(fileno=self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
+            given = [self._runtime.kernel.adopt(self._incoming.parcel.take(n)) for n in self._incoming.given.metrics]
         async with serve_metrics(address, self.metrics, self.missing, given) as self.restarts.metrics_sockets:
             await asyncio.Event().wait()
 
@@ -189,8 +190,10 @@ class Gateway:
                 robot,
                 self.sessions,
                 self.metrics,
-                time.monotonic,
+                self._runtime.clock,
                 each,
+                self._runtime.raw_ms,
+                self._runtime.kernel,
             )
             for plan, name, each in zip(plans, names, given, strict=True)
         ]
@@ -208,8 +211,10 @@ class Gateway:
 
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
-        self.restarts.latches = store = LatchStore(self._keys, self.conditions)
-        ownership, incoming = Ownership(bus, self._keys, mirror=store.mirror), self._incoming
+        self.restarts.latches = store = LatchStore(self._keys, self.conditions, self._runtime.folder)
+        clock, chance = self._runtime.clock, self._runtime.chance
+        ownership = Ownership(bus, self._keys, clock, mirror=store.mirror, chance=chance)
+        incoming = self._incoming
         self.restarts.claim = ClaimPart(ownership)
         try:
             bus.gather(self._keys.key("@rpc/**"))
@@ -260,14 +265,16 @@ class Gateway:
         def show() -> tuple[Handle, ...]:
             return (self._show_sessions(bus, "gateway"), self.restarts.answer(bus))
 
-        self._serving = Serving(self._keys.robot, device, ownership, store, self.conditions, show, camera)
+        self._serving = Serving(
+            self._keys.robot, device, ownership, store, self.conditions, show, camera, self._runtime.clock
+        )
         try:
             await self._serving.run(begin)
         finally:
             self.restarts.device = self._serving = None
 
     def _make_device(self, bus: Bus, audit: Audit, plan: DevicePlan, store: LatchStore) -> Device:
-        near = self._neighbourhood
+        near, runtime = self._neighbourhood, self._runtime
         control = self._plan.config.control
         limited = control.rate_hz is not None or control.slew_per_s is not None
         return Device(
@@ -276,9 +283,7 @@ class Gateway:
             protocol=plan.protocol.name,
             keys=self._keys,
             bus=bus,
-            authority=Authority(
-                control.lease_s, control.deadman_s, secrets.token_bytes, control.max_age_s, store.load()
-            ),
+            authority=Authority(control.lease_s, control.deadman_s, runtime.secret, control.max_age_s, store.load()),
             limits=MotionLimits(control.rate_hz or math.inf, control.slew_per_s or math.inf) if limited else None,
             manager=self.sessions,
             metrics=self.metrics,
@@ -287,8 +292,13 @@ class Gateway:
             idle_stop_s=control.idle_stop_s,
             share=FairShare(near.part) if near is not None else None,
             shared_address=plan.shares,
-            connect=partial(connect, buffer=near.buffer) if near is not None else connect,
+            connect=partial(connect, buffer=near.buffer if near is not None else None, kernel=runtime.kernel),
+            take_over=partial(take_over, kernel=runtime.kernel),
             observer=self._observer,
-            clock=time.monotonic,  # the time line of event loops on Linux, without their rounding
+            clock=runtime.clock,
+            clock_ns=runtime.clock_ns,
+            raw_ms=runtime.raw_ms,
+            suspended_s=runtime.suspended_s,
+            chance=runtime.chance,
             keep_latches=store.save,
         )

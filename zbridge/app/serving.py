@@ -39,7 +39,7 @@ class Serving:
     """One robot that is served; ``run`` does it.
 
     store: keeps what the owner says while this gateway is aside. show: declares what the owner of a robot answers
-    besides the device. camera: publishes the camera's images until it is cancelled.
+    besides the device. camera: publishes the camera's images until it is cancelled. clock: seconds.
     """
 
     def __init__(
@@ -51,7 +51,9 @@ class Serving:
         conditions: Conditions,
         show: Callable[[], Iterable[Handle]],
         camera: Callable[[], Coroutine[Any, Any, None]] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self._robot = robot
         self._device = device
         self._ownership = ownership
@@ -153,8 +155,8 @@ class Serving:
         if claims and not zids:
             text = SECOND_CONNECTION
         self._conditions.set(_RIVALS, text if claims else None)
-        if claims and time.monotonic() - self._told_at >= TELL_S:
-            self._told_at = time.monotonic()
+        if claims and self._clock() - self._told_at >= TELL_S:
+            self._told_at = self._clock()
             log.error("%s: %s", self._robot, text)
             for zid in zids[:_NAMED]:
                 self._device.refuse("claim", Held("this gateway serves the robot"), zid)

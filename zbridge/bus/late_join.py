@@ -35,10 +35,16 @@ LIVE_KEYS = 4096
 
 
 class LateJoin:
-    """Gives ``handler`` the last values of all keys that an expression matches, and then the live ones."""
+    """Gives ``handler`` the last values of all keys that an expression matches, and then the live ones.
 
-    def __init__(self, bus: Bus, key_expr: str, handler: Callable[[Sample], None]) -> None:
+    chance: 0 to 1.
+    """
+
+    def __init__(
+        self, bus: Bus, key_expr: str, handler: Callable[[Sample], None], chance: Callable[[], float] = random.random
+    ) -> None:
         self._bus = bus
+        self._chance = chance
         self._key_expr = key_expr
         self._handler = handler
         self.closed = False
@@ -82,7 +88,7 @@ class LateJoin:
     async def _ask(self, realm: str, robot: str) -> None:
         live = self._live[robot] = set()
         if len(self._asking) > 1:
-            await asyncio.sleep(JITTER_S * random.random())
+            await asyncio.sleep(JITTER_S * self._chance())
         try:
             for after_s in ASK_AFTER_S:
                 await asyncio.sleep(after_s)

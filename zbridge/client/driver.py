@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import getpass
 import socket
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
@@ -50,7 +50,18 @@ class Driver:
     robot was stopped, because the program was paused for example; then :meth:`neutral`, and begin anew.
     """
 
-    def __init__(self, bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        request: Acquire,
+        name: str,
+        *,
+        takeover: bool,
+        wait_s: float,
+        clock_ms: Callable[[], float] = raw_ms,
+    ) -> None:
+        self._clock_ms = clock_ms
         self.who = request.who[:NAMED]
         self.robot = keys.robot
         self.lost = asyncio.Event()
@@ -61,7 +72,7 @@ class Driver:
         self._takeover = takeover
         self._wait_s = wait_s
         self._client = LeaseClient(
-            keys, request, name, concerns=self._concerns, clock_ms=raw_ms, takeover=takeover, wait_s=wait_s
+            keys, request, name, concerns=self._concerns, clock_ms=clock_ms, takeover=takeover, wait_s=wait_s
         )
         loop = asyncio.get_running_loop()
         self._holder = LeaseHolder(bus, self._client, spawn=self._spawn, on_event=self._on_event, clock=loop.time)
@@ -133,13 +144,13 @@ class Driver:
         """
         if self._lock.locked():
             return False
-        refusal = self._put(topics.CMD_DRIVE, drive, raw_ms())
+        refusal = self._put(topics.CMD_DRIVE, drive, self._clock_ms())
         if refusal is not None:
             raise refusal
         return True
 
     async def _send(self, topic: Topic, message: FleetMessage) -> None:
-        given_ms = raw_ms()
+        given_ms = self._clock_ms()
         async with self._lock:
             refusal = self._put(topic, message, given_ms)
             if topic is not topics.CMD_DRIVE:  # a thread writes it: the next command must not overtake it
@@ -254,10 +265,17 @@ class Driver:
 
 @contextlib.asynccontextmanager
 async def holding(
-    bus: Bus, keys: KeySpace, request: Acquire, name: str, *, takeover: bool, wait_s: float
+    bus: Bus,
+    keys: KeySpace,
+    request: Acquire,
+    name: str,
+    *,
+    takeover: bool,
+    wait_s: float,
+    clock_ms: Callable[[], float] = raw_ms,
 ) -> AsyncIterator[Driver]:
     """Hold the lease while the context lasts. name: what it is asked for as; ``request.who`` begins with it."""
-    driver = Driver(bus, keys, request, name, takeover=takeover, wait_s=wait_s)
+    driver = Driver(bus, keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
     try:
         await driver.acquire()
         with contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), driver.look)):

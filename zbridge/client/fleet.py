@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import AsyncIterator, Iterable
+import os
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Any
 
 from zbridge.bus import Bus, Sample
@@ -13,6 +14,7 @@ from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
+from zbridge.control.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -48,9 +50,24 @@ an earlier wish only after it has granted a later one, which must not end for it
 
 
 class Fleet:
-    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says."""
+    """All robots of one realm: ``fleet["r1"]``. name: of this program on a secure bus, as its certificate says.
 
-    def __init__(self, bus: Bus, realm: str = "fleet", name: str | None = None) -> None:
+    clock_ms: the raw clock, which dates commands. attempts: numbers the requests for a lease of this bus session.
+    secret: returns so many random bytes.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        realm: str = "fleet",
+        name: str | None = None,
+        *,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+        secret: Callable[[int], bytes] = os.urandom,
+    ) -> None:
+        self._machine = (clock_ms, attempts, secret)
+        self._secret = secret
         self.realm = realm
         self.name = name
         self._bus = bus
@@ -62,7 +79,7 @@ class Fleet:
         """Return the robot of this name, whether or not it is on the bus; raise ValueError if it cannot be a name."""
         if not is_name(name):
             raise ValueError(f"robot {name!r}: expected letters, digits, '_', '.' and '-' only")
-        return Robot(self._bus, KeySpace(self.realm, name), self.name)
+        return Robot(self._bus, KeySpace(self.realm, name), self.name, *self._machine)
 
     async def robots(self) -> dict[str, Status | None]:
         """Return the robots that have a gateway or a status, by name; None for a robot without a status.
@@ -135,7 +152,7 @@ class Fleet:
         return await stops.unlatch_fleet(self._bus, self.realm, names, self._own)
 
     async def _stop(self, names: Iterable[str] | None, reason: str | None, *, latch: bool) -> dict[str, Outcome]:
-        stop = stops.new_stop(self._own, reason, latch=latch)
+        stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
         if names is None:
             await stops.put_stop(self._bus, KeySpace(self.realm, "*"), stop)
             names = filter(is_name, await settled(self._gateways, lambda seen: seen))
@@ -150,8 +167,17 @@ class Fleet:
 class ControlFeed(StateFeed[Control]):
     """The messages of ``control``; calling the feed acquires the right to drive."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        own: str | None = None,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+    ) -> None:
         super().__init__(bus, keys, topics.CONTROL)
+        self._clock_ms = clock_ms
+        self._attempts = attempts
         self._keys = keys
         self._own = own
 
@@ -183,9 +209,12 @@ class ControlFeed(StateFeed[Control]):
             priority=priority,
             lease_s=lease_s,
             deadman_s=deadman_s,
-            alive=f"operator.{escape(name)}.{self._bus.zid}.{next(_attempts)}",
+            alive=f"operator.{escape(name)}.{self._bus.zid}.{next(self._attempts)}",
         )
-        async with holding(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s) as driver:
+        clock_ms = self._clock_ms
+        async with holding(
+            self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms
+        ) as driver:
             yield driver
 
 
@@ -204,8 +233,17 @@ def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str
 class Robot:
     """One robot: a feed for each key it publishes, questions, commands that need no lease, and the lease."""
 
-    def __init__(self, bus: Bus, keys: KeySpace, own: str | None = None) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: KeySpace,
+        own: str | None = None,
+        clock_ms: Callable[[], float] = raw_ms,
+        attempts: Iterator[int] = _attempts,
+        secret: Callable[[int], bytes] = os.urandom,
+    ) -> None:
         self.name = keys.robot
+        self._secret = secret
         self._own = own or default_who()
         self._bus = bus
         self._keys = keys
@@ -220,7 +258,7 @@ class Robot:
         self.lidar: StateFeed[Switch] = StateFeed(bus, keys, topics.LIDAR)
         self.camera: StateFeed[Switch] = StateFeed(bus, keys, topics.CAMERA)
         self.devices: StateFeed[Devices] = StateFeed(bus, keys, topics.DEVICES)
-        self.control = ControlFeed(bus, keys, own)
+        self.control = ControlFeed(bus, keys, own, clock_ms, attempts)
 
     def __repr__(self) -> str:
         return f"<Robot {self._keys.realm}/{self.name}>"
@@ -261,11 +299,15 @@ class Robot:
 
         Raises BusError if no gateway does within 3 s, Refused if the robot cannot be stopped or reached.
         """
-        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=False))
+        await stops.stop_robot(
+            self._bus, self._keys, stops.new_stop(self._own, reason, latch=False, secret=self._secret)
+        )
 
     async def latch(self, reason: str | None = None) -> None:
         """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
-        await stops.stop_robot(self._bus, self._keys, stops.new_stop(self._own, reason, latch=True))
+        await stops.stop_robot(
+            self._bus, self._keys, stops.new_stop(self._own, reason, latch=True, secret=self._secret)
+        )
 
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.

@@ -41,9 +41,12 @@ Outcome = Refused | BusError | None
 """What came of a robot: None if it was confirmed."""
 
 
-def new_stop(who: str, reason: str | None, *, latch: bool) -> Stop:
-    """Make a stop with an id of its own. who, reason: for people, cut to what a stop can carry."""
-    stop = Stop(id=os.urandom(16), who=_cut(who, _WHO))
+def new_stop(who: str, reason: str | None, *, latch: bool, secret: Callable[[int], bytes] = os.urandom) -> Stop:
+    """Make a stop with an id of its own. who, reason: for people, cut to what a stop can carry.
+
+    secret: returns so many random bytes.
+    """
+    stop = Stop(id=secret(16), who=_cut(who, _WHO))
     if latch:
         stop = msgspec.structs.replace(stop, latch=True)
     return msgspec.structs.replace(stop, reason=_cut(reason, _REASON)) if reason else stop

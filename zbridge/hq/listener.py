@@ -33,6 +33,7 @@ from zbridge.protocol.plugin import ATTEND_S
 from zbridge.protocol.session import Limits, Session
 from zbridge.protocol.session_table import SessionTable
 from zbridge.transport import Accepted, Conversation, Door, Link, Parcel, Receiver, TlsLink, listen
+from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.hq")
 
@@ -46,7 +47,7 @@ class Listener:
 
     name: of the listener on the bus. clock: seconds on the event loop's time line, by default the loop's own.
     given: the listener as another process handed it over, and its sockets. clock_ms: the raw clock, which dates
-    commands.
+    commands. kernel: of this machine, or a simulated one.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Listener:
         clock: Callable[[], float] | None = None,
         given: tuple[Exported, Parcel] | None = None,
         clock_ms: Callable[[], float] = raw_ms,
+        kernel: Kernel = KERNEL,
     ) -> None:
         self._given = given
         self._clock_ms = clock_ms
@@ -83,7 +85,7 @@ class Listener:
         if (tls := plan.tls) is not None:
             self._secured = lambda receiver: TlsLink(receiver, tls, plan.settings.handshake_s)
         self._closing = False
-        self._door = Door(given[0]["door"], given[1]) if given is not None else Door()
+        self._door = Door(given[0]["door"], given[1], kernel) if given is not None else Door(kernel=kernel)
         self.handover = ListenerHandover(context, self._door, self.clients, self._numbers, self._add)
         """How the listener is handed to another process."""
 

@@ -173,6 +173,17 @@ class Outbox(Kept):
         elif old is not None and len(old.frames) == len(frames):
             new.position = old.position
 
+    def prolong(self, slot: str, frames: tuple[bytes, ...], *, period_s: float, until: float) -> bool:
+        """Repeat what ``slot`` holds until then, at the times it has anyway; False where it holds other frames.
+
+        Frames that somebody says again and again so leave evenly: a peer that reads seldom joins what comes closer.
+        """
+        group = self._slots.get(slot)
+        if group is None or group.frames != frames or group.due > until:
+            return False
+        group.period_s, group.until = period_s, max(group.until, until)
+        return True
+
     def forget(self) -> None:
         """Drop every frame that waits, and every repetition."""
         for place in (self._queue, self._urgent, self._exempt, self._slots):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
 from zbridge.fleet.messages import SessionEntry
@@ -16,13 +16,16 @@ REMEMBERED = 32
 
 
 class Backoff:
-    """Delays between attempts, seconds: doubling from ``first_s`` to ``most_s``, each with 25 % jitter either way."""
+    """Delays between attempts, seconds: doubling from ``first_s`` to ``most_s``, each with 25 % jitter either way.
 
-    def __init__(self, first_s: float = 0.5, most_s: float = 10.0, rng: random.Random | None = None) -> None:
+    chance: 0 to 1.
+    """
+
+    def __init__(self, first_s: float = 0.5, most_s: float = 10.0, chance: Callable[[], float] = random.random) -> None:
         self._first_s = first_s
         self._most_s = most_s
         self._next_s = first_s
-        self._rng = rng or random.Random()
+        self._chance = chance
 
     def __repr__(self) -> str:
         return f"<Backoff next {self._next_s:g} s>"
@@ -30,7 +33,7 @@ class Backoff:
     def delay_s(self) -> float:
         """Give the next delay, seconds."""
         delay_s, self._next_s = self._next_s, min(self._most_s, 2 * self._next_s)
-        return delay_s * self._rng.uniform(0.75, 1.25)
+        return delay_s * (0.75 + 0.5 * self._chance())
 
     def reset(self) -> None:
         """Start again from ``first_s``: an attempt succeeded."""

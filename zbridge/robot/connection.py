@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import random
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -27,6 +28,8 @@ log = logging.getLogger("zbridge.link")
 
 Connect = Callable[[DeviceAddress, Conversation], Any]
 """``await connect(address, receiver)``: raises LinkError where there is no connection to be had."""
+TakeOver = Callable[[DeviceAddress, Exported, Parcel, Conversation], Any]
+"""``await take_over(address, given, parcel, receiver)``: raises ProtocolError, OSError."""
 
 _STATES: dict[State, RobotState] = {
     State.CONNECTING: "connecting",
@@ -61,6 +64,9 @@ class Hooks(msgspec.Struct, frozen=True):
     """Called when a link is up (True), and when it is gone (False)."""
     read: Callable[[], object] = lambda: None
     """Called when the bytes of a read have been handled."""
+    take_over: TakeOver = take_over
+    chance: Callable[[], float] = random.random
+    """Between 0 and 1."""
     shared: bool = False
     """Whether gateways of other robots may connect to the same address."""
 
@@ -134,7 +140,7 @@ class Connection:
 
     async def run(self) -> None:
         """Connect, converse and connect again, until :meth:`close`."""
-        backoff = Backoff()
+        backoff = Backoff(chance=self._hooks.chance)
         while not self._ending:
             reason, established = await self._converse()
             if established:
@@ -196,7 +202,7 @@ class Connection:
         self.conversation.go_on()
         if given is not None:
             try:
-                await take_over(self.address, *given, self.conversation)
+                await self._hooks.take_over(self.address, *given, self.conversation)
             except (OSError, ProtocolError) as error:
                 self.conversation.lost(str(error))
 

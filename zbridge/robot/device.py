@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
+
+import msgspec
 
 from zbridge.bus import Bus, Handle
 from zbridge.control import clocks
@@ -36,7 +39,7 @@ from zbridge.protocol.session import Datagram, Session, State
 from zbridge.protocol.session_kept import PARTIAL
 from zbridge.protocol.session_table import SessionTable
 from zbridge.robot.commands import Commands
-from zbridge.robot.connection import Connect, Connection, Hooks, Links
+from zbridge.robot.connection import Connect, Connection, Hooks, Links, TakeOver
 from zbridge.robot.fleet_latches import FleetLatchNews
 from zbridge.robot.observer import Boundary, LastStop, Nobody, Observer, StopFrame
 from zbridge.robot.on_demand import OnDemand
@@ -45,7 +48,7 @@ from zbridge.robot.presence import Presence
 from zbridge.robot.publishers import RobotPublishers
 from zbridge.robot.queries import PendingQueries, Queries
 from zbridge.robot.telemetry import Telemetry
-from zbridge.transport import Parcel, connect
+from zbridge.transport import Parcel, connect, take_over
 from zbridge.transport.fair_share import FairShare
 from zbridge.wire.frames import Partial
 
@@ -94,12 +97,14 @@ class Device:
         raw_ms: Callable[[], float] = clocks.raw_ms,
         suspended_s: Callable[[], float] = clocks.suspended_s,
         keep_latches: Keep = lambda latches: None,
+        chance: Callable[[], float] = random.random,
+        take_over: TakeOver = take_over,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 
         shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
         time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.clocks`. keep_latches: writes
-        the latched stops down.
+        the latched stops down. chance: 0 to 1. take_over: attaches a connection that another process handed over.
         """
         loop = asyncio.get_running_loop()
         self._protocol = protocol
@@ -136,14 +141,16 @@ class Device:
         self._enforcer = Enforcer(context, authority, self._standstill, audit, limits, keep_latches)
         self._enforcer.settled = self._observer.changed
         self._leases = LeaseServer(context, self._enforcer)
-        self._latch_news = FleetLatchNews(bus, keys, self._enforcer, self._leases)
+        self._latch_news = FleetLatchNews(bus, keys, self._enforcer, self._leases, chance)
         self._commands = Commands(context, self._enforcer)
         self._queries = Queries(context, self._commands, pending)
         self._telemetry = Telemetry(context, self._publishers, pending, links)
         self._presence = Presence(context, protocol, links, self._enforcer, self._standstill, self._commands, pending)
         conditions.changed = self._presence.publish_status
         for name, address in zip(robot.link_names, addresses, strict=True):
-            hooks = self._hooks(name, address, connect, manager)
+            hooks = msgspec.structs.replace(
+                self._hooks(name, address, connect, manager), take_over=take_over, chance=chance
+            )
             links.add(Connection(name, f"{keys.robot} {name}", address, hooks))
 
     def _hooks(self, name: str, address: DeviceAddress, connect: Connect, sessions: SessionTable) -> Hooks:

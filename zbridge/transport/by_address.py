@@ -6,14 +6,17 @@ from zbridge.errors import ProtocolError
 from zbridge.protocol.address import DeviceAddress, SerialAddress, ZenohAddress
 from zbridge.protocol.kept import Exported
 from zbridge.transport import serial, tcp
+from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.parcel import Parcel
 
 
-async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray | None = None) -> Link:
+async def connect(
+    address: DeviceAddress, receiver: Receiver, buffer: bytearray | None = None, kernel: Kernel = KERNEL
+) -> Link:
     """Connect ``receiver`` to the robot at ``address``; raise LinkError with the reason where that is not possible.
 
-    buffer: where reads from sockets go, which links of one loop may share.
+    buffer: where reads from sockets go, which links of one loop may share. kernel: of this machine, or a simulated one.
     """
     if isinstance(address, SerialAddress):
         return serial.connect(address, receiver)
@@ -21,10 +24,12 @@ async def connect(address: DeviceAddress, receiver: Receiver, buffer: bytearray 
         from zbridge.transport import samples  # loads what only such links need
 
         return await samples.connect(address, receiver)
-    return await tcp.connect(address, receiver, buffer)
+    return await tcp.connect(address, receiver, buffer, kernel)
 
 
-async def take_over(address: DeviceAddress, given: Exported, parcel: Parcel, receiver: Receiver) -> Link:
+async def take_over(
+    address: DeviceAddress, given: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL
+) -> Link:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError.
 
     Only when the other process has let go: reading begins at once.
@@ -33,4 +38,4 @@ async def take_over(address: DeviceAddress, given: Exported, parcel: Parcel, rec
         return serial.take_over(address, parcel.take(given.get("serial")), receiver)
     if isinstance(address, ZenohAddress):
         raise ProtocolError("a Zenoh session stays in its process")
-    return await tcp.take_over(given, parcel, receiver)
+    return await tcp.take_over(given, parcel, receiver, kernel)

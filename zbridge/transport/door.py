@@ -7,13 +7,13 @@ queue, for this process (:meth:`Door.open`) or for one that was handed the socke
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
 from collections.abc import Callable
 
 from zbridge.errors import ProtocolError
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
+from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 from zbridge.transport.parcel import Parcel
 from zbridge.transport.udp import DatagramHub
@@ -25,7 +25,8 @@ Accept = Callable[[Receiver], asyncio.BufferedProtocol]
 class Door:
     """The sockets of one listener. ``given``, ``parcel``: as another process handed them over; it begins shut then."""
 
-    def __init__(self, given: Exported | None = None, parcel: Parcel | None = None) -> None:
+    def __init__(self, given: Exported | None = None, parcel: Parcel | None = None, kernel: Kernel = KERNEL) -> None:
+        self.kernel = kernel
         self._given = given
         self._parcel = parcel or Parcel()
         self._sockets: list[socket.socket] = []
@@ -48,24 +49,24 @@ class Door:
             loop = asyncio.get_running_loop()
             server = await loop.create_server(lambda: accept(receiver()), address.host, address.port)
             self._servers = [server]
-            self._sockets = [socket.socket(fileno=os.dup(bound.fileno())) for bound in server.sockets]
+            self._sockets = [self.kernel.adopt(self.kernel.duplicate(bound.fileno())) for bound in server.sockets]
         host, port = self._sockets[0].getsockname()[:2]
         if hub is not None and self._given is None:
             hub.open(host, port)
         return Address(host, port, address.tls)
 
     def _take_over(self, given: Exported) -> None:
-        self._sockets = [socket.socket(fileno=self._parcel.take(number)) for number in given["tcp"]]
+        self._sockets = [self.kernel.adopt(self._parcel.take(number)) for number in given["tcp"]]
         if not self._sockets or (given["udp"] is None) is not (self._hub is None):
             raise ProtocolError("other sockets than this listener's")
         if self._hub is not None:
-            self._hub.take_over(socket.socket(fileno=self._parcel.take(given["udp"])))
+            self._hub.take_over(self.kernel.adopt(self._parcel.take(given["udp"])))
 
     async def open(self) -> None:
         """Accept peers, again or for the first time; take their datagrams."""
         loop = asyncio.get_running_loop()
         for bound in self._sockets if not self._servers else ():
-            copy = bound.dup()
+            copy = self.kernel.adopt(self.kernel.duplicate(bound.fileno()))
             copy.setblocking(False)
             self._servers.append(await loop.create_server(lambda: self._accept(self._receiver()), sock=copy))
         if self._hub is not None:
@@ -93,7 +94,7 @@ class Door:
 
     async def admit(self, number: object, receiver: Receiver, source: tuple[str, int] | None) -> None:
         """Attach an accepted peer that was handed over, with the source of its datagrams."""
-        connection = socket.socket(fileno=self._parcel.take(number))
+        connection = self.kernel.adopt(self._parcel.take(number))
         connection.setblocking(False)
         _, link = await asyncio.get_running_loop().create_connection(lambda: self._accept(receiver), sock=connection)
         if source is not None and self._hub is not None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import os
 
 from zbridge.errors import ProtocolError
+from zbridge.transport.kernel import KERNEL, Kernel
 
 
 class Parcel:
@@ -14,7 +14,8 @@ class Parcel:
     Those that were put are duplicates: the own sockets stay as they are. Close the parcel when it was sent, or taken.
     """
 
-    def __init__(self, descriptors: list[int] | None = None) -> None:
+    def __init__(self, descriptors: list[int] | None = None, kernel: Kernel = KERNEL) -> None:
+        self._kernel = kernel
         self.descriptors: list[int] = list(descriptors or ())
         self._taken: set[int] = set()
 
@@ -26,7 +27,7 @@ class Parcel:
 
     def put(self, descriptor: int) -> int:
         """Add a duplicate of a descriptor; return its number."""
-        self.descriptors.append(os.dup(descriptor))
+        self.descriptors.append(self._kernel.duplicate(descriptor))
         return len(self.descriptors) - 1
 
     def take(self, number: object) -> int:
@@ -42,4 +43,4 @@ class Parcel:
             if number not in self._taken:
                 self._taken.add(number)
                 with contextlib.suppress(OSError):
-                    os.close(descriptor)
+                    self._kernel.close(descriptor)

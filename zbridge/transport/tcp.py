@@ -10,8 +10,8 @@ import contextlib
 import logging
 import socket
 import struct
-import time
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from typing import cast
 
 from zbridge.errors import LinkError
@@ -20,6 +20,7 @@ from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
 from zbridge.transport.door import Door
+from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import NOBODY, STALLED_S, Receiver
 from zbridge.transport.parcel import Parcel
 from zbridge.transport.tcp_options import KEEPALIVE_S, bound_retries, keep_alive, new_backlog, outstanding, tune
@@ -67,7 +68,9 @@ class TcpLink(asyncio.BufferedProtocol):
         *,
         accepted: bool = False,
         given_udp: socket.socket | None = None,
+        kernel: Kernel = KERNEL,
     ) -> None:
+        self._kernel = kernel
         self.peer = ""
         self.reads: Callable[[], object] = _unwatched
         self._given_udp = given_udp
@@ -101,7 +104,7 @@ class TcpLink(asyncio.BufferedProtocol):
         """Write ``data`` as one segment."""
         if self._transport is not None:
             if self._backlog is not None:
-                self._backlog.written(len(data), time.monotonic())
+                self._backlog.written(len(data), self._kernel.monotonic())
             self._transport.write(data)
 
     def write_datagram(self, data: bytes) -> None:
@@ -115,7 +118,7 @@ class TcpLink(asyncio.BufferedProtocol):
         elif self._transport is not None:
             if self._datagrams is None:
                 try:
-                    self._datagrams = DatagramSocket(self._transport, self._receiver)
+                    self._datagrams = DatagramSocket(self._transport, self._receiver, kernel=self._kernel)
                 except OSError as error:  # no descriptor, no port: the datagram is lost, the next one tries again
                     log.warning("%s: no socket for datagrams: %s", self.peer, error)
                     return
@@ -145,9 +148,9 @@ class TcpLink(asyncio.BufferedProtocol):
         backlog, transport = self._backlog, self._transport
         if backlog is None or backlog.since is None or transport is None:
             return 0.0
-        now = time.monotonic()
+        now = self._kernel.monotonic()
         if now - backlog.since > STALLED_S:
-            backlog.settle(outstanding(transport))
+            backlog.settle(outstanding(transport, self._kernel))
         return now - backlog.since if backlog.since is not None else 0.0
 
     def pause(self) -> None:
@@ -222,9 +225,9 @@ class TcpLink(asyncio.BufferedProtocol):
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_WRITE_BYTES)
         else:
             bound_retries(sock)
-            self._backlog = new_backlog(sock)
+            self._backlog = new_backlog(sock, self._kernel)
             if self._given_udp is not None:
-                self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp)
+                self._datagrams = DatagramSocket(self._transport, self._receiver, self._given_udp, self._kernel)
                 self._datagrams.go_on()
         if self._hub is not None:
             self._hub.add(self, peer[0], self._receiver)
@@ -265,7 +268,9 @@ class TcpLink(asyncio.BufferedProtocol):
         self._receiver.lost(f"connection lost: {exc}" if exc else "closed by peer")
 
 
-async def connect(address: Address, receiver: Receiver, buffer: bytearray | None = None) -> TcpLink:
+async def connect(
+    address: Address, receiver: Receiver, buffer: bytearray | None = None, kernel: Kernel = KERNEL
+) -> TcpLink:
     """Connect within :data:`CONNECT_S`, or raise LinkError with the reason. buffer: where reads go; links may share it.
 
     Reads are as large as the buffer at most.
@@ -273,7 +278,9 @@ async def connect(address: Address, receiver: Receiver, buffer: bytearray | None
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(CONNECT_S):
-            _, link = await loop.create_connection(lambda: TcpLink(receiver, buffer=buffer), address.host, address.port)
+            _, link = await loop.create_connection(
+                lambda: TcpLink(receiver, buffer=buffer, kernel=kernel), address.host, address.port
+            )
     except TimeoutError as error:
         raise LinkError(f"{address}: no answer within {CONNECT_S:g} s") from error
     except (OSError, UnicodeError) as error:
@@ -281,13 +288,13 @@ async def connect(address: Address, receiver: Receiver, buffer: bytearray | None
     return link
 
 
-async def take_over(given: Exported, parcel: Parcel, receiver: Receiver) -> TcpLink:
+async def take_over(given: Exported, parcel: Parcel, receiver: Receiver, kernel: Kernel = KERNEL) -> TcpLink:
     """Attach ``receiver`` to the connection that another process handed over; raise ProtocolError, OSError."""
-    sock = socket.socket(fileno=parcel.take(given.get("tcp")))
+    sock = kernel.adopt(parcel.take(given.get("tcp")))
     sock.setblocking(False)
-    udp = socket.socket(fileno=parcel.take(given["udp"])) if given.get("udp") is not None else None
+    udp = kernel.adopt(parcel.take(given["udp"])) if given.get("udp") is not None else None
     loop = asyncio.get_running_loop()
-    _, link = await loop.create_connection(lambda: TcpLink(receiver, given_udp=udp), sock=sock)
+    _, link = await loop.create_connection(lambda: TcpLink(receiver, given_udp=udp, kernel=kernel), sock=sock)
     return link
 
 
@@ -308,13 +315,15 @@ async def listen(
     hands them over. Raise LinkError if the address cannot be bound.
     """
     door = door or Door()
-    hub = DatagramHub(foreign or Count()) if datagrams and secured is None else None
+    kernel = door.kernel
+    hub = DatagramHub(foreign or Count(), kernel) if datagrams and secured is None else None
     make = receiver if secured is None else lambda: secured(receiver())
     buffer = bytearray(CLIENT_READ_BYTES)
     async with contextlib.AsyncExitStack() as stack:
         try:
             stack.callback(door.close)
-            bound = await door.bind(address, make, lambda each: TcpLink(each, hub, buffer, accepted=True), hub)
+            accept = partial(TcpLink, hub=hub, buffer=buffer, accepted=True, kernel=kernel)
+            bound = await door.bind(address, make, accept, hub)
         except OSError as error:
             raise LinkError(f"{address}: {error.strerror or error}") from error
         yield bound

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import fcntl
 import logging
 import socket
-import struct
-import termios
-import time
 
 from zbridge.transport.backlog import Backlog
+from zbridge.transport.kernel import Kernel
 
 log = logging.getLogger("zbridge.link")
 
@@ -21,9 +18,6 @@ _RETRY_MOST_S = 1.0
 """Longest time between two retransmissions of the kernel to a robot."""
 _TCP_RTO_MAX_MS = 44
 """Linux 6.15 and newer; Python has no name for it yet."""
-_OUTSTANDING = struct.Struct("=i")
-_SIOCOUTQ = termios.TIOCOUTQ
-"""The ioctl for the unacknowledged bytes of a socket; Python names it for terminals only."""
 
 
 def tune(sock: socket.socket, give_up_s: float) -> None:
@@ -56,31 +50,25 @@ def bound_retries(sock: socket.socket) -> None:
 _unwatched_warned = False
 
 
-def new_backlog(sock: socket.socket) -> Backlog | None:
+def new_backlog(sock: socket.socket, kernel: Kernel) -> Backlog | None:
     """Make a backlog if the platform tells what is unacknowledged; else warn once and return None."""
     global _unwatched_warned
     try:
-        queued(sock)
+        kernel.unacknowledged(sock)
     except OSError:
         if not _unwatched_warned:
             _unwatched_warned = True
             log.warning("this platform does not tell what robots acknowledged: drives are written to broken links too")
         return None
     backlog = Backlog()
-    if unsent := queued(sock):  # of the process that had the connection before
-        backlog.written(unsent, time.monotonic())
+    if unsent := kernel.unacknowledged(sock):  # of the process that had the connection before
+        backlog.written(unsent, kernel.monotonic())
     return backlog
 
 
-def outstanding(transport: asyncio.Transport) -> int:
+def outstanding(transport: asyncio.Transport, kernel: Kernel) -> int:
     """Count the unacknowledged bytes: the kernel's and the transport's own."""
     waiting = 0
     with contextlib.suppress(OSError):  # closed meanwhile; connection_lost follows
-        waiting = queued(transport.get_extra_info("socket"))
+        waiting = kernel.unacknowledged(transport.get_extra_info("socket"))
     return waiting + transport.get_write_buffer_size()
-
-
-def queued(sock: socket.socket) -> int:
-    """Count the unacknowledged bytes of the kernel; raise OSError where the platform does not tell."""
-    waiting: int = _OUTSTANDING.unpack(fcntl.ioctl(sock.fileno(), _SIOCOUTQ, bytes(_OUTSTANDING.size)))[0]
-    return waiting

@@ -11,6 +11,7 @@ import socket
 
 from zbridge.metrics import Count
 from zbridge.protocol.rate_limit import RateLimit
+from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import Link, Receiver
 
 _DATAGRAM_BYTES = 65_536
@@ -29,21 +30,14 @@ _DRAINED = 1024
 class _DatagramReader:
     """A bound UDP socket on the event loop; asyncio and uvloop alike."""
 
-    def __init__(self) -> None:
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
         self._socket: socket.socket | None = None
         self._loop = asyncio.get_running_loop()
         self._held = False
 
     def _listen(self, host: str, port: int) -> None:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        sock = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            sock.setblocking(False)
-            sock.bind((host, port))
-        except OSError:
-            sock.close()
-            raise
-        self._socket = sock
+        self._socket = self._kernel.datagrams(host, port)
         self.go_on()
 
     def fileno(self) -> int:
@@ -101,9 +95,15 @@ class _DatagramReader:
 class DatagramSocket(_DatagramReader):
     """A UDP socket to one robot: hears the address and port of the robot, and counts everything else."""
 
-    def __init__(self, transport: asyncio.Transport, receiver: Receiver, given: socket.socket | None = None) -> None:
+    def __init__(
+        self,
+        transport: asyncio.Transport,
+        receiver: Receiver,
+        given: socket.socket | None = None,
+        kernel: Kernel = KERNEL,
+    ) -> None:
         """``given``: the socket of another process, that was held."""
-        super().__init__()
+        super().__init__(kernel)
         self._receiver = receiver
         self._peer: tuple[str, int] = transport.get_extra_info("peername")[:2]
         if given is not None:
@@ -130,8 +130,8 @@ class DatagramHub(_DatagramReader):
     name: all of them lose their sources and are told so (``rivalled``).
     """
 
-    def __init__(self, foreign: Count) -> None:
-        super().__init__()
+    def __init__(self, foreign: Count, kernel: Kernel = KERNEL) -> None:
+        super().__init__(kernel)
         self._hosts: dict[str, dict[Link, Receiver]] = {}
         self._strays: dict[str, RateLimit] = {}
         self._deaf_until: dict[tuple[str, int], float] = {}

@@ -58,6 +58,8 @@ REPEAT_S = 0.25
 """Seconds after which a drive command is repeated while the robot moves."""
 STOP_REPEAT_S = 0.1
 """Seconds between the repetitions of a stop: a late datagram can restart motion."""
+NEUTRAL_S = 1.0
+"""Seconds for which a neutral is repeated."""
 IDLE_STOP_S = 0.25
 """Seconds between two stops to robots of 1.1 and 1.2 while nobody drives: after a stall they ignore the first one."""
 AUTONOMOUS = "autonomous"
@@ -126,7 +128,7 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         elif session.misreads:
-            self._rest(now, until=until, spacing_s=IDLE_STOP_S / 2)
+            self._rest(now, until=until)
             return
         self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
@@ -162,7 +164,7 @@ class TcpUdpRobot(Robot):
         if not command.moving:
             session = self._connected()
             session.withdraw_autonomous()
-            self._rest(now, period_s=REPEAT_S, until=now + 1.0, urgent=session.sent_autonomous)
+            self._neutral(session, now)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
         packets: list[Packet] = []
@@ -180,6 +182,15 @@ class TcpUdpRobot(Robot):
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._rests_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
+
+    def _neutral(self, session: HqRole, now: float) -> None:
+        """Repeat neutral for a second. Where it is repeated already, at its own times: programs say it all the time."""
+        until = now + NEUTRAL_S
+        frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
+        if session.outbox.prolong(_MOTION, frames, period_s=REPEAT_S, until=until):
+            self._rests_until = max(self._rests_until, until)
+        else:
+            self._rest(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
 
     def _mode(self, command: Mode, now: float) -> None:
         """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""
@@ -214,12 +225,13 @@ class TcpUdpRobot(Robot):
     def _send(self, message: Packet) -> None:
         self._connected().send(message)
 
-    def _rest(
-        self, now: float, *, until: float, period_s: float = math.inf, spacing_s: float = 0.0, urgent: bool = False
-    ) -> None:
+    def _rest(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
         """Repeat the packets of a stop; raise Refused if the robot may be sent none of them."""
-        session = self._connected()
+        session, spacing_s = self._connected(), 0.0
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
+        if session.misreads and len(frames) > 1:  # each of the pair must be read alone
+            spacing_s = IDLE_STOP_S / 2
+            period_s = max(period_s, spacing_s)
         session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
         self._rests_until = until
 

@@ -78,9 +78,14 @@ def left(version: str, script: str, **options: object) -> str:
 ALL, WELL, BADLY = tuple(SETTINGS), ("1.3", "1.4"), ("1.1", "1.2")
 """Robots of 1.1 and 1.2 misread a tenth: what is sent once and matters is sent to them again after 0.3 s."""
 
+_TWICE = " neutral +0.01 neutral +0.19"
+"""As a program of two wheels says it. A robot that reads every 0.1 s loses what comes 0.01 s apart."""
+
 ROWS = {
     "motion is repeated every quarter of a second without end": (ALL, "left +2", "L{9}"),
     "neutral is 13 repeated for a second": (ALL, "left +0.01 neutral +4", "LS{5}"),
+    "a neutral that is said all the time leaves evenly": (ALL, "left +0.01" + _TWICE * 10 + " +4", "LS{11,13}"),
+    "and so does the pair of one": (BADLY, "auto +1 neutral" + _TWICE * 10 + " +4", "A+ NS (NS){6,10}"),
     "a stop goes before what waits and ends motion": (ALL, "left hi stop +3", "SHS{9,10}"),
     "a stop leaves before newer motion": (ALL, "left +0.001 stop +0.001 neutral +0.001 right +0.02", "LSR"),
     "a routine stop is sent exactly once and ends motion": (ALL, "left +0.1 once +3 once +3", "LSS"),
@@ -131,7 +136,8 @@ ROWS = {
 
 @pytest.mark.parametrize(("versions", "script", "expected"), ROWS.values(), ids=ROWS)
 def test_what_leaves_a_robot(versions: tuple[str, ...], script: str, expected: str) -> None:
-    a_second = {"pairs": "(NS){9,11}", "manuals": "(MS){9,11}", "stops": "S{9,11}", " ": ""}
+    pairs = "{4,6}" if versions == BADLY else "{4,11}" if versions == ALL else "{9,11}"
+    a_second = {"pairs": f"(NS){pairs}", "manuals": f"(MS){pairs}", "stops": "S{9,11}", " ": ""}
     for name, pattern in a_second.items():
         expected = expected.replace(name, pattern)
     for version in versions:

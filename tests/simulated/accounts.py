@@ -1,0 +1,138 @@
+"""What the checker knows of leases and commands, and how it reads frames; it shares no code with the gateway."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from typing import Any
+
+import msgpack
+
+TOLERANCE = {"tcpudp": 1e-6, "alf": 0.0051, "wc2ec": 1e-6}
+"""By how much a value at the robot may differ from the one that was given, fractions of full scale."""
+MAX_AGE_S = 0.4
+"""Seconds after which a dated command is stale, unless the deadman is less."""
+WHEEL_FULL = 10.0
+"""rad/s of a wheel at full scale, as the scenarios configure it."""
+
+
+class Command:
+    """A drive, motor or mode command that somebody put on the bus."""
+
+    def __init__(self, key: str, payload: bytes, shown: dict[str, Any], who: str, now: float) -> None:
+        fields = read(payload)
+        self.kind = key.partition("@cmd/")[2].partition("/")[0]
+        self.who = who
+        self.put_at = now
+        self.lease = shown.get("lease")
+        self.dated = "t" in shown
+        self.received: dict[str, float] = {}
+        """By gateway."""
+        self.forbidden: str | None = None
+        """Why it must not move the robot, whatever else holds."""
+        if self.kind == "mode":
+            self.value = 1.0 if fields.get("mode") == "autonomous" else 0.0
+        elif self.kind == "motor":
+            self.value = abs(fields.get("value", 0.0)) / WHEEL_FULL
+        else:
+            along = math.hypot(fields.get("forward") or 0.0, fields.get("left") or 0.0)
+            self.value = max(along, abs(fields.get("turn") or 0.0))
+
+    def __repr__(self) -> str:
+        return f"{self.kind} {self.value:.5f} of {self.who} put at {self.put_at:.3f}"
+
+
+class Grant:
+    """A lease that a gateway granted."""
+
+    def __init__(self, gateway: str, asker: str, answer: dict[str, Any], request: dict[str, Any], now: float) -> None:
+        self.lease: bytes = answer["lease"]
+        self.gateway = gateway
+        self.asker = asker
+        self.at = now
+        self.who = str(request.get("who"))
+        self.lease_s: float = answer.get("expires_in_s") or 3.0
+        self.alive: str | None = request.get("alive")
+        self.dated = "t" in request and answer.get("max_age_s") is not None
+        self.renewed_at = now
+        self.ended_at: float | None = None
+        self.why = ""
+        self.deadman_s = 2.0
+        self.base_s = 0.5
+        """The least time that anything of it took to the gateway."""
+        self.shown = False
+        """Whether ``control`` showed it."""
+        self.autonomous = False
+        self.last_motion: Command | None = None
+        self.held_back = False
+
+    def __repr__(self) -> str:
+        return f"lease {self.lease.hex()[:6]} of {self.asker} at {self.gateway}"
+
+    def end(self, now: float, why: str) -> None:
+        """Note the first end."""
+        if self.ended_at is None:
+            self.ended_at, self.why = now, why
+
+    def over(self, now: float, slack_s: float) -> bool:
+        """Whether it ended more than so long ago."""
+        return self.ended_at is not None and now > self.ended_at + slack_s
+
+    def received(self, command: Command, now: float) -> None:
+        """Follow a command that reached the gateway: when motion must wait for neutral."""
+        late_s = now - command.put_at
+        self.base_s = min(self.base_s, late_s)
+        late_s -= self.base_s
+        if not command.dated or late_s < MAX_AGE_S + 0.1:
+            self.renewed_at = now
+        if command.kind == "mode":
+            self.autonomous = command.value > 0
+            return
+        if not command.value:
+            if late_s < 0.3:
+                self.held_back = False
+            self.last_motion, self.autonomous = None, False
+            return
+        if command.dated and late_s > min(MAX_AGE_S, self.deadman_s) - 0.05:
+            return  # refused as stale, or nearly: it begins nothing
+        last = self.last_motion
+        if last is not None:
+            since_s = now - (last.put_at if last.dated else last.received[self.gateway])
+            if since_s > self.deadman_s + self.base_s + 0.1:
+                self.held_back = True
+        if self.held_back:
+            command.forbidden = "neutral first"
+        else:
+            self.last_motion = command
+
+
+def read(payload: bytes | None) -> dict[str, Any]:
+    """Read a MessagePack map; anything else is empty."""
+    try:
+        fields = msgpack.unpackb(payload) if payload else {}
+    except (ValueError, msgpack.exceptions.UnpackException):
+        return {}
+    return fields if isinstance(fields, dict) else {}
+
+
+def motions(protocol: str, data: bytes) -> list[tuple[str, float]]:
+    """Read the motion in what was written to a robot: (``motion`` or ``mode``, fraction of full scale or mode)."""
+    found: list[tuple[str, float]] = []
+    if protocol == "tcpudp" and len(data) >= 6:
+        if data[5] == 11 and len(data) >= 18:
+            found = [("motion", abs(struct.unpack("<fff", data[6:18])[2]))]
+        elif data[5] == 12 and len(data) >= 10:
+            found = [("motion", abs(struct.unpack("<f", data[6:10])[0]))]
+        elif data[5] == 10 and len(data) >= 10:
+            found = [("mode", float(struct.unpack("<i", data[6:10])[0]))]
+    elif protocol == "alf":
+        if data[:1] == b"\x03":
+            found = [("motion", data[1] / 100)]
+        else:
+            found = [("motion", int(speed) / 100) for speed in re.findall(rb"(?:^|;)3\|(\d+)\|", data)]
+    elif protocol == "wc2ec":
+        for start in range(0, len(data) - 10, 11):
+            if data[start] == 130:
+                found.append(("motion", abs(struct.unpack("<d", data[start + 3 : start + 11])[0]) / WHEEL_FULL))
+    return [(kind, value) for kind, value in found if value]

@@ -1,0 +1,356 @@
+"""The independent checker: rules about who drives, from the robot's account, the bus and the programs' logs alone.
+
+It reads the notes of the trace. What a gateway writes to the robot is compared with the commands that reached that
+gateway and with the leases that it granted; :mod:`tests.simulated.obligations` adds what must happen in time.
+Each violation begins with its time and the name of its rule.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Any
+
+from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
+from tests.simulated.obligations import Obligations
+
+if TYPE_CHECKING:
+    from tests.simulated.scenario import Simulation
+
+SLACK_S = 0.06
+"""What is on its way through a gateway when a lease ends may be written so long."""
+WRITTEN_S = 0.02
+"""Seconds that writing a latched stop takes."""
+KNOWN_S = 8.0
+"""Two gateways that see each other for so long know the same latched stops."""
+MEET_S = 3.0
+"""Two gateways that see each other for so long: exactly one grants."""
+MOST = 20
+"""Violations that are kept."""
+HQ_DEADMAN_S = {"tcpudp": 1.3, "alf": 0.3, "wc2ec": 0.5}
+
+
+class Checker:
+    """Judges one simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.world = simulation.world
+        self.protocol = simulation.robot_protocol
+        self.violations: list[str] = []
+        self.counts: Counter[str] = Counter()
+        self.grants: dict[bytes, Grant] = {}
+        self.current: dict[str, Grant] = {}
+        """By gateway, the lease that it granted last."""
+        self.latches: dict[str, dict[bytes, float]] = {each.name: {} for each in simulation.gateways}
+        self.gateways = {each.name: each for each in simulation.gateways}
+        self.by_host = {each.host.name: each.name for each in simulation.gateways if each.serves}
+        self._requests: dict[tuple[str, str], dict[str, Any]] = {}
+        self._commands: dict[tuple[str, bytes, bytes], Command] = {}
+        self._recent: dict[str, deque[Command]] = {name: deque(maxlen=600) for name in self.gateways}
+        self._gives: dict[str, deque[tuple[float, float]]] = {
+            each.name: deque(maxlen=200) for each in simulation.programs
+        }
+        self._taken_at: dict[str, float] = {}
+        """By the name of a holder, when a stop or a takeover ended its lease."""
+        self._wrote_motion: dict[str, float] = {}
+        self._met: dict[frozenset[str], float] = {}
+        self._handlers = {
+            "asks": self._on_asks,
+            "answers": self._on_answers,
+            "puts": self._on_puts,
+            "receives": self._on_receives,
+            "writes": self._on_writes,
+            "sends": self._on_sends,
+            "alive": self._on_alive,
+            "connected": self._on_connected,
+            "started": self._on_started,
+            "killed": self._on_ended,
+            "ended": self._on_ended,
+            "was suspended": self._on_suspended,
+            "gives": self._on_gives,
+            "crashed": self._on_crashed,
+        }
+        self.obligations = Obligations(self)
+        self.world.watchers.append(self._watch)
+
+    def violate(self, rule: str, text: str) -> None:
+        """Note that a rule was broken."""
+        self.counts[f"violation {rule}"] += 1
+        if len(self.violations) < MOST:
+            self.violations.append(f"{self.world.now:.3f} {rule}: {text}")
+        self.world.note("checker", "violation", rule, text)
+
+    def _watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        handler = self._handlers.get(what)
+        if handler is not None:
+            handler(who, *fields)
+        self.obligations.watch(who, what, fields)
+
+    # Leases
+
+    def _on_asks(self, who: str, key: str, payload: bytes) -> None:
+        if "@rpc/control/" in key:
+            self._requests[who, key] = {**read(payload), "asked at": self.world.now}
+
+    def _on_answers(self, gateway: str, key: str, payload: bytes, error: str, asker: str) -> None:
+        verb = key.partition("@rpc/control/")[2].partition("/")[0]
+        if not verb or error != "None" or gateway not in self.gateways:
+            return
+        answer, request = read(payload), self._requests.get((asker, key), {})
+        self.counts[f"{verb} {'ok' if answer.get('ok', True) else answer.get('code')}"] += 1
+        if verb.startswith("unlatch"):
+            for known in self.latches.values():
+                known.pop(request.get("id", b""), None)
+        elif answer.get("ok") and verb in ("acquire", "takeover"):
+            grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
+            stands = last is not None and last.ended_at is None and last.shown
+            if verb == "acquire" and stands and not request.get("priority"):
+                self.violate("held", f"{grant} granted while {last} stands")
+            self._grant(grant, request)
+        elif verb == "release" and gateway in self.current:
+            if request.get("lease") == self.current[gateway].lease:
+                self._released(self.current[gateway], answer, asker)
+        elif answer.get("ok") and verb == "renew" and gateway in self.current:
+            self.current[gateway].renewed_at = self.world.now
+
+    def _released(self, grant: Grant, answer: dict[str, Any], asker: str) -> None:
+        """Only the holder ends its lease, and may do so."""
+        if answer.get("ok") and asker != grant.asker and grant.ended_at is None:
+            self.violate("forged", f"{asker} released {grant}")
+        elif not answer.get("ok") and answer.get("code") == "malformed" and asker == grant.asker:
+            self.violate("forged", f"{asker} may not release {grant}: {answer.get('reason')}")
+        if answer.get("ok"):
+            self.end(grant.gateway, "released")
+
+    def _grant(self, grant: Grant, request: dict[str, Any]) -> None:
+        now = self.world.now
+        most_s = self.simulation.scenario.get("control", {}).get("deadman_s", 2.0)
+        grant.deadman_s = min(request.get("deadman_s") or most_s, most_s)
+        grant.base_s = now - request.get("asked at", now)
+        self.end(grant.gateway, "superseded")
+        self._neutral_between(self._taken_at.pop(grant.who, None), grant)
+        self.grants[grant.lease] = self.current[grant.gateway] = grant
+        if any(now - at > SLACK_S for at in self.latches[grant.gateway].values()):
+            self.violate("latched", f"{grant} granted while latched")
+        for other, last in self.current.items():
+            if other != grant.gateway and last.ended_at is None and self._met_for(other, grant.gateway) > MEET_S:
+                self.violate("one-gateway", f"{grant} granted while {last} stands")
+        self.obligations.granted(grant)
+
+    def _neutral_between(self, taken_at: float | None, grant: Grant) -> None:
+        """An HQ program whose robot was taken says neutral before it drives again."""
+        programs = self.simulation.programs
+        if taken_at is None or len(programs) != 1 or not grant.who.startswith("hq."):
+            return
+        said = self._gives[programs[0].name]
+        if not any(value == 0.0 and at > taken_at - 0.2 for at, value in said):
+            self.violate("hq-neutral", f"{grant}: nothing neutral was said since the robot was taken")
+
+    def end(self, gateway: str, why: str) -> None:
+        """Note the end of a gateway's lease."""
+        grant = self.current.get(gateway)
+        if grant is not None and grant.ended_at is None:
+            grant.end(self.world.now, why)
+            if why in ("stop", "superseded"):
+                self._taken_at[grant.who] = self.world.now
+            self.counts[f"lease ended: {why}"] += 1
+            self.obligations.lease_ended(grant)
+
+    def expire(self) -> None:
+        """End leases that nobody renewed."""
+        for gateway, grant in self.current.items():
+            if self.world.now > grant.renewed_at + grant.lease_s + 0.1:
+                self.end(gateway, "expired")
+
+    def _on_alive(self, who: str, key: str, alive: bool) -> None:
+        grant = self.current.get(who)
+        if not alive and grant is not None and grant.alive and key.endswith(f"/@alive/{grant.alive}"):
+            self.end(who, "holder lost")
+
+    def _on_connected(self, who: str, up: Any) -> None:
+        if up is False and who in self.gateways:
+            self.end(who, "bus lost")
+
+    def _on_started(self, who: str) -> None:
+        if who in self.gateways:
+            self.end(who, "gateway started")
+
+    def _on_ended(self, who: str) -> None:
+        if who in self.gateways:
+            unwritten = [each for each, at in self.latches[who].items() if self.world.now - at < WRITTEN_S]
+            for stop_id in unwritten:  # docs/reliability.md: confirmed before it is on disk
+                del self.latches[who][stop_id]
+                self.counts["excused: killed before a latch was written"] += 1
+            self.end(who, "gateway ended")
+
+    def _on_suspended(self, who: str, seconds: float) -> None:
+        if seconds > 0.15:
+            self.end(who, "suspended")
+
+    def meet(self) -> None:
+        """Note since when gateways reach each other; called regularly."""
+        names = [name for name, each in self.gateways.items() if each.serves]
+        for number, one in enumerate(names):
+            for other in names[number + 1 :]:
+                a, b = self.gateways[one], self.gateways[other]
+                pair = frozenset((one, other))
+                if a.running and b.running and self.simulation.fabric.works(a.session, b.session):
+                    self._met.setdefault(pair, self.world.now)
+                    self._share_latches(one, other)
+                else:
+                    self._met.pop(pair, None)
+
+    def _share_latches(self, one: str, other: str) -> None:
+        """Two gateways of one robot that met for long know of each other's latches."""
+        now = self.world.now
+        if self._met_for(one, other) < KNOWN_S:
+            return
+        for here, there in ((one, other), (other, one)):
+            for stop_id, at in self.latches[here].items():
+                if now - at > KNOWN_S:
+                    self.latches[there].setdefault(stop_id, now)
+
+    def _met_for(self, one: str, other: str) -> float:
+        return self.world.now - self._met.get(frozenset((one, other)), self.world.now)
+
+    # Commands
+
+    def _on_puts(self, who: str, key: str, payload: bytes, attachment: bytes | None) -> None:
+        kind = key.partition("@cmd/")[2].partition("/")[0]
+        if kind in ("drive", "motor", "mode") and attachment:
+            command = Command(key, payload, read(attachment), who, self.world.now)
+            self._commands.setdefault((key, payload, attachment), command)
+            if who in self.gateways and kind != "mode" and command.value:
+                self._of_program(who, command)
+        elif kind == "stop":
+            self.counts["stops"] += 1
+
+    def _of_program(self, listener: str, command: Command) -> None:
+        """A listener's motion was said by an HQ program a moment ago."""
+        now = self.world.now
+        for program in self.simulation.programs:
+            most_s = HQ_DEADMAN_S[program.protocol] + 0.35
+            for at, value in reversed(self._gives[program.name]):
+                if now - at > most_s:
+                    break
+                if abs(value - command.value) < 0.0052:
+                    return
+        self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
+
+    def _on_gives(self, who: str, value: float) -> None:
+        if who in self._gives:
+            self._gives[who].append((self.world.now, value))
+
+    def _on_receives(self, gateway: str, key: str, payload: bytes, attachment: bytes | None) -> None:
+        now = self.world.now
+        if key.endswith("@cmd/stop"):
+            fields = read(payload)
+            self.end(gateway, "stop")
+            if fields.get("latch") is True and fields.get("id"):
+                self.latches[gateway].setdefault(fields["id"], now)
+                self.obligations.latched(gateway)
+            return
+        command = self._commands.get((key, payload, attachment or b""))
+        if command is None or gateway in command.received:
+            return
+        command.received[gateway] = now
+        self._recent[gateway].append(command)
+        grant = self.current.get(gateway)
+        theirs = grant is not None and command.lease == grant.lease and command.who == grant.asker
+        if grant is not None and theirs and grant.ended_at is None:
+            grant.received(command, now)
+
+    # What is written to the robot
+
+    def _on_writes(self, who: str, peer: tuple[str, int], data: str) -> None:
+        if peer[0] == "robot" and who in self.gateways:
+            self._written(who, bytes.fromhex(data))
+
+    def _on_sends(self, who: str, source: tuple[str, int], target: tuple[str, int], data: str) -> None:
+        if target[0] == "robot" and source[0] in self.by_host:
+            self._written(self.by_host[source[0]], bytes.fromhex(data))
+
+    def _written(self, gateway: str, data: bytes) -> None:
+        for kind, value in motions(self.protocol, data):
+            if kind == "mode" and value != 3.0:
+                continue
+            self.counts[f"{kind} written"] += 1
+            reason = self._judge(gateway, kind, 1.0 if kind == "mode" else value)
+            if reason is not None:
+                self.violate(*reason)
+            now = self.world.now
+            for other, at in self._wrote_motion.items():
+                if other != gateway and now - at < 1.0 and self._met_for(other, gateway) > MEET_S:
+                    self.violate("one-gateway", f"{gateway} and {other} both move the robot")
+            self._wrote_motion[gateway] = now
+
+    def _judge(self, gateway: str, kind: str, value: float) -> tuple[str, str] | None:
+        """Return the rule that this frame breaks; None where a command allows it."""
+        now, tolerance = self.world.now, TOLERANCE[self.protocol]
+        if any(now - at > SLACK_S for at in self.latches[gateway].values()):
+            return "latched", f"{gateway} wrote {kind} {value:.5f} while latched"
+        worst: tuple[str, str] | None = None
+        for command in reversed(self._recent[gateway]):
+            if now - command.received[gateway] > 15.0:
+                break
+            if (command.kind == "mode") is not (kind == "mode") or abs(command.value - value) > tolerance:
+                continue
+            reason = self._fault_of(command, gateway)
+            if reason is None:
+                return None
+            worst = worst or (reason[0], f"{gateway} wrote {command}: {reason[1]}")
+        return worst or ("unknown-motion", f"{gateway} wrote {kind} {value:.5f}, which nobody commanded")
+
+    def _fault_of(self, command: Command, gateway: str) -> tuple[str, str] | None:
+        now, received = self.world.now, command.received[gateway]
+        grant = self.grants.get(command.lease or b"")
+        if grant is None or grant.gateway != gateway:
+            return "no-lease", "without a lease of this gateway"
+        if command.who != grant.asker:
+            return "forged", f"{command.who} used the lease of {grant.asker}"
+        if grant.over(now, SLACK_S):
+            return "lease-ended", f"its lease ended {now - (grant.ended_at or 0):.2f} s ago: {grant.why}"
+        if received < grant.at:
+            return "no-lease", "received before its lease"
+        if command.forbidden:
+            return "neutral-first", "after the deadman, without a neutral"
+        late_s = received - command.put_at - grant.base_s
+        if command.dated and late_s > min(MAX_AGE_S, grant.deadman_s) + 0.05:
+            return "stale", f"it came {late_s:.2f} s late"
+        if command.kind == "mode":
+            return ("stale", "long ago") if now - received > 2.5 else None
+        given_at = command.put_at + grant.base_s if command.dated else received
+        if now - given_at > grant.deadman_s + 0.1:
+            return "deadman", f"given {now - given_at:.2f} s ago, deadman {grant.deadman_s:g} s"
+        return None
+
+    def _on_crashed(self, who: str, why: str) -> None:
+        self.violate("fragile", f"{who} crashed: {why}")
+
+    # The end
+
+    def probe(self) -> None:
+        """Begin the last test: the robot can be driven again."""
+        self.obligations.probe()
+
+    def probed(self) -> None:
+        """End it."""
+        self.obligations.probed()
+
+    def ended(self) -> None:
+        """Look for what is left after all processes were told to end."""
+        for error in self.world.errors:
+            self.violate("exception", error)
+        for member in self.simulation.members.values():
+            if member.task is None or not member.process.alive:
+                continue
+            assert member.process.loop is not None
+            tasks, timers = member.process.loop.left
+            if not member.task.done():
+                self.violate("leak", f"{member.name} does not end")
+            elif tasks or timers:
+                self.violate("leak", f"{member.name} leaves {len(tasks)} tasks and {timers} timers: {tasks[:2]}")
+            elif member.process.descriptors:
+                self.violate("leak", f"{member.name} leaves descriptors: {member.process.descriptors}")
+        if self.simulation.robot.moving and self.obligations.reachable_long and not self.obligations.excused_until():
+            self.violate("moves-on", "the robot moves after its gateways ended")

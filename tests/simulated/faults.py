@@ -1,0 +1,232 @@
+"""The steps of a scenario: what people and programs do, and faults, at a time or when a state is reached.
+
+A step with ``when`` waits for a state from its ``t`` on, and happens ``after`` seconds after it was reached, once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import msgpack
+
+if TYPE_CHECKING:
+    from tests.simulated.scenario import Simulation
+
+REACHED: dict[str, Callable[[str, str, tuple[Any, ...]], bool]] = {
+    "moving": lambda who, what, fields: what == "moving" and bool(fields[0]),
+    "stopping": lambda who, what, fields: what == "moving" and not fields[0],
+    "mode read": lambda who, what, fields: what == "reads" and fields[0] == "mode",
+    "asking": lambda who, what, fields: what == "asks" and "@rpc/control/" in fields[0],
+    "granted, not replied": lambda who, what, fields: what == "answers" and "@rpc/control/acquire" in fields[0],
+    "granted": lambda who, what, fields: what == "granted",
+    "mode unwritten": lambda who, what, fields: what == "receives" and fields[0].endswith("@cmd/mode"),
+    "stop unwritten": lambda who, what, fields: what == "receives" and fields[0].endswith("@cmd/stop"),
+    "drive received": lambda who, what, fields: what == "receives" and fields[0].endswith("@cmd/drive"),
+    "claim asked": lambda who, what, fields: what == "asks" and "@rpc/claim" in fields[0],
+    "connected": lambda who, what, fields: who == "robot" and what == "connected",
+    "released": lambda who, what, fields: what == "released",
+}
+"""The states that a fault can wait for."""
+
+
+class Faults:
+    """Carries the steps out."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.world = simulation.world
+        self._waiting: dict[str, list[dict[str, Any]]] = {}
+        self.reached: dict[str, int] = {}
+        self._over = False
+        self._overheard: tuple[str, str, bytes, bytes] | None = None
+        self.world.watchers.append(self._watch)
+
+    def plan(self, steps: list[dict[str, Any]]) -> None:
+        """Set the steps up."""
+        for step in steps:
+            if "when" in step:
+                self.world.at(step["t"], lambda step=step: self._waiting.setdefault(step["when"], []).append(step))
+            else:
+                self.world.at(step["t"], lambda step=step: self.do(step))
+
+    def _watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        if what == "puts" and fields[0].endswith("@cmd/drive") and fields[2]:
+            grant = self._simulation.checker.grants.get(msgpack.unpackb(fields[2])["lease"])
+            if grant is not None and grant.asker == who:
+                self._overheard = (who, *fields)
+        if not self._waiting:
+            return
+        for state in [state for state in self._waiting if REACHED[state](who, what, fields)]:
+            steps = self._waiting.pop(state)
+            for step in steps:
+                self.reached[state] = self.reached.get(state, 0) + 1
+                self.world.after(step.get("after", 0.0), lambda step=step: self.do(step))
+
+    def do(self, step: dict[str, Any]) -> None:
+        """Do one step now."""
+        if self._over:
+            return
+        if "fault" in step:
+            self._simulation.checker.counts[f"fault {step['fault']}"] += 1
+            getattr(self, f"_{step['fault']}")(step)
+            return
+        name = step["who"]
+        for who in (*self._simulation.drivers, *self._simulation.programs):
+            if who.name == name:
+                who.do(step)
+
+    def _later(self, step: dict[str, Any], undo: Callable[[], None]) -> None:
+        self.world.after(step.get("for", 1.0), undo)
+
+    def _process(self, name: str) -> Any:
+        simulation = self._simulation
+        if name == "robot":
+            return simulation.robot
+        if name in simulation.members:
+            member = simulation.members[name]
+            return member.process if member.alive else None
+        return next((each for each in simulation.programs if each.name == name), None)
+
+    # Faults
+
+    def _pause(self, step: dict[str, Any]) -> None:
+        process = self._process(step["target"])
+        if process is not None and process.alive and not process.paused:
+            process.pause()
+            self._later(step, process.resume)
+
+    def _kill(self, step: dict[str, Any]) -> None:
+        member = self._simulation.members[step["target"]]
+        member.kill()
+        self._later(step, member.start)
+
+    def _end(self, step: dict[str, Any]) -> None:
+        member = self._simulation.members[step["target"]]
+        member.stop()
+        self.world.after(max(5.0, step.get("for", 1.0)), member.start)
+
+    def _cut(self, step: dict[str, Any]) -> None:
+        here, there = step["between"]
+        self._simulation.paths.cut(here, there, both=step.get("both", True))
+        self._simulation.fabric.follow()
+        self._later(step, lambda: self._simulation.paths.heal(here, there))
+
+    def _reset(self, step: dict[str, Any]) -> None:
+        """Reset the connections between two hosts."""
+        pair = set(step["between"])
+        for end in tuple(self._simulation.network.ends):
+            if {end.address[0], end.peer.address[0]} == pair and not end.closed:
+                end.ended(ConnectionResetError("reset by peer"))
+                end.peer.ended(ConnectionResetError("reset by peer"))
+
+    def _unlink(self, step: dict[str, Any]) -> None:
+        """Drop a member's link to its router, or that of the routers; it returns soon."""
+        fabric = self._simulation.fabric
+        name = step["target"]
+        member = self._simulation.members.get(name)
+        link = member.session.link if member is not None and member.alive else fabric.between
+        link.drop()
+        self._later(step, link.restore)
+
+    def _router(self, step: dict[str, Any]) -> None:
+        """Restart a router: all of its links end."""
+        fabric = self._simulation.fabric
+        links = [each.link for each in fabric.sessions if each.router == step["target"]] + [fabric.between]
+        for link in links:
+            link.drop()
+        self._later(step, lambda: [link.restore() for link in links])
+
+    def _slow(self, step: dict[str, Any]) -> None:
+        slow, pair = self._simulation.paths.slow, frozenset(step["between"])
+        slow[pair] = step.get("by", 0.1)
+        self._later(step, lambda: slow.pop(pair, None))
+
+    def _news(self, step: dict[str, Any]) -> None:
+        """Liveliness news come late, or never."""
+        fabric = self._simulation.fabric
+        fabric.news_late_s, fabric.news_lost = step.get("late", 2.0), step.get("lost", 0.0)
+
+        def undo() -> None:
+            fabric.news_late_s, fabric.news_lost = 0.0, 0.0
+
+        self._later(step, undo)
+
+    def _duplicate(self, step: dict[str, Any]) -> None:
+        fabric, paths = self._simulation.fabric, self._simulation.paths
+        fabric.duplicates = paths.duplicates = 0.3
+
+        def undo() -> None:
+            fabric.duplicates = paths.duplicates = 0.0
+
+        self._later(step, undo)
+
+    def _lose(self, step: dict[str, Any]) -> None:
+        """Lose a part of all datagrams."""
+        paths = self._simulation.paths
+        paths.loss = step.get("part", 0.2)
+
+        def undo() -> None:
+            paths.loss = 0.0
+
+        self._later(step, undo)
+
+    def _forge(self, step: dict[str, Any]) -> None:
+        """Somebody who overheard a drive alters it, repeats it late, and asks for the end of the lease."""
+        overheard = self._overheard
+        driver = next((each for each in self._simulation.drivers if overheard and each.name != overheard[0]), None)
+        if overheard is None or driver is None or not driver.running or driver.bus is None:
+            return
+        _, key, payload, attachment = overheard
+        bus, shown = driver.bus, msgpack.unpackb(attachment)
+        altered = msgpack.packb({**msgpack.unpackb(payload), "forward": 0.98765})
+        later = msgpack.packb({**shown, "seq": shown["seq"] + 1000})
+        bus.put(key, altered, attachment, droppable=False)
+        bus.put(key, altered, later, droppable=False)
+        bus.put(key, payload, attachment, droppable=False)
+        for after_s in (0.7, 1.3):
+            driver.process.after(after_s, lambda: bus.put(key, payload, attachment, droppable=False))
+        ask = bus.ask("fleet/r1/@rpc/control/release", later)
+        driver.process.loop.create_task(ask)
+
+    def _jump(self, step: dict[str, Any]) -> None:
+        """Let the wall clock jump."""
+        self._simulation.host(step["target"]).wall_offset_s += step.get("by", 3600.0)
+
+    def _suspend(self, step: dict[str, Any]) -> None:
+        """Suspend a gateway's machine: its processes are paused, and its monotonic clock stands."""
+        simulation = self._simulation
+        member = simulation.members[step["target"]]
+        if not member.running:
+            return
+        process, begun = member.process, self.world.now
+        process.pause()
+
+        def wake() -> None:
+            if process.alive and process.paused:
+                member.host.suspended_s += self.world.now - begun
+                self.world.note(member.name, "was suspended", self.world.now - begun)
+                process.resume()
+
+        self._later(step, wake)
+
+    def heal_all(self) -> None:
+        """End all faults."""
+        self._over = True
+        simulation, paths, fabric = self._simulation, self._simulation.paths, self._simulation.fabric
+        self._waiting.clear()
+        for here, there in paths.cuts:
+            paths.heal(here, there)
+        paths.loss = paths.duplicates = fabric.duplicates = fabric.news_late_s = fabric.news_lost = 0.0
+        paths.slow.clear()
+        processes = [simulation.robot, *simulation.programs]
+        processes += [member.process for member in simulation.members.values() if member.alive]
+        for process in processes:
+            process.resume()
+        for member in simulation.members.values():
+            if not member.alive:
+                member.start()
+        fabric.follow()
+        fabric.between.restore()
+        for session in fabric.sessions:
+            session.link.restore()

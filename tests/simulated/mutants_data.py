@@ -1,0 +1,386 @@
+"""Broken variants of the product: name, profile that reaches it, file, old text, new text."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Mutant(NamedTuple):
+    """One broken variant. profile: None where any scenario may show it."""
+
+    name: str
+    profile: str | None
+    file: str
+    old: str
+    new: str
+
+
+AUTHORITY = "zbridge/control/authority.py"
+PROOF = "zbridge/control/proof.py"
+AGE = "zbridge/control/command_age.py"
+ENFORCER = "zbridge/control/enforcer.py"
+LATCH = "zbridge/control/latch.py"
+INTENT = "zbridge/hq/intent.py"
+OWNERSHIP = "zbridge/robot/ownership.py"
+COMMANDS = "zbridge/robot/commands.py"
+DEVICE = "zbridge/robot/device.py"
+STANDSTILL = "zbridge/control/standstill.py"
+TCPUDP = "gateways/tcpudp/translate/robot.py"
+PRESENCE = "zbridge/robot/presence.py"
+
+MUTANTS = (
+    # the deadman
+    Mutant("deadman never fires", None, AUTHORITY, "        elif now >= self._stop_at:", "        elif False:"),
+    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = given_at + self._deadman_s\n\n", "pass\n\n"),
+    Mutant(
+        "repeated motion extends by three deadmen",
+        None,
+        AUTHORITY,
+        "            self._stop_at = given_at + self._deadman_s\n            return",
+        "            self._stop_at = given_at + 3 * self._deadman_s\n            return",
+    ),
+    Mutant(
+        "deadman as the robot allows",
+        None,
+        AUTHORITY,
+        "Verifier(lease, token), deadman_s",
+        "Verifier(lease, token), self.deadman_s",
+    ),
+    Mutant(
+        "deadman sends no stop",
+        None,
+        AUTHORITY,
+        "reason, stops=stops))\n        self._still()\n        self._held_back = reason",
+        "reason, stops=False))\n        self._still()\n        self._held_back = reason",
+    ),
+    Mutant(
+        "timer not armed",
+        None,
+        ENFORCER,
+        "if deadline is not None and deadline < self._timer_at:",
+        "if False:",
+    ),
+    Mutant(
+        "hold-back forgotten",
+        None,
+        AUTHORITY,
+        "        if self._held_back is not None:\n            raise NeutralFirst",
+        "        if False:\n            raise NeutralFirst",
+    ),
+    Mutant(
+        "hold-back ends with motion",
+        None,
+        AUTHORITY,
+        "        self._still()\n        self._held_back = reason\n",
+        "        self._still()\n        self._held_back = None\n",
+    ),
+    # the lease: expiry, token, proof
+    Mutant(
+        "lease never expires", "bus", AUTHORITY, 'self._handle(Input.EXPIRED, "lease expired", EventKind.ENDED)', "pass"
+    ),
+    Mutant("expiry leaves the robot moving", "bus", AUTHORITY, "        Input.EXPIRED: (_end, State.STOPPED),\n", ""),
+    Mutant("loss of the holder ignored", "bus", AUTHORITY, "        Input.HOLDER_LOST: (_end, State.STOPPED),\n", ""),
+    Mutant("loss of the bus ignored", "bus", AUTHORITY, "        Input.BUS_LOST: (_end, State.STOPPED),\n", ""),
+    Mutant(
+        "stop does not end the lease",
+        "mixed",
+        AUTHORITY,
+        "        Input.STOP: (_end, State.STOPPED),\n        Input.LATCH: (_end, State.LATCHED),\n        Input.EXP",
+        "        Input.LATCH: (_end, State.LATCHED),\n        Input.EXP",
+    ),
+    Mutant(
+        "a held robot is granted to anybody",
+        None,
+        AUTHORITY,
+        "Input.ACQUIRE: (_deny, None),",
+        "Input.ACQUIRE: (_grant, State.HELD),",
+    ),
+    Mutant("ended leases still drive", None, PROOF, "    if holder.ended is not None:", "    if False:"),
+    Mutant(
+        "right proofs are wrong",
+        None,
+        PROOF,
+        "        if not holder.verifier.proves(shown, key, payload):",
+        "        if holder.verifier.proves(shown, key, payload):",
+    ),
+    Mutant(
+        "proofs are not checked",
+        "bus",
+        PROOF,
+        "        if not holder.verifier.proves(shown, key, payload):",
+        "        if False:",
+    ),
+    Mutant(
+        "the gate checks no proof",
+        "bus",
+        "zbridge/control/gate.py",
+        "        if not verifier.proves(said, key, payload):",
+        "        if False:",
+    ),
+    Mutant(
+        "numbers may be used twice",
+        "bus",
+        PROOF,
+        "    if not fresh:\n        raise Malformed",
+        "    if False:\n        raise Malformed",
+    ),
+    Mutant(
+        "release does not stop the robot",
+        None,
+        AUTHORITY,
+        "stops = kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
+        "stops = kind in (EventKind.STOPPED, EventKind.LATCHED)",
+    ),
+    Mutant(
+        "a lease is not renewed by commands",
+        None,
+        AUTHORITY,
+        "            holder.expires_at = now + holder.lease_s\n        return Sender",
+        "            pass\n        return Sender",
+    ),
+    # the age of commands
+    Mutant("nothing is stale", "bus", AGE, "        return late_s > self.limit_s", "        return False"),
+    Mutant(
+        "stale after four seconds",
+        "bus",
+        AGE,
+        "        return late_s > self.limit_s",
+        "        return late_s > 10 * self.limit_s",
+    ),
+    Mutant(
+        "baseline follows every sample",
+        "bus",
+        AGE,
+        "            self._baseline_ms = min(apart_ms, risen_ms)",
+        "            self._baseline_ms = apart_ms",
+    ),
+    Mutant(
+        "deadman counts from arrival",
+        "bus",
+        AUTHORITY,
+        "return Sender(holder.who, now - late_s, late_s, stale)",
+        "return Sender(holder.who, now, late_s, stale)",
+    ),
+    Mutant(
+        "stale motion is not refused",
+        "bus",
+        COMMANDS,
+        "            self._enforcer.require_fresh(sender)\n        try:",
+        "            pass\n        try:",
+    ),
+    Mutant(
+        "suspension not noticed", "mixed", ENFORCER, "if suspended_s > self._suspended_s + SUSPENDED_S:", "if False:"
+    ),
+    # stops and standing still
+    Mutant(
+        "no idle stops",
+        "tcpudp",
+        STANDSTILL,
+        "            and now >= self._repeated_until\n",
+        "            and False\n",
+    ),
+    Mutant(
+        "stop never written",
+        None,
+        ENFORCER,
+        "        if event.stops:\n            self._send_stop()",
+        "        if False:\n            self._send_stop()",
+    ),
+    Mutant(
+        "autonomous mode survives a stall",
+        "tcpudp",
+        "gateways/tcpudp/session/hq_role.py",
+        "        if type(frame) is _Chosen and frame.autonomous:\n            self.sent_autonomous = True",
+        "        if type(frame) is _Chosen:\n            self.sent_autonomous = frame.autonomous",
+    ),
+    Mutant(
+        "stop does not end mode 3",
+        "tcpudp",
+        TCPUDP,
+        "return (ClientControllMode(mode), ClientJoystickStop()) if paired",
+        "return (ClientJoystickStop(),) if paired",
+    ),
+    Mutant("neutral does not reach the robot", None, TCPUDP, "            self._neutral(session, now)\n", ""),
+    Mutant(
+        "stops 10 ms apart to robots that read seldom",
+        "tcpudp",
+        TCPUDP,
+        "        if session.misreads and len(frames) > 1:",
+        "        if False:",
+    ),
+    Mutant(
+        "stalled link is written to",
+        "link",
+        "zbridge/transport/stalls.py",
+        "        blocked = waited_s > (0.0 if self.blocked else STALLED_S)",
+        "        blocked = False",
+    ),
+    Mutant(
+        "drives wait for a stalled link for ever",
+        "link",
+        PRESENCE,
+        '            self._enforcer.hold_back("the robot\'s link took nothing", stops=True)',
+        "            pass",
+    ),
+    Mutant(
+        "a reconnected robot is not stopped",
+        "link",
+        PRESENCE,
+        "            self._standstill.stop()\n        for topic",
+        "            pass\n        for topic",
+    ),
+    # ownership
+    Mutant(
+        "ownership never yields (split brain)",
+        "ownership",
+        OWNERSHIP,
+        "        return any(claim.better_than(own, zid, self._bus.zid) for zid, claim in claims.items())",
+        "        return False",
+    ),
+    Mutant(
+        "both gateways yield",
+        "ownership",
+        OWNERSHIP,
+        "        if first != second:\n            return first > second",
+        "        if first != second:\n            return True",
+    ),
+    Mutant(
+        "a claim is not announced",
+        "ownership",
+        OWNERSHIP,
+        "question.answer(_write(self._claim()))",
+        "question.answer(_write(Claim()))",
+    ),
+    Mutant(
+        "nobody looks before taking",
+        "ownership",
+        OWNERSHIP,
+        "if self._bus_gone or await self._sees(others):",
+        "if False:",
+    ),
+    Mutant(
+        "a yielded gateway goes on",
+        "ownership",
+        "zbridge/app/serving.py",
+        "        await self._device.step_aside()\n",
+        "",
+    ),
+    Mutant(
+        "a yielded gateway never returns",
+        "ownership",
+        OWNERSHIP,
+        "            Input.BEST: (_show, State.OWNING),\n            Input.OUTBID: (_withdraw, State.LOOKING),",
+        "            Input.OUTBID: (_withdraw, State.LOOKING),",
+    ),
+    Mutant("robot not stopped by who yields", "ownership", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
+    Mutant(
+        "claim without latches",
+        "ownership",
+        OWNERSHIP,
+        "            latches=standing.latches,",
+        "            latches=(),",
+    ),
+    # latch
+    Mutant("a latch is a plain stop", "latch", AUTHORITY, "        if stop.latch is True:", "        if False:"),
+    Mutant(
+        "a latched robot is granted",
+        "latch",
+        AUTHORITY,
+        "            Input.ACQUIRE: (_refuse_latched, None),",
+        "            Input.ACQUIRE: (_grant, State.HELD),",
+    ),
+    Mutant(
+        "latches are not kept on disk",
+        "latch",
+        "zbridge/control/latch_store.py",
+        "        self._put(self._own, latches.record)",
+        "        pass",
+    ),
+    Mutant(
+        "a takeover ends a latch",
+        "latch",
+        AUTHORITY,
+        "            Input.TAKEOVER: (_refuse_latched, None),",
+        "            Input.TAKEOVER: (_grant, State.HELD),",
+    ),
+    Mutant(
+        "any unlatch frees the robot",
+        "latch",
+        AUTHORITY,
+        "        if not self.latches:\n            self._handle(Input.UNLATCH)",
+        "        self._handle(Input.UNLATCH)",
+    ),
+    Mutant(
+        "latched robots forget at their start",
+        "latch",
+        AUTHORITY,
+        "State.LATCHED if self.latches else State.FREE",
+        "State.FREE",
+    ),
+    # HQ programs
+    Mutant(
+        "HQ deadman ignored",
+        "hq",
+        INTENT,
+        "        if self._moving and now - self._moved_at >= self.deadman_s:",
+        "        if False:",
+    ),
+    Mutant(
+        "HQ programs need no neutral",
+        "hq",
+        INTENT,
+        "            Input.MOTION: (Action.REFUSE, State.IDLE_OWES),",
+        "            Input.MOTION: (Action.ACQUIRE, State.ASKING),",
+    ),
+    Mutant(
+        "a lost HQ program keeps the lease",
+        "hq",
+        "zbridge/hq/operator.py",
+        '            self._release("disconnected")',
+        "            pass",
+    ),
+    Mutant("old neutral counts at once", "hq", INTENT, "        if self._waited:\n", "        if False:\n"),
+    Mutant(
+        "a frozen listener goes on",
+        "hq",
+        "zbridge/hq/listener.py",
+        "            client.let_go(FROZEN)",
+        "            pass",
+    ),
+    Mutant(
+        "HQ programs hold the robot for ever",
+        "hq",
+        INTENT,
+        "        return self.held and now - used_at >=",
+        "        return self.held and now - used_at >= 1000 +",
+    ),
+    # what is shown
+    Mutant(
+        "control is not published",
+        None,
+        ENFORCER,
+        "        if changed:\n            self.report()",
+        "        if False:\n            self.report()",
+    ),
+    Mutant(
+        "no heartbeat",
+        None,
+        DEVICE,
+        "                self._presence.publish_status()\n                self._enforcer.beat()",
+        "                pass",
+    ),
+    Mutant(
+        "leases wait for ever",
+        None,
+        "zbridge/robot/fleet_latches.py",
+        "        if not self._returned.is_set():\n            self._leases.wait(None)",
+        "        pass",
+    ),
+    Mutant(
+        "the client never learns of a loss",
+        "bus",
+        "zbridge/client/driver.py",
+        "        self.lost.set()",
+        "        pass",
+    ),
+)

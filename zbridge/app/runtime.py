@@ -1,0 +1,36 @@
+"""What a gateway takes from its machine: clocks, randomness, sockets and a folder. A simulation injects its own."""
+
+from __future__ import annotations
+
+import random
+import secrets
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from zbridge.control import clocks
+from zbridge.transport.kernel import KERNEL, Kernel
+
+
+class Runtime(msgspec.Struct, frozen=True):
+    """The machine below one gateway.
+
+    clock: seconds on the time line of event loops, without their rounding. clock_ns: Unix time. raw_ms, suspended_s:
+    see :mod:`zbridge.control.clocks`. chance: 0 to 1. secret: so many random bytes. folder: where latched stops are
+    kept; None: where :func:`zbridge.control.latch_store.state_folder` says.
+    """
+
+    clock: Callable[[], float] = time.monotonic
+    clock_ns: Callable[[], int] = time.time_ns
+    raw_ms: Callable[[], float] = clocks.raw_ms
+    suspended_s: Callable[[], float] = clocks.suspended_s
+    chance: Callable[[], float] = random.random
+    secret: Callable[[int], bytes] = secrets.token_bytes
+    kernel: Kernel = KERNEL
+    folder: Path | None = None
+
+
+RUNTIME = Runtime()
+"""This machine."""

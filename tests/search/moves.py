@@ -15,7 +15,8 @@ Move = tuple[str, Callable[[World], None]]
 @dataclass(frozen=True)
 class Bounds:
     """One bounded world: what may happen in it. channel: messages on their way at a time; a program whose commands
-    find no room waits, and its questions are lost. delay: steps of time for which a message is on its way at most."""
+    find no room waits, and its questions are lost. delay: steps of time for which a message is on its way at most. loses, repeats: what the network does. drops: whether
+    programs give the lease back, or stop asking. freezes: whether the gateway may be late with what is due. beats: whether ``control`` comes unchanged, too."""
 
     name: str
     programs: tuple[Program, ...]
@@ -23,8 +24,10 @@ class Bounds:
     channel: int = 2
     delay: int = 1
     loses: bool = True
+    drops: bool = True
     repeats: bool = False
     freezes: bool = False
+    beats: bool = True
     faults: frozenset[str] = field(default_factory=frozenset)
     """``stop``, ``robot latch``, ``fleet latch``, ``link``, ``offline``, ``bus``, ``token``, ``gateway``, ``forged``."""
     states: int = 200_000
@@ -47,7 +50,7 @@ def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
         state = holder.client._state.value
         if room and state in ("free", "dropped", "returning"):
             yield f"{number} wants", lambda world, number=number: world.holders[number].want()
-        if state not in ("free", "dropped", "returning") and (room or not holder.held):
+        if bounds.drops and state not in ("free", "dropped", "returning") and (room or not holder.held):
             yield f"{number} drops", lambda world, number=number: world.holders[number].drop()
         if room and holder.held:
             for what in bounds.commands:
@@ -56,7 +59,8 @@ def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
             yield f"{number} hears", lambda world, number=number: world.hear(number)
         if "gateway" in bounds.faults and state != "free":
             yield f"{number} hears that the gateway is gone", lambda w, number=number: w.holders[number].gateway_lost()
-    yield "beat", lambda world: world.beat()
+    if bounds.beats:
+        yield "beat", lambda world: world.beat()
 
 
 def _of_network(world: World, bounds: Bounds) -> Iterator[Move]:

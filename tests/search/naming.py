@@ -161,7 +161,7 @@ class _Namer:
             authority._state.value, authority.on_its_own, authority._autonomous, tuple(sorted(authority._moving)),
             self._ago(authority._stop_at), authority._held_back or "", tuple(map(self._lease, self._known())),
             tuple(authority.latches._in_force), tuple(sorted(authority.latches._released)),
-            tuple(sorted(authority.latches._released_fleet)), tuple(authority._stops),
+            tuple(sorted(authority.latches._released_fleet)), _stops(tuple(authority._stops)),
         )  # fmt: skip
 
     def _lease(self, holder: Any) -> Any:
@@ -225,3 +225,8 @@ class _Namer:
 
 
 _WAITING = ("asking", "paused", "dropped", "recalled", "returning", "wanted", "free")
+
+
+def _stops(ids: tuple[bytes, ...]) -> tuple[bytes, ...]:
+    """Name the ids of the last stops: how often one alone was told does not matter."""
+    return ids if len(set(ids)) > 1 else ids[:1]

@@ -27,7 +27,8 @@ HANG_S = 5.0
 MEMORY_BYTES = 4 << 30
 """Address space of a process that fuzzes: a reader that wants more raises MemoryError."""
 NUMBERS = (b"\0", b"\xff", b"\x7f", b"\x80", b"\xff\xff\xff\xff", b"\0\0\0\x80", b"\xff\xff\xff\x7f", b"\0" * 8,
-           b"\xff" * 8, b"\0\0\0\0\0\0\xf0\x7f", b"\0\0\0\0\0\0\xf8\x7f", b"-1", b"nan", b"1e999", b"\r\n\r\n")  # fmt: skip
+           b"\xff" * 8, b"\0\0\0\0\0\0\xf0\x7f", b"\0\0\0\0\0\0\xf8\x7f", b"-1", b"nan", b"1e999",
+           b"\r\n\r\n")  # fmt: skip
 
 
 class HangError(Exception):
@@ -137,7 +138,8 @@ def run_guided(target: Target, seconds: float, seed: int) -> int:
     for number, data in enumerate(target.seeds()):
         (found / f"seed-{number}").write_bytes(data)
     options = [f"-max_total_time={max(1, int(seconds))}", f"-seed={seed}", f"-max_len={target.most_bytes}",
-               f"-timeout={HANG_S:.0f}", "-rss_limit_mb=2048", f"-artifact_prefix={place}/", "-print_final_stats=1"]  # fmt: skip
+               f"-timeout={HANG_S:.0f}", "-rss_limit_mb=2048",
+               f"-artifact_prefix={place}/", "-print_final_stats=1"]  # fmt: skip
     folders = [str(found), *([str(CORPUS / target.name)] if (CORPUS / target.name).is_dir() else [])]
     command = [sys.executable, "-m", "tests.fuzz.guided", target.name, *options, *folders]
     return subprocess.run(command, check=False).returncode

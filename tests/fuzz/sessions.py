@@ -72,10 +72,7 @@ def _in_time(make: Make, reads: Iterable[bytes], chance: Iterator[int]) -> None:
         now += PAUSES_S[next(chance) % len(PAUSES_S)]
         _run_timers(session, now)
         way = next(chance) % 16
-        if way < 2:
-            heard = session.receive_datagram(read if way else b"", now)
-        else:
-            heard = session.receive(read, now)
+        heard = session.receive_datagram(read[: way * len(read)], now) if way < 2 else session.receive(read, now)
         for message in heard:
             with contextlib.suppress(ProtocolError, EncodeError):
                 tell(message)
@@ -248,5 +245,6 @@ ROLES: tuple[tuple[str, Make, tuple[str, ...], bytes], ...] = (
     ("session-wc2ec-robot-draft", _robot(WC2EC, dialect="draft", devices=[{"name": "light0", "number": 0}]), _WC2EC,
      b""),
     ("session-wc2ec-hq", _listener(WC2EC), _WC2EC, stream("wc2ec-deployed.hex", destination=27515)),
-    ("session-wc2ec-hq-draft", _listener(WC2EC, dialect="draft", devices=[{"name": "light0", "number": 0}]), _WC2EC, b""),
+    ("session-wc2ec-hq-draft", _listener(WC2EC, dialect="draft", devices=[{"name": "light0", "number": 0}]), _WC2EC,
+     b""),
 )  # fmt: skip

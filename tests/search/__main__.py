@@ -42,8 +42,8 @@ def main() -> int:
 
 def _line(found: Found) -> str:
     return (
-        f"{found.bounds.name:34} {found.states:7} states {found.moves:8} moves, {'complete' if found.complete else 'CUT'},"
-        f" the lease within {found.longest} steps"
+        f"{found.bounds.name:34} {found.states:7} states {found.moves:8} moves, "
+        f"{'complete' if found.complete else 'CUT'}, the lease within {found.longest} steps"
     )
 
 

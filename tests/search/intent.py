@@ -103,8 +103,10 @@ def _after(intent: Intent, now: float, known: Known) -> Iterator[tuple[Intent, f
 def _judge(name: str, before: Intent, after: Intent, action: Action | None, known: Known) -> Known:
     """Follow what the program said; raise Finding."""
     owes = after.held_back is not None
-    if name in ("motion", "autonomous") and action in (Action.SEND, Action.ACQUIRE, Action.WAIT) and (
-        known.owes and owes
+    if (
+        name in ("motion", "autonomous")
+        and action in (Action.SEND, Action.ACQUIRE, Action.WAIT)
+        and (known.owes and owes)
     ):
         raise Finding(f"{name} was {action} while neutral was owed: {before!r}")
     if name == "motion" and action is Action.SEND and known.lease != "held":

@@ -14,9 +14,13 @@ Move = tuple[str, Callable[[World], None]]
 
 @dataclass(frozen=True)
 class Bounds:
-    """One bounded world: what may happen in it. channel: messages on their way at a time; a program whose commands
-    find no room waits, and its questions are lost. delay: steps of time for which a message is on its way at most. loses, repeats: what the network does. drops: whether
-    programs give the lease back, or stop asking. freezes: whether the gateway may be late with what is due. beats: whether ``control`` comes unchanged, too."""
+    """One bounded world: what may happen in it.
+
+    channel: messages on their way at a time; a program whose commands find no room waits, and its questions are lost.
+    delay: steps of time for which a message is on its way at most. loses, repeats: what the network does. drops:
+    whether programs give the lease back, or stop asking. freezes: whether the gateway may be late with what is due.
+    beats: whether ``control`` comes unchanged, too.
+    """
 
     name: str
     programs: tuple[Program, ...]
@@ -29,7 +33,7 @@ class Bounds:
     freezes: bool = False
     beats: bool = True
     faults: frozenset[str] = field(default_factory=frozenset)
-    """``stop``, ``robot latch``, ``fleet latch``, ``link``, ``offline``, ``bus``, ``token``, ``gateway``, ``forged``."""
+    """Of ``stop``, ``robot latch``, ``fleet latch``, ``link``, ``offline``, ``bus``, ``token``, ``gateway``."""
     states: int = 200_000
     """More states than this are a fault of the bounds: the search has to be complete."""
 
@@ -58,7 +62,7 @@ def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
         if world.news[number] is not None:
             yield f"{number} hears", lambda world, number=number: world.hear(number)
         if "gateway" in bounds.faults and state != "free":
-            yield f"{number} hears that the gateway is gone", lambda w, number=number: w.holders[number].gateway_lost()
+            yield f"{number} hears that the gateway is gone", lambda w, n=number: w.holders[n].gateway_lost()
     if bounds.beats:
         yield "beat", lambda world: world.beat()
 

@@ -30,7 +30,13 @@ class Account(NamedTuple):
 
     def named(self, world: World) -> Any:
         """Write what of the account the state does not say; for the name of the state."""
-        return (self.program, self.owes, round(self.baseline_s, 1), tuple(sorted(self.latched)), tuple(sorted(self.released)))
+        return (
+            self.program,
+            self.owes,
+            round(self.baseline_s, 1),
+            tuple(sorted(self.latched)),
+            tuple(sorted(self.released)),
+        )
 
 
 class Violation(AssertionError):
@@ -76,7 +82,7 @@ def _state_holds(world: World, account: Account) -> None:
         raise Violation("commanded motion has no deadline")
     if deadline is not None and deadline - world.now > max(LEASE_S, DEADMAN_S) + TOLERANCE_S:
         raise Violation(f"a deadline {deadline - world.now:g} s away")
-    if robot.moving and world.now >= robot.moved_at + DEADMAN_S + TOLERANCE_S and not _was_late(world):
+    if robot.moving and world.now >= robot.moved_at + DEADMAN_S - TOLERANCE_S and not _was_late(world):
         raise Violation("the robot moves longer than its deadman")
 
 
@@ -97,7 +103,9 @@ def _acquire(account: Account, world: World, said: Any) -> Account:
     outranks = held and world.programs[program].priority > world.programs[account.program].priority
     allowed = not account.latched and (not held or taking or outranks)
     if reply.ok != allowed:
-        raise Violation(f"a question for the lease was {'granted' if reply.ok else 'refused'}: {account}, {reply.reason}")
+        raise Violation(
+            f"a question for the lease was {'granted' if reply.ok else 'refused'}: {account}, {reply.reason}"
+        )
     if not reply.ok:
         return account
     return account._replace(

@@ -93,9 +93,9 @@ class _Search:
                     if key not in self._came:
                         self._came[key] = (name, move)
                         following.append((key, after, next_account))
+                if len(self._came) > bounds.states:
+                    raise Finding(f"{bounds.name}: more than {bounds.states} states: the search is not complete")
             level = following
-            if len(self._came) > bounds.states:
-                raise Finding(f"{bounds.name}: more than {bounds.states} states: the search is not complete")
         found.states, found.complete = len(self._came), True
 
     def _after(self, name: Any, world: World, account: Account) -> Iterator[tuple[str, World, Account]]:
@@ -123,7 +123,9 @@ class _Search:
                 raise Finding(self._told(name, "then the network works", error)) from error
 
     def _fair(self, wanted: int | None, world: World) -> int:
-        """Return the steps of time until all is well; raise Violation where it never is. wanted: who wants the lease."""
+        """Return the steps of time until all is well; raise Violation where it never is. wanted: wants the lease."""
+        if _well(wanted, world):
+            return 0
         world = world.copy()
         World.moves = world
         if wanted is not None:

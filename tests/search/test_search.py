@@ -1,5 +1,6 @@
 """Every state of small worlds around the lease: nobody moves a robot who may not, and who wants the lease gets it."""
 
+import contextlib
 from collections import Counter
 
 import pytest
@@ -30,3 +31,7 @@ def test_every_state_of_the_intent_of_a_program_keeps_the_rules_and_each_cell_is
 @pytest.mark.parametrize("broken", MUTANTS, ids=lambda broken: broken[0])
 def test_a_broken_variant_is_caught(broken: Broken) -> None:
     assert caught_by(broken[1]) is not None
+
+
+def test_the_same_search_finds_nothing_in_the_real_machines() -> None:
+    assert caught_by(contextlib.nullcontext) is None

@@ -6,8 +6,8 @@ refusals and the names of tokens only by their order, for the machines only comp
 more is left out: ended leases of which nothing is on its way, refusals on which no program acts, the drift of a clock.
 
 Real are the authority with its latches and proofs, the gates of commands and questions, and the lease clients with
-:class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the enforcer, the lease
-server and ``Commands`` do it.
+:class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the enforcer, the
+lease server and ``Commands`` do it.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def test_what_is_no_message_is_an_error_and_its_descriptors_are_closed(data: byt
     with far, contextlib.closing(near), socket.socket() as sent:
         before = len(os.listdir("/proc/self/fd"))
         socket.send_fds(far, [data], [sent.fileno()])
-        with pytest.raises(ValueError, match="malformed|utf-8") as raised:
+        with pytest.raises(ValueError, match=r"malformed|utf-8") as raised:
             near.receive()
         assert type(raised.value) is ValueError
         assert len(os.listdir("/proc/self/fd")) == before

@@ -85,8 +85,8 @@ def targets() -> Iterator[Target]:
     yield Target("mcap", read_recording, _recordings, ("zbridge/views/recording/reader.py",
                  "zbridge/views/recording/wire_tape.py", "zbridge/views/recording/summary.py"), 8192)  # fmt: skip
     yield Target("mjpeg", read_camera, _answers, ("zbridge/camera/mjpeg.py", "zbridge/camera/jpeg.py"), 8192)
-    yield Target("http", answer_http, _requests, ("zbridge/app/prometheus.py",), 1024)
-    yield Target("configuration", read_configuration, _configurations, ("zbridge/app/config.py",))
+    yield Target("http", answer_http, _requests, (), 1024)
+    yield Target("configuration", read_configuration, _configurations, ())
 
 
 def _recordings() -> Iterator[bytes]:

@@ -172,12 +172,12 @@ def require_drivable(drive: messages.Drive) -> None:
 def targets() -> Iterator[Target]:
     """Yield the targets."""
     yield Target("fleet-payload", read_fleet, _fleet, ("zbridge/fleet/payload.py", "zbridge/views/recording/stamps.py"))
-    yield Target("authorization", read_authorization, _authorizations, ("zbridge/control/proof.py",), 256)
+    yield Target("authorization", read_authorization, _authorizations, (), 256)
     yield Target("stop", read_stops, _stops, ("zbridge/control/latch.py",), 512)
-    yield Target("claim", read_claim, _claims, ("zbridge/robot/ownership.py",))
-    yield Target("process", read_process, _processes, ("zbridge/app/handover/messages.py",))
+    yield Target("claim", read_claim, _claims, ())
+    yield Target("process", read_process, _processes, ())
     yield Target("key", read_key, _keys, ("zbridge/fleet/topics.py", "zbridge/ros2/tokens.py", "zbridge/ros2/qos.py",
-                                          "zbridge/ros2/names.py", "zbridge/protocol/address.py"), 512)  # fmt: skip
+                                           "zbridge/protocol/address.py"), 512)  # fmt: skip
     yield Target("keyed-sample", read_keyed, _samples, ("zbridge/protocol/samples.py", "zbridge/ros2/attachment.py"))
     yield Target("cdr", read_cdr, _cdr, ("zbridge/ros2/types.py", "zbridge/views/ros2/cmd_vel.py"))
     yield Target("viewer", read_viewer, _viewer, ("zbridge/views/foxglove/requests.py",

@@ -1,6 +1,6 @@
 """Runs targets: with atheris, which looks at what each input reaches, or with a mutator of our own, which is blind.
 
-The blind one needs nothing, reads some ten times as many bytes a second, and repeats itself from a seed. Both begin
+The blind one needs nothing, is faster, and repeats itself from a seed. Both begin
 with the corpus and the seeds of a target, end a reader that hangs, and bound the memory of the process.
 """
 

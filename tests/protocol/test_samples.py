@@ -62,3 +62,8 @@ def test_what_is_too_long_is_not_written() -> None:
 def test_subscriptions_and_counts() -> None:
     assert (subscription("k").payload, subscription("k", kept=True).payload) == (b"", b"kept")
     assert read_sample(write_sample(dropped(7))).count == 7
+
+
+def test_a_number_of_dropped_samples_that_is_none_is_a_protocol_error() -> None:
+    with pytest.raises(ProtocolError, match="DROPPED of 3 bytes"):
+        assert read_sample(write_sample(KeyedSample(SampleKind.DROPPED, payload=b"\1\0\0"))).count

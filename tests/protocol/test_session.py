@@ -243,3 +243,11 @@ def test_a_peer_without_a_rate_may_send_all_at_once() -> None:
     session = Toy(Limits(frame_bytes=100, handshake_s=5.0, rate_hz=math.inf))
     session.open(0.0)
     assert [len(session.receive(b"\x01a" * count, 0.0)) for count in (10_000, 1)] == [10_000, 1]
+
+
+def test_an_empty_datagram_is_malformed_and_no_framing_function_sees_it() -> None:
+    session = Toy(LIMITS)
+    session.open(0.0)
+    assert session.receive_datagram(b"", 0.0) == []
+    assert (session.traffic.malformed, session.last_malformed) == (1, "datagram of 0 bytes holds a frame of 1")
+    assert not session.over

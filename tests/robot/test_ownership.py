@@ -209,6 +209,7 @@ IMPLAUSIBLE = [
     b"",
     b"\xc1",
     b"\x91" * 2000,
+    b"\x81\xa7latches\x91\x82\xa2id\xc4\x10" + bytes(16) + b"\xa3who\xa1\xff",  # a text that is no UTF-8
 ]
 
 
@@ -446,7 +447,8 @@ async def test_a_foreign_question_makes_the_owner_ask_and_its_own_does_not() -> 
     forge(bus.join("1"), EVIL)
     await bus.join("1").ask(CLAIM, msgpack.packb({"zid": "5", "serves": True}))
     await bus.join("2").ask(CLAIM, msgpack.packb({"zid": "2", "serves": False}))
-    await bus.join("2").ask(CLAIM, b"\xc1")
+    for question in (b"\xc1", b"\x81\xa3zid\xa1\xff"):
+        await bus.join("2").ask(CLAIM, question)
     seen = len(robot.rivals)
     await asyncio.sleep(0.3)
     assert len(robot.rivals) == seen

@@ -59,7 +59,9 @@ class KeyedSample(msgspec.Struct, frozen=True):
 
     @property
     def count(self) -> int:
-        """The number of samples that DROPPED tells of."""
+        """The number of samples that DROPPED tells of; raises ProtocolError where it tells none."""
+        if len(self.payload) != _COUNT.size:
+            raise ProtocolError(f"DROPPED of {len(self.payload)} bytes: expected {_COUNT.size}")
         return int(_COUNT.unpack(self.payload)[0])
 
 

@@ -191,7 +191,7 @@ class Session(KeptSession, ABC, Generic[M]):
         if self.tap is not None:
             self.tap("in", Datagram(datagram))
         try:
-            end = self.frame_end(datagram, 0)
+            end = self.frame_end(datagram, 0) if datagram else 1
             if end != len(datagram):
                 raise ProtocolError(f"datagram of {len(datagram)} bytes holds a frame of {end}")
             message = self.decode(datagram)

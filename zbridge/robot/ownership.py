@@ -421,7 +421,7 @@ class Ownership:
             if answer.replier is None or answer.replier in heard:
                 continue
             heard.add(answer.replier)
-            with contextlib.suppress(msgspec.MsgspecError, RecursionError):
+            with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
                 claim = _read(answer.payload)
                 if answer.error is None and claim.plausible:
                     claims.append((claim, answer.replier))
@@ -444,7 +444,7 @@ class Ownership:
         )
 
     def _on_question(self, question: IncomingQuery) -> None:
-        with contextlib.suppress(msgspec.MsgspecError, RecursionError):
+        with contextlib.suppress(msgspec.MsgspecError, UnicodeError, RecursionError):
             asker = _read_question(question.payload)
             if asker.serves and asker.zid != self._bus.zid:
                 self._asked.set()

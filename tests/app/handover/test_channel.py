@@ -45,3 +45,11 @@ async def test_the_last_word_of_who_takes_nothing_any_more_is_the_reason(ends: t
     other.close()
     with pytest.raises(HandoverError, match="its file is wrong"):
         await channel.send(Hello(VERSION, os.getpid()))
+
+
+async def test_a_message_that_cannot_be_read_is_told_as_such(ends: tuple[Channel, socket.socket]) -> None:
+    channel, other = ends
+    for data in (b"\xc1", b"\x82\xa4type\xa6failed\xa6reason\xa1\xff"):
+        other.sendall(len(data).to_bytes(4, "big") + data)
+        with pytest.raises(HandoverError, match="cannot be understood"):
+            await channel.receive(Hello, 5.0)

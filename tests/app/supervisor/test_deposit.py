@@ -43,7 +43,9 @@ class Played:
         self.deposit.duplicates.opened(link, name, [os.dup(self._stream.fileno())], drives=True)
 
     def deposits(self, what: str) -> None:
-        data = msgspec.msgpack.encode(Given(VERSION, {}, 1, device={"what": what}))
+        self.leaves(msgspec.msgpack.encode(Given(VERSION, {}, 1, device={"what": what})))
+
+    def leaves(self, data: bytes) -> None:
         self.deposit.keep(Kept(((self.link, 0),), self.memory.deposit(data), len(data)))
 
     def close(self) -> None:
@@ -183,3 +185,13 @@ def test_a_link_that_is_closed_on_purpose_is_closed_in_all_deposits(pair: Pair) 
     after.deposit.closed(2)
     assert pair.robot.recv(1) == b""
     assert not after.deposit.has_links
+
+
+@pytest.mark.parametrize("data", [b"\xc1", b"\x82\xa4type\xa5given\xa5setup\x81\xa1\xff\1"], ids=["form", "text"])
+def test_a_state_that_cannot_be_read_is_told_as_such(pair: Pair, data: bytes) -> None:
+    process = pair.process()
+    process.opens(1)
+    process.leaves(data)
+    process.memory.cut(1, Partial())
+    with pytest.raises(HandoverError, match="cannot be understood"):
+        process.deposit.inheritance()

@@ -78,11 +78,13 @@ def test_what_finds_no_room_is_counted_and_does_not_block(ends: tuple[Post, Post
     assert ends[0].unsent == 1
 
 
-def test_what_is_no_message_is_an_error_and_its_descriptors_are_closed() -> None:
+@pytest.mark.parametrize("data", [b"\xc1", b"\x82\xa4type\xa7started\xa6reason\xa1\xff"], ids=["form", "text"])
+def test_what_is_no_message_is_an_error_and_its_descriptors_are_closed(data: bytes) -> None:
     near, far = Post.pair()
     with far, contextlib.closing(near), socket.socket() as sent:
         before = len(os.listdir("/proc/self/fd"))
-        socket.send_fds(far, [b"\xc1"], [sent.fileno()])
-        with pytest.raises(ValueError, match="malformed"):
+        socket.send_fds(far, [data], [sent.fileno()])
+        with pytest.raises(ValueError, match=r"malformed|utf-8") as raised:
             near.receive()
+        assert type(raised.value) is ValueError
         assert len(os.listdir("/proc/self/fd")) == before

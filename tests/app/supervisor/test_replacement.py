@@ -84,6 +84,19 @@ def test_a_state_of_another_version_is_refused_whatever_else_it_has() -> None:
         os.close(descriptor)
 
 
+@pytest.mark.parametrize(
+    "data", [b"\xc1", b"\x82\xa7version" + bytes([VERSION]) + b"\xa7sources\x91\xa1\xff"], ids=["form", "text"]
+)
+def test_what_is_no_state_is_told_as_such(data: bytes) -> None:
+    descriptor = os.memfd_create("state")
+    try:
+        os.write(descriptor, data)
+        with pytest.raises(HandoverError, match="no state of a supervisor"):
+            restore(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def test_no_state_is_said_in_one_line() -> None:
     reading, writing = os.pipe()
     os.close(writing)

@@ -91,7 +91,7 @@ class Channel:
             raise HandoverError(f"the other side says nothing for {timeout_s:g} s") from error
         except OSError as error:  # reset: it ended with a message of ours unread
             raise EndError(_ENDED) from error
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise HandoverError(f"the other side cannot be understood: {error}") from error
         if isinstance(message, Failed):
             raise HandoverError(message.reason)

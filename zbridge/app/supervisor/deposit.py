@@ -99,7 +99,7 @@ class Deposit:
             raise HandoverError("it died while it read: nobody knows where its stream stands")
         try:
             given = msgspec.msgpack.decode(state, type=Given)
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise HandoverError(f"what it left cannot be understood: {error}") from error
         parcel = Parcel()
         try:

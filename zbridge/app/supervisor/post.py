@@ -80,7 +80,7 @@ class Post:
         descriptors = _descriptors(sent)
         try:
             return _decode(data), descriptors
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             close_all(descriptors)
             raise ValueError(str(error)) from error
 

@@ -131,5 +131,5 @@ def restore(descriptor: int) -> SupervisorState:
         if (version := _head(data).version) != VERSION:
             raise HandoverError(f"the supervisor left a state of version {version}, this code takes version {VERSION}")
         return _decode(data)
-    except (OSError, msgspec.MsgspecError) as error:
+    except (OSError, msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise HandoverError(f"no state of a supervisor: {error}") from error

@@ -15,7 +15,7 @@ _LARGEST = 2**64 - 1
 
 
 def with_stamp(payload: bytes, stamp_ns: int) -> bytes:
-    """Return a payload with this stamp in place of its own; unchanged where it has none or is no map."""
+    """Return a payload with this stamp in place of its own; unchanged where it has none or cannot be read."""
     stamp_ns = min(max(stamp_ns, 0), _LARGEST)
     if payload[1:_AT] == _NAME and payload[0] in _MAPS and len(payload) >= _AT + 8:
         return payload[:_AT] + struct.pack(">Q", stamp_ns) + payload[_AT + 8 :]

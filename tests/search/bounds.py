@@ -1,0 +1,32 @@
+"""The bounded worlds that are searched. What is not in any of them is said in ``docs/reliability.md``."""
+
+from tests.search.moves import Bounds
+from tests.search.world import Program
+
+ANN = Program("ann")
+LISTENER = Program("hq.l.1", waits=False)
+CHIEF = Program("chief", takeover=True, waits=False)
+
+_DRIVES = ("motion", "neutral")
+
+
+def _of(*faults: str) -> frozenset[str]:
+    return frozenset(faults)
+
+
+QUICK = (
+    Bounds("one client asks and loses", (ANN,), channel=1, faults=_of("stop")),
+    Bounds("one listener drives", (LISTENER,), _DRIVES, channel=1, loses=False, faults=_of("link")),
+    Bounds("a latch", (LISTENER,), channel=1, loses=False, faults=_of("robot latch")),
+    Bounds("a takeover", (LISTENER, CHIEF), channel=1, loses=False, drops=False, beats=False),
+)
+"""Those that the tests search."""
+FULL = (
+    Bounds("one listener drives by itself", (LISTENER,), ("autonomous", "manual", "neutral"), channel=1, loses=False,
+           faults=_of("stop", "bus")),
+    Bounds("one client, and all is lost", (ANN,), channel=1, faults=_of("stop", "token", "gateway", "bus")),
+    Bounds("late by two steps", (LISTENER,), _DRIVES, channel=1, delay=2, faults=_of("link")),
+    Bounds("a frozen gateway", (LISTENER,), _DRIVES, channel=1, freezes=True, faults=_of("stop", "offline")),
+    Bounds("one client drives", (ANN,), _DRIVES, channel=1, faults=_of("stop", "link")),
+)  # fmt: skip
+"""Those that ``python -m tests.search`` searches besides."""

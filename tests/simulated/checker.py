@@ -178,7 +178,7 @@ class Checker:
     def _on_ended(self, who: str) -> None:
         if who in self.gateways:
             unwritten = [each for each, at in self.latches[who].items() if self.world.now - at < WRITTEN_S]
-            for stop_id in unwritten:  # docs/reliability.md: confirmed before it is on disk
+            for stop_id in unwritten:  # nobody has confirmed it yet
                 del self.latches[who][stop_id]
                 self.counts["excused: killed before a latch was written"] += 1
             self.end(who, "gateway ended")

@@ -137,6 +137,9 @@ class Outcome:
     disturbed: bool = False
     """Whether the robot was never driven, and was late itself: it lost packets that it read as one."""
 
+    within_a_read: bool = False
+    """Whether the process died while it read: then nobody can resume its connection."""
+
     @property
     def good(self) -> bool:
         """Whether everything was as it should be."""
@@ -322,6 +325,7 @@ def repeat(scene: Scene, case: Case) -> Outcome:
             outcome.faults.append(f"{type(error).__name__}: {error}; {status}")
         if not outcome.good and not outcome.disturbed:
             lines = [line for line in scene.supervisor.log_since(logged).splitlines() if f"{crossing._name}:" in line]
+            outcome.within_a_read = any("it died while it read" in line for line in lines)
             print(outcome, *lines[-25:], sep="\n  ", file=sys.stderr, flush=True)
     return outcome
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.conftest import Bench, device, end, repeated, start, until
-from tests.e2e.crossings import Case, measure
+from tests.e2e.crossings import Case, Outcome, measure
 from tests.e2e.robots import MOVE, STOP, Robot, position
 from tests.e2e.steps import AFTER_GIVEN, AFTER_GO, FIRST_READ
 from tests.e2e.supervised import Supervised
@@ -157,7 +157,11 @@ def test_robots_rest_and_stay_usable_whatever_their_gateway_dies_of_and_at_whate
         Case("alf", f"successor {AFTER_GO}"),
         Case("tcpudp-1.3-udp", f"again successor {FIRST_READ}"),
     ]
-    outcomes = measure(plan, lanes=len(plan))
+    outcomes, left = list[Outcome](), plan
+    for _ in range(4):  # the busier the machine, the more often somebody dies within a read
+        tried = measure(left, lanes=len(left)) if left else []
+        outcomes += [outcome for outcome in tried if not outcome.within_a_read]
+        left = [outcome.case for outcome in tried if outcome.within_a_read]
     assert len(outcomes) == len(plan)
     assert [outcome for outcome in outcomes if not outcome.good] == []
 

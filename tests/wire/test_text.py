@@ -218,7 +218,12 @@ def by_the_book(body: bytes) -> tuple[int, list[int], int] | None:
     if len(numbers) < 2:
         return None
     sequence, *points, last = numbers
-    right = 0 <= sequence < 2**63 and 0 <= last < 2**32 and all(-(2**63) <= point < 2**31 for point in points)
+    right = (
+        0 <= sequence < 2**63
+        and 0 <= last < 2**32
+        and last != 13
+        and all(-(2**63) <= point < 2**31 for point in points)
+    )
     return (sequence, points, last) if right else None
 
 
@@ -233,6 +238,7 @@ def by_the_book(body: bytes) -> tuple[int, list[int], int] | None:
 )
 @example(b"1|2|3 4")
 @example(b"1|-|3")
+@example(b"0|13")
 @example(b"5|10-20|--9|9")
 @example(b"|5|+10|\xff020||- 3|9x\r\n")
 @example(b"9223372036854775806|2147483647|4294967295")

@@ -60,6 +60,7 @@ class RosRobot(Robot):
     """One ROS 2 robot: the nodes on the other side of its router."""
 
     link_names = ("router",)
+    closing_harmless = True
 
     def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()

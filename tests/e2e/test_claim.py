@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import time
 
@@ -13,6 +14,7 @@ import zenoh
 from tests.e2e.conftest import WAIT_S, Bench, Fleet, Gateway, configuration, device, end, start, until
 from tests.e2e.relay import Relay
 from tests.e2e.robots import Robot
+from tests.e2e.supervised import Supervised
 from tests.machine import Patience
 from tests.ports import free_port
 from tests.proofs import packed
@@ -174,6 +176,42 @@ def test_a_standby_that_took_over_during_a_silent_cut_yields_within_2_s_and_step
         assert [latch["who"] for latch in bench.fleet.last("r1/control")["latches"]] == ["ann"]
         assert "next attempt" not in second.log, "its connection is kept"
         second.end()
+
+
+def test_a_gateway_that_stands_aside_does_so_after_a_restart_and_after_a_crash_and_keeps_its_connection(
+    bench: Bench,
+) -> None:
+    port, other, folder = bench.simulator(), f"tcp/127.0.0.1:{free_port()}", bench.folder / "robots"
+    far = Fleet(bench.stack.enter_context(zenoh.open(configuration("router", other))))
+    owner = bench.gateway(device(port), name="far", endpoint=other)
+    until(lambda: far.state() == "established", what="the owner has the robot")
+    folder.mkdir()
+    file = folder / "r1.toml"
+    bus = f'[bus]\nconnect = ["{bench.endpoint}"]\nmulticast = false\n'
+    file.write_text(f'[robot]\nname = "r1"\n{device(port)}{bus}')
+    supervised = Supervised(bench.stack, folder)
+    until(lambda: bench.fleet.state() == "established", what="the other one has it too")
+    joined = configuration("client", bench.endpoint, other)
+    joined.insert_json5("mode", '"router"')
+    joined.insert_json5("listen/endpoints", "[]")
+    with zenoh.open(joined):
+        until(lambda: YIELDED in supervised.log, LOOK_S, what="it yields")
+        process = supervised.gateway("r1")
+        file.write_text(file.read_text() + "[control]\nlease_s = 4.0\n")
+        supervised.reload()
+        successor = supervised.gateway("r1", not_pid=process)
+        until(lambda: "handed over" in supervised.log, what="a restart")
+        assert granted(bench) == 1
+        os.kill(successor, signal.SIGKILL)
+        supervised.gateway("r1", not_pid=successor)
+        time.sleep(2 * CLOSE_S)
+        assert granted(bench) == 1
+        assert bench.fleet.reason() == SECOND_CONNECTION
+        assert AGAIN not in supervised.log
+        owner.end()
+        until(lambda: AGAIN in supervised.log, LOOK_S, what="it serves the robot again")
+        bench.fleet.hold(how="takeover")
+        assert supervised.log.count("robot: established") == 1, "one connection, from the first to the last"
 
 
 def test_of_two_that_start_together_one_serves_the_robot(bench: Bench) -> None:

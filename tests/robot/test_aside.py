@@ -8,6 +8,7 @@ from typing import Any
 import msgpack
 import pytest
 
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import scene_of
 from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, established, serving
 from zbridge.fleet.messages import Latch
@@ -85,6 +86,23 @@ async def test_a_link_that_is_lost_meanwhile_is_not_connected_again_and_need_not
     assert len(rig.links) == 1
     assert not rig.device.must_stay
     await rig.device.step_in()
+    await asyncio.sleep(10.0)
+    assert len(rig.links) >= 2
+
+
+async def test_a_connection_whose_end_does_no_harm_need_not_be_kept(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TcpUdpRobot, "closing_harmless", True)
+    assert not rig.device.must_stay
+
+
+async def test_nothing_is_connected_while_another_process_may_get_the_link_also_when_served_again(rig: Rig) -> None:
+    await aside(rig)
+    rig.goes()
+    rig.device.hold()
+    await rig.device.step_in()
+    await asyncio.sleep(10.0)
+    assert len(rig.links) == 1
+    await rig.device.go_on()
     await asyncio.sleep(10.0)
     assert len(rig.links) >= 2
 

@@ -129,8 +129,10 @@ class Connection:
         self._ending = False
         self._link: Link | None = None
         self._free = asyncio.Event()
-        """Cleared while another process may get the link: nothing is connected then."""
+        """Cleared while held or muted: nothing is connected then."""
         self._free.set()
+        self._held = False
+        """Whether another process may get the link."""
         self._given: tuple[Exported, Parcel] | None = None
         self._muted = False
         self._wire = WireTap(label)
@@ -172,7 +174,10 @@ class Connection:
         self._muted = muted
         if self.conversation is not None:
             self.conversation.session.outbox.mute(muted)
-        (self._free.clear if muted else self._free.set)()
+        self._set_free()
+
+    def _set_free(self) -> None:
+        (self._free.clear if self._held or self._muted else self._free.set)()
 
     # A restart
 
@@ -188,14 +193,15 @@ class Connection:
 
     def hold(self) -> None:
         """Read, write and connect nothing until :meth:`go_on`."""
-        self._free.clear()
+        self._held = True
+        self._set_free()
         if self.conversation is not None:
             self.conversation.hold()
 
     async def go_on(self) -> None:
         """Go on after :meth:`hold`, or attach what was taken over: from now on this process has the link."""
-        if not self._muted:
-            self._free.set()
+        self._held = False
+        self._set_free()
         given, self._given = self._given, None
         if self.conversation is None:
             return

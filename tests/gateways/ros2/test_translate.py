@@ -216,3 +216,7 @@ def test_what_the_robot_cannot_do_is_refused(scene: RosScene, case: str) -> None
 def test_it_cannot_be_asked(scene: RosScene) -> None:
     with pytest.raises(Unsupported, match="cannot be asked"):
         scene.robot.ask(topics.MAP)
+
+
+def test_one_of_two_gateways_may_leave_it_since_each_is_a_session_of_a_router_that_takes_many(scene: RosScene) -> None:
+    assert scene.robot.closing_harmless

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -16,6 +16,7 @@ from zbridge.app.handover.claim import ClaimPart
 from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.handover.outgoing import Outgoing, Part
+from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.handover.successor import Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.gate import NameGate
@@ -29,6 +30,7 @@ from zbridge.protocol.kept import Budget
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import CLAIM
 from zbridge.transport import Parcel
+from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
 
@@ -36,10 +38,23 @@ log = logging.getLogger("zbridge.app.handover")
 class Restarts:
     """The restarts of one gateway. The gateway enters its parts as it makes them.
 
-    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused.
+    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused. clock:
+    seconds. processes, kernel: of this machine, or simulated ones.
     """
 
-    def __init__(self, plan: Plan, keys: KeySpace, incoming: Incoming | None, successor: Successor | None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        keys: KeySpace,
+        incoming: Incoming | None,
+        successor: Successor | None,
+        clock: Callable[[], float] = time.monotonic,
+        processes: Processes = PROCESSES,
+        kernel: Kernel = KERNEL,
+    ) -> None:
+        self._clock = clock
+        self._processes = processes
+        self._kernel = kernel
         self.bus: Bus | None = None
         self.listeners: Sequence[Part] = ()
         self.device: Device | None = None
@@ -80,7 +95,7 @@ class Restarts:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(time.monotonic))
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(self._clock))
 
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:
@@ -105,10 +120,11 @@ class Restarts:
         if self._lock.locked() or self.gone.is_set() or successor_begins:
             raise NotReady("a restart is under way")
         async with self._lock:
-            began = time.monotonic()
+            began = self._clock()
             parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
-            pid = await Outgoing(self._successor, parts, self._describe, self._drain).run()
-            log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
+            machine = (self._processes, self._kernel)
+            pid = await Outgoing(self._successor, parts, self._describe, self._drain, *machine).run()
+            log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
     async def _drain(self) -> None:
         if self.latches is not None:

@@ -169,7 +169,7 @@ class Gateway:
                 stack.callback(self._show_sessions(bus, self._process).close)
             if metrics and self._plan.metrics is not None:
                 work.append(self._serve_metrics(self._plan.metrics))
-            await until(self.restarts.gone, together(*work))
+            await until(self.restarts.gone, together(*work, first=self.restarts.settle))
 
     async def _serve_metrics(self, address: Address) -> None:
         """Serve the counters, once a predecessor has let go."""

@@ -151,6 +151,35 @@ async def test_a_successor_that_cannot_be_told_to_go_leaves_everything_where_nob
     assert scene.steps[-1] == "go on"
 
 
+async def test_a_gateway_that_ends_meanwhile_takes_everything_back_first(scene: Scene) -> None:
+    running = await scene.up()
+    scene.outgoing.give_up()
+    scene.drained.set()
+    with pytest.raises(NotReady, match="the gateway ends"):
+        await running
+    assert scene.steps == ["prepare", "hold", "withdraw", "go on"]
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+
+
+async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_nothing(scene: Scene) -> None:
+    running = asyncio.ensure_future(scene.outgoing.run())
+    while not hasattr(scene.successor, "channel"):  # noqa: ASYNC110
+        await asyncio.sleep(0.001)
+    scene.outgoing.give_up()
+    with pytest.raises(NotReady, match="the other side has ended"):
+        await asyncio.wait_for(running, SOON_S)
+    assert scene.steps == []
+
+
+async def test_from_go_on_a_gateway_that_ends_leaves_everything_to_its_successor(scene: Scene) -> None:
+    running = await scene.up()
+    scene.drained.set()
+    await scene.successor.channel.receive(Go, SOON_S)
+    scene.outgoing.give_up()
+    await running
+    assert scene.steps[-1] == "release"
+
+
 @supervised
 async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) -> None:
     running = await scene.up()

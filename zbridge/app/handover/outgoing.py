@@ -96,6 +96,11 @@ class Outgoing:
         self._processes = processes
         self._kernel = kernel
         self._process: OtherProcess | None = None
+        self._channel: Channel | None = None
+        self._ends = False
+        """Whether the gateway ends."""
+        self._goes = False
+        """Whether the successor is about to be told to go."""
 
     def __repr__(self) -> str:
         return f"<Outgoing to {self._process}>"
@@ -107,7 +112,7 @@ class Outgoing:
         except OSError as error:
             log.error("not restarted: %s", error)
             raise NotReady(f"not restarted: {error}") from error
-        changed = looked_after = False
+        self._channel, changed, looked_after = channel, False, False
         try:
             with far:
                 await self._successor.start_successor(far)
@@ -119,6 +124,9 @@ class Outgoing:
             for part in self._parts:
                 part.withdraw()
             await self._drain()
+            if self._ends:
+                raise HandoverError("the gateway ends")
+            self._goes = True
             looked_after = self._successor.handed_over()
             if not looked_after:
                 await channel.send(Go())
@@ -137,6 +145,12 @@ class Outgoing:
         channel.close()
         self._forget()
         return hello.pid
+
+    def give_up(self) -> None:
+        """Give the handover up, for the gateway ends: everything is taken back, unless the successor is told to go."""
+        self._ends = True
+        if self._channel is not None and not self._goes:
+            self._channel.close()
 
     async def _give(self, channel: Channel) -> None:
         """Stop, hold and describe everything; send it."""

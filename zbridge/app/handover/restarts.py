@@ -68,6 +68,9 @@ class Restarts:
         self._incoming = incoming
         self._successor = successor
         self._lock = asyncio.Lock()
+        self._outgoing: Outgoing | None = None
+        self._ends = False
+        """Whether the gateway ends."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     def __repr__(self) -> str:
@@ -78,6 +81,17 @@ class Restarts:
         with contextlib.suppress(Refused):
             await self._restart()
             self.gone.set()
+
+    async def settle(self) -> None:
+        """Begin no restart any more, and give up one that is under way; wait until all is taken back, or handed over.
+
+        To be awaited before the parts of the gateway end: two processes must not write to one socket.
+        """
+        self._ends = True
+        if self._outgoing is not None:
+            self._outgoing.give_up()
+        async with self._lock:
+            return
 
     def keep(self, parcel: Parcel, budget: Budget) -> Given | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
@@ -119,11 +133,14 @@ class Restarts:
         successor_begins = self._incoming is not None and not self._incoming.begun.is_set()
         if self._lock.locked() or self.gone.is_set() or successor_begins:
             raise NotReady("a restart is under way")
+        if self._ends:
+            raise NotReady("the gateway ends")
         async with self._lock:
             began = self._clock()
             parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
             machine = (self._processes, self._kernel)
-            pid = await Outgoing(self._successor, parts, self._describe, self._drain, *machine).run()
+            self._outgoing = Outgoing(self._successor, parts, self._describe, self._drain, *machine)
+            pid = await self._outgoing.run()
             log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
     async def _drain(self) -> None:

@@ -166,8 +166,10 @@ async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_not
     while not hasattr(scene.successor, "channel"):  # noqa: ASYNC110
         await asyncio.sleep(0.001)
     scene.outgoing.give_up()
-    with pytest.raises(NotReady, match="the other side has ended"):
+    with pytest.raises(NotReady, match="the gateway ends"):
         await asyncio.wait_for(running, SOON_S)
+    with pytest.raises(HandoverError, match="the gateway ends"):  # an end without a word would let it begin
+        await scene.successor.channel.receive(Given, SOON_S)
     assert scene.steps == []
 
 

@@ -59,11 +59,11 @@ class PlayedSuccessor:
 
     def __init__(self) -> None:
         self.given = asyncio.Event()
-        self._task: asyncio.Task[None]
+        self.task: asyncio.Task[None]
 
     async def start_successor(self, far_end: socket.socket) -> None:
         channel = Channel(socket.socket(fileno=os.dup(far_end.fileno())))
-        self._task = asyncio.ensure_future(self._take(channel))
+        self.task = asyncio.ensure_future(self._take(channel))
 
     async def _take(self, channel: Channel) -> None:
         await channel.send(Hello(VERSION, 0))
@@ -89,6 +89,7 @@ async def test_a_gateway_that_is_told_to_end_during_a_restart_takes_everything_b
     with pytest.raises(asyncio.CancelledError):
         await gateway
     await restarting
+    await successor.task
     assert part.steps == ["prepare", "hold", "go on", "ends"]
     assert not restarts.gone.is_set()
     with pytest.raises(NotReady, match="the gateway ends"):

@@ -22,7 +22,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from zbridge.app.handover.channel import Channel
 from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
@@ -34,6 +34,8 @@ from zbridge.transport import Parcel
 from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
+
+M = TypeVar("M")
 
 RESTARTED = "gateway restarted"
 START_S = 30.0
@@ -96,11 +98,8 @@ class Outgoing:
         self._processes = processes
         self._kernel = kernel
         self._process: OtherProcess | None = None
-        self._channel: Channel | None = None
-        self._ends = False
-        """Whether the gateway ends."""
-        self._goes = False
-        """Whether the successor is about to be told to go."""
+        self._ends = asyncio.Event()
+        """Set when the gateway ends."""
 
     def __repr__(self) -> str:
         return f"<Outgoing to {self._process}>"
@@ -112,21 +111,19 @@ class Outgoing:
         except OSError as error:
             log.error("not restarted: %s", error)
             raise NotReady(f"not restarted: {error}") from error
-        self._channel, changed, looked_after = channel, False, False
+        changed = looked_after = False
         try:
             with far:
                 await self._successor.start_successor(far)
-            hello = await channel.receive(Hello, START_S)
+            hello = await self._hear(channel, Hello, START_S)
             self._know(hello)
             changed = True
             await self._give(channel)
-            await channel.receive(Up, TAKE_OVER_S)
+            await self._hear(channel, Up, TAKE_OVER_S)
             for part in self._parts:
                 part.withdraw()
             await self._drain()
-            if self._ends:
-                raise HandoverError("the gateway ends")
-            self._goes = True
+            self._require_no_end()
             looked_after = self._successor.handed_over()
             if not looked_after:
                 await channel.send(Go())
@@ -148,9 +145,23 @@ class Outgoing:
 
     def give_up(self) -> None:
         """Give the handover up, for the gateway ends: everything is taken back, unless the successor is told to go."""
-        self._ends = True
-        if self._channel is not None and not self._goes:
-            self._channel.close()
+        self._ends.set()
+
+    def _require_no_end(self) -> None:
+        if self._ends.is_set():
+            raise HandoverError("the gateway ends")
+
+    async def _hear(self, channel: Channel, kind: type[M], within_s: float) -> M:
+        """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
+        message = asyncio.ensure_future(channel.receive(kind, within_s))
+        ends = asyncio.ensure_future(self._ends.wait())
+        try:
+            await asyncio.wait((message, ends), return_when=asyncio.FIRST_COMPLETED)
+            self._require_no_end()
+            return await message
+        finally:
+            message.cancel()
+            ends.cancel()
 
     async def _give(self, channel: Channel) -> None:
         """Stop, hold and describe everything; send it."""

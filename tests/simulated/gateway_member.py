@@ -140,8 +140,7 @@ class GatewayMember(Member):
         finally:
             if process.alive:
                 self.host.world.note(process.name, "ended")
-                if process is not self.process:
-                    process.after(1e-3, lambda: self._exit(life))
+                process.after(1e-3, lambda: self._exit(life))
 
     def _ended(self, life: Life, task: asyncio.Task[None]) -> None:
         """Judge the end of a successor: it may end with an error before it has the robot."""
@@ -161,11 +160,11 @@ class GatewayMember(Member):
             self.host.world.after(AGAIN_S, self.start)
 
     def _exit(self, life: Life) -> None:
-        """Let a process that has handed over exit; what it leaves is a leak."""
+        """Let a process that has ended exit; what it leaves is a leak, unless it never had the robot."""
         process = life.process
         assert process.loop is not None
         tasks, timers = process.loop.left
-        if tasks or timers or process.descriptors:
+        if life.begun and (tasks or timers or process.descriptors):
             what = f"{len(tasks)} tasks, {timers} timers, {process.descriptors}: {tasks[:2]} {process.loop.waiting}"
             self.host.world.note(process.name, "leaves", what)
         process.exit()

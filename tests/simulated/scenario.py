@@ -14,6 +14,7 @@ import os
 import shutil
 import sys
 import tempfile
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -183,6 +184,11 @@ class _Quiet(logging.Handler):
         return self
 
     def __exit__(self, *_: object) -> None:
+        with warnings.catch_warnings():  # of coroutines that a killed process never began
+            warnings.simplefilter("ignore", RuntimeWarning)
+            self._leave()
+
+    def _leave(self) -> None:
         world, self.world = self.world, None
         if world is not None:
             world.watchers.clear()

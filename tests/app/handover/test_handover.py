@@ -89,7 +89,7 @@ class Scene:
         self.steps: list[str] = []
         self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
         describe = lambda parcel: Given(VERSION, {}, 0)  # noqa: E731
-        self.outgoing = Outgoing(self.successor, [PlayedPart(self.steps)], describe, self._drain)
+        self.outgoing = Outgoing(self.successor, lambda: [PlayedPart(self.steps)], describe, self._drain)
         self.drained = asyncio.Event()
         self.drained.set()
 

@@ -76,7 +76,9 @@ Describe = Callable[[Parcel], Given]
 
 
 class Outgoing:
-    """One handover. ``successor``: starts it. ``parts``: what is handed over. ``describe``: writes all of it.
+    """One handover. ``successor``: starts it. ``parts``: gives what is handed over, once the successor is there.
+
+    ``describe``: writes all of it.
 
     ``drain``: waits until what was published has left: what the successor publishes must not overtake it.
     ``processes``, ``kernel``: of this machine, or simulated ones.
@@ -85,14 +87,15 @@ class Outgoing:
     def __init__(
         self,
         successor: Successor,
-        parts: Sequence[Part],
+        parts: Callable[[], Sequence[Part]],
         describe: Describe,
         drain: Callable[[], Awaitable[None]],
         processes: Processes = PROCESSES,
         kernel: Kernel = KERNEL,
     ) -> None:
         self._successor = successor
-        self._parts = parts
+        self._find_parts = parts
+        self._parts: Sequence[Part] = ()
         self._describe = describe
         self._drain = drain
         self._processes = processes
@@ -117,7 +120,7 @@ class Outgoing:
                 await self._successor.start_successor(far)
             hello = await self._hear(channel, Hello, START_S)
             self._know(hello)
-            changed = True
+            changed, self._parts = True, self._find_parts()
             await self._give(channel)
             await self._hear(channel, Up, TAKE_OVER_S)
             for part in self._parts:

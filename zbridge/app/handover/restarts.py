@@ -69,6 +69,8 @@ class Restarts:
         self._successor = successor
         self._lock = asyncio.Lock()
         self._outgoing: Outgoing | None = None
+        self._handed_over: Device | None = None
+        """The device that the restart under way has stopped."""
         self._ends = False
         """Whether the gateway ends."""
         self._tasks: set[asyncio.Task[None]] = set()
@@ -137,19 +139,30 @@ class Restarts:
             raise NotReady("the gateway ends")
         async with self._lock:
             began = self._clock()
-            parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
             machine = (self._processes, self._kernel)
-            self._outgoing = Outgoing(self._successor, parts, self._describe, self._drain, *machine)
+            self._outgoing = Outgoing(self._successor, self._parts, self._describe, self._drain, *machine)
             pid = await self._outgoing.run()
             log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
 
+    def _parts(self) -> list[Part]:
+        """Give what there is to hand over now."""
+        self._handed_over = self.device
+        return [part for part in (*self.listeners, self.device, self.claim) if part is not None]
+
+    def _require_same_device(self) -> None:
+        """Raise Refused where the robot was taken, or left, since the parts were stopped."""
+        if self.device is not self._handed_over:
+            raise NotReady("the robot was taken, or left to another gateway, meanwhile: ask again")
+
     async def _drain(self) -> None:
+        self._require_same_device()
         if self.latches is not None:
             await self.latches.flush()  # the successor reads them
         if self.bus is not None and self.claim is not None:
             await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 
     def _describe(self, parcel: Parcel) -> Given:
+        self._require_same_device()
         given = Given(
             VERSION,
             self._plan.setup,

@@ -169,3 +169,13 @@ async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: 
     assert counts(rig) == before
     running.cancel()
     await asyncio.wait([running])
+
+
+async def test_who_has_left_the_commands_to_the_next_process_says_nothing_any_more(rig: Rig) -> None:
+    rig.device.withdraw()
+    published = counts(rig)
+    await asyncio.sleep(3.0)
+    assert counts(rig) == published, "it may be frozen before it learns that it has handed over"
+    await rig.device.go_on()
+    await asyncio.sleep(3.0)
+    assert counts(rig) > published

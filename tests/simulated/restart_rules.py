@@ -53,6 +53,8 @@ class RestartRules:
         self._hello: dict[str, tuple[list[End], dict[str, Any]]] = {}
         """By gateway, the connections when its successor said hello: the robot's, and the HQ programs'."""
         self._connected: dict[End, float] = {}
+        self._left_at: dict[str, float] = {}
+        """By HQ program, when it left its listener by itself."""
         self.world.watchers.append(self._watch)
         simulation.fabric.on_put.append(self._on_put)
 
@@ -63,6 +65,8 @@ class RestartRules:
         elif what == "connected" and who == "robot":
             self._connected[self.simulation.robot.ends[-1]] = self.world.now
             self._moves.clear()
+        elif what == "leaves listener":
+            self._left_at[who] = self.world.now
         elif (who, what) == ("udp", "sends"):
             self._on_datagram(*fields)
         elif name not in self.checker.gateways:
@@ -190,7 +194,8 @@ class RestartRules:
         if ends and sum(end.peer.address[0] == host for end in robot.ends) > len(ends):
             checker.violate("restart-connection", f"{name} restarted, and the robot has another connection")
         for program in self.simulation.programs:
-            if program.name in programs and program.end is not programs[program.name]:
+            stays = self.world.now - self._left_at.get(program.name, -math.inf) > 2 * SOON_S
+            if stays and program.name in programs and program.end is not programs[program.name]:
                 checker.violate("restart-hq", f"{name} restarted, and {program.name} lost its connection")
 
     def ended(self) -> None:

@@ -289,7 +289,7 @@ class Device:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self._publishers.expire()
-            if not self._aside:
+            if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
                 self._enforcer.beat()
 

@@ -200,9 +200,13 @@ class RestartRules:
 
     def ended(self) -> None:
         """Judge what holds at the end: HQ programs are connected again."""
+        owners = tuple(self.simulation.network.listeners.values())
         for program in self.simulation.programs:
-            if program.end is None:
-                self.checker.violate("restart-hq", f"{program.name} is not connected long after all faults are over")
+            waits = (
+                any(program.end.peer in getattr(owner, "waiting", ()) for owner, _ in owners) if program.end else True
+            )
+            if waits:
+                self.checker.violate("restart-hq", f"nobody serves {program.name} long after all faults are over")
 
 
 def _motion(protocol: str, data: bytes) -> bool | None:

@@ -9,7 +9,7 @@ RATES_HZ = {"drives": 10_000, "express": 5000, "forged": 5000, "scans": 100, "ra
 USUAL_HZ = 2000
 SECONDS, QUIET_S = 2.0, 0.5
 ANSWER_S = 2.0
-"""Longest wait for an answer, and of commands, on a busy machine; before there were filters it was four seconds, or for ever."""
+"""Longest wait for an answer, and of commands, on a busy machine; without filters it is four seconds, or for ever."""
 GROWN_MB = 20.0
 
 

@@ -13,7 +13,6 @@ import contextlib
 import json
 import math
 import re
-import socket
 import struct
 import sys
 import time
@@ -102,9 +101,9 @@ class _Controller(FragileController):
     Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
     """
 
-    async def _send(self, conn: socket.socket, messages: list[bytes]) -> None:
+    async def _send(self, messages: list[bytes]) -> None:
         begun = time.monotonic()
-        await super()._send(conn, messages)
+        await super()._send(messages)
         if telling and time.monotonic() - begun > HELD_UP_S:
             print(f"{time.monotonic():.6f} {GOES_ON}", flush=True)
 

@@ -279,9 +279,8 @@ class Stage:
         while True:
             before = self._place()
             await program.drive(forward)
-            await soon(lambda: self._moved(before, forward), f"{name} moves {self.robot}")  # noqa: B023
             holder = f"hq.{program.name}.{program.number}"
-            assert (self.control["state"], self.control["holder"]) == ("held", holder), self.control
+            await soon(lambda: self._moved(before, forward) and self._held_by(holder), f"{holder} moves {self.robot}")  # noqa: B023
             if time.monotonic() >= ends:
                 break
             await asyncio.sleep(0.3)
@@ -289,6 +288,9 @@ class Stage:
         await program.idle()
         await soon(lambda: self.robot != "alf" or not self._place()[0], f"{name} lets go of {self.robot}")
         await program.release()
+
+    def _held_by(self, holder: str) -> bool:
+        return (self.control["state"], self.control["holder"]) == ("held", holder)
 
     def _place(self) -> list[float]:
         """Read what changes when the robot moves: its speed, what it sees around it, or its place along its way."""

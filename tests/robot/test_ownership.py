@@ -126,9 +126,9 @@ async def test_of_two_that_start_at_the_same_moment_the_lower_id_goes_on(zids: t
 
 
 @pytest.mark.parametrize("count", [2, 3])
-async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hundred(count: int) -> None:
+async def test_of_those_that_start_together_one_goes_on(count: int) -> None:
     settled = []
-    for seed in range(100):
+    for seed in range(20):
         rng, shared = random.Random(seed), FakeBus()._shared
         takes = []
         for number in range(count):
@@ -138,7 +138,7 @@ async def test_of_those_that_start_together_one_goes_on_a_hundred_times_of_a_hun
             await asyncio.sleep(rng.uniform(0.0, 0.2))
         await asyncio.sleep(10.0)
         settled.append([take.done() for take in takes].count(True))
-    assert settled == [1] * 100
+    assert settled == [1] * 20
 
 
 async def test_one_that_holds_the_robot_is_not_driven_out_by_a_lower_id_that_does_not_see_its_token() -> None:

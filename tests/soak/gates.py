@@ -105,7 +105,7 @@ class Measured:
             yield Gate(f"datagram to the robot and back, {label}", _ms(echo[0]), _ms(echo[1]), "for comparison", True)
             for what in ("pose_s", "drive_s"):
                 times = [quantile([s for one in part for s in getattr(one, what)], share) for part in (early, late)]
-                drift = times[1] / times[0] / (echo[1] / echo[0]) - 1
+                drift = times[1] / times[0] / max(1.0, echo[1] / echo[0]) - 1
                 limit = f"{drift:+.1%} < {most:.0%}"
                 yield Gate(f"{LABELS[what]}, {label}", _ms(times[0]), _ms(times[1]), limit, drift < most)
 

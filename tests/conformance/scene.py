@@ -16,7 +16,7 @@ import pytest
 
 from tests.machine import Patience
 
-LONG_S = 5.0
+LONG_S = 30.0
 VERBS = {">": "send", "<": "expect", "!": "violated", "!!": "violated_once", "?": "happened"}
 Script = tuple[dict[str, Any], list[str]]
 """The options of the judge, and the steps."""

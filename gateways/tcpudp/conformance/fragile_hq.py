@@ -11,7 +11,6 @@ import struct
 import time
 from collections import Counter
 from collections.abc import Iterable
-from functools import partial
 from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
@@ -116,7 +115,11 @@ class FragileHq(Operator):
         loop, tcp = asyncio.get_running_loop(), self._tcp
         tcp.setblocking(True)  # for the thread that reads
         self._robot = tcp.getpeername()
-        self._thread = ReadingThread(tcp, self._since, partial(loop.call_soon_threadsafe, self._arrive, "tcp"))
+
+        def give(read: Read) -> None:
+            loop.call_soon_threadsafe(self._arrive, "tcp", read)
+
+        self._thread = ReadingThread(tcp, self._since, give)
         self._thread.start()
         return (self._converse(),)
 

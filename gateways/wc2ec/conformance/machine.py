@@ -28,8 +28,6 @@ class Motor:
         """As it is now: rad, or m."""
         self.target = 0.0
         """The last value that it was set to: rad/s, or m."""
-        self.commands = 0
-        """How often it was set."""
 
     def __repr__(self) -> str:
         return f"<Motor {self.device.name!r} {self.velocity:g} at {self.position:g}, set to {self.target:g}>"
@@ -37,7 +35,6 @@ class Motor:
     def set(self, value: float) -> None:
         """Take a setValue."""
         self.target = value
-        self.commands += 1
         if self.device.kind is Kind.ROTATIONAL:
             self.velocity = value
 
@@ -122,5 +119,5 @@ class Robot:
                 value = lamp * (1.5 + math.cos(self.place.heading + bearing)) * 10
             else:
                 continue
-            measured.append((device, value if device.reading is None else device.reading))
+            measured.append((device, value))
         return measured

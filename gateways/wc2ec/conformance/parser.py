@@ -46,13 +46,12 @@ class Kind(enum.Enum):
 
 
 class Device(msgspec.Struct, frozen=True):
-    """One device of the robot; ``reading`` is what it always measures, None if the world is to say."""
+    """One device of the robot."""
 
     name: str
     number: int
     node_type: int
     kind: Kind
-    reading: float | None = None
 
     @property
     def motor(self) -> bool:

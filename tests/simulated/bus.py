@@ -118,6 +118,7 @@ class Fabric:
         self.paths = paths
         self.rng = world.rng("bus")
         self.sessions: list[SimSession] = []
+        self.on_put: list[Callable[[str, str, bytes], None]] = []
         self.between = Link(self, "router1", "router2")
         self.news_late_s = 0.0
         """Added to the delay of liveliness news, at most."""

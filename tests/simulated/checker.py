@@ -151,7 +151,7 @@ class Checker:
         grant = self.current.get(gateway)
         if grant is not None and grant.ended_at is None:
             grant.end(self.world.now, why)
-            if why in ("stop", "superseded"):
+            if why in ("stop", "superseded", "gateway restarted"):
                 self._taken_at[grant.who] = self.world.now
             self.counts[f"lease ended: {why}"] += 1
             self.obligations.lease_ended(grant)
@@ -243,6 +243,8 @@ class Checker:
 
     def _on_receives(self, gateway: str, key: str, payload: bytes, attachment: bytes | None) -> None:
         now = self.world.now
+        if gateway not in self.gateways:
+            return
         if key.endswith("@cmd/stop"):
             fields = read(payload)
             self.end(gateway, "stop")

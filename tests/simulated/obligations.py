@@ -59,6 +59,9 @@ class Obligations:
             self._disturbed[who] = self._disturbed_dead = self.world.now
         elif what in ("paused", "resumed", "started", "told to end", "was suspended"):
             self._disturbed[who] = self.world.now
+        elif what == "took over":
+            has_token = self._tokens.pop(f"{who}+", float("inf")) <= self.world.now
+            self._tokens[who] = self.world.now if has_token else float("inf")
         elif what in ("announces", "withdraws") and fields[0].endswith("/@alive/gateway"):
             self._tokens[who] = self.world.now if what == "announces" else float("inf")
         elif who == "robot":

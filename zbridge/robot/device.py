@@ -181,7 +181,7 @@ class Device:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
 
         Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
-        declared; until then nothing is read, written or published.
+        declared; until then nothing is read or written, and only ``control`` is published, which confirms stops.
         """
         if begin is None:
             self._show()

@@ -69,7 +69,12 @@ class PlayedOutgoing:
     made: list[PlayedOutgoing]
 
     def __init__(
-        self, successor: object, parts: list[Any], describe: Callable[[Parcel], Given], drain: Callable[[], Any]
+        self,
+        successor: object,
+        parts: Callable[[], list[Any]],
+        describe: Callable[[Parcel], Given],
+        drain: Callable[[], Any],
+        *machine: object,
     ) -> None:
         self.parts, self.describe, self.drain = parts, describe, drain
         self.end: asyncio.Future[int] = asyncio.get_running_loop().create_future()
@@ -175,7 +180,7 @@ async def test_everything_the_gateway_has_is_described_in_order(handovers: list[
         running = asyncio.ensure_future(restarts.restart())
         await asyncio.sleep(0)
         (handover,) = handovers
-        assert [part.told for part in handover.parts] == [{"a": 1}, {"b": 2}, {"d": 4}, {"since": 1.0}]
+        assert [part.told for part in handover.parts()] == [{"a": 1}, {"b": 2}, {"d": 4}, {"since": 1.0}]
         parcel = Parcel()
         given = handover.describe(parcel)
         assert (given.version, given.setup, given.descriptors) == (VERSION, planned().setup, 1)

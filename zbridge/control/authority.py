@@ -33,7 +33,7 @@ from msgspec import UNSET
 
 from zbridge.control.command_age import MAX_AGE_S, CommandAge
 from zbridge.control.events import Event, EventKind, Input, Sender, State
-from zbridge.control.latch import STOPS, Latches, latch_of
+from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of
 from zbridge.control.proof import Holder, Holders, Verifier
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.control.wishes import capped, name_of
@@ -211,11 +211,10 @@ class Authority:
         for latch in self.latches.adopt(answers):
             self._latch(latch)
 
-    def merge(self, latches: Iterable[Latch]) -> None:
-        """Take over the latched stops that another gateway of this robot knows."""
-        for latch in latches:
-            if self.latches.add(latch):
-                self._latch(latch)
+    def merge(self, record: LatchRecord) -> None:
+        """Take over what another gateway of this robot knows."""
+        for latch in self.latches.merge(record):
+            self._latch(latch)
 
     def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
         """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""

@@ -106,10 +106,11 @@ class Authority:
     # Questions about the lease. received_ms: the gateway's raw clock, for the age of what is dated.
 
     def acquire(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
-        """Grant the lease of a robot that is free or stopped, or held with a lower priority."""
+        """Grant the lease of a robot that is free or stopped, held with a lower priority, or by who asks again."""
         self.expire(now)
         outranks = self._holders.current is not None and request.priority > self._holders.current.priority
-        asked = Input.OUTRANK if outranks else Input.ACQUIRE
+        again = self._holders.current is not None and self._holders.current.asks_again(request)
+        asked = Input.OUTRANK if outranks else Input.AGAIN if again else Input.ACQUIRE
         return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now, received_ms)
 
     def takeover(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
@@ -331,7 +332,9 @@ class Authority:
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
         age.late_s(request.t, received_ms)
         expires_at = now + lease_s
-        self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, expires_at, age)
+        self._holders.current = Holder(
+            who, request.priority, self.verifier, lease_s, request.alive, expires_at, age, request.t
+        )
         self._held_back = None
         self._events.append(Event(kind, who, priority=request.priority))
         max_age_s = age.limit_s if request.t is not UNSET and age.limit_s < math.inf else UNSET
@@ -423,6 +426,7 @@ class Authority:
     _HOLDER: ClassVar[Row] = {
         Input.ACQUIRE: (_deny, None),
         Input.OUTRANK: (_grant, State.HELD),
+        Input.AGAIN: (_grant, State.HELD),
         Input.TAKEOVER: (_grant, State.HELD),
         Input.RENEW: (_extend, None),
         Input.RELEASE: (_give_back, State.FREE),

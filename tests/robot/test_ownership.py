@@ -17,6 +17,7 @@ from tests.tables import documented, executed
 from zbridge.bus import Answer, Handle, IncomingQuery, Lane
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import Sort
+from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
 from zbridge.robot.ownership import (
@@ -157,12 +158,15 @@ class Robot:
     latches: tuple[Latch, ...] = ()
     rivals: list[set[str]] = field(default_factory=list)
     heard_latches: set[Latch] = field(default_factory=set)
+    merged: list[LatchRecord] = field(default_factory=list)
+    autonomous: bool = False
     turns: list[str] = field(default_factory=list)
 
     @property
     def standing(self) -> Standing:
         now = asyncio.get_running_loop().time()
-        return Standing(self.healthy, now - self.connected_at if self.must_stay else 0.0, self.latches)
+        age_s = now - self.connected_at if self.must_stay else 0.0
+        return Standing(self.healthy, age_s, self.latches, self.autonomous)
 
     @property
     def must_stay(self) -> bool:
@@ -171,6 +175,9 @@ class Robot:
     def heard(self, claims: Mapping[str, Claim]) -> None:
         self.rivals.append(set(claims))
         self.heard_latches.update(latch for claim in claims.values() for latch in claim.latches)
+
+    def merge(self, record: LatchRecord) -> None:
+        self.merged.append(record)
 
     async def step_aside(self) -> None:
         self.turns.append("aside")
@@ -470,16 +477,28 @@ async def test_whoever_answers_better_claims_silences_a_gateway_for_as_long_as_i
 
 
 async def test_a_waiting_gateway_hears_of_the_latched_stops_of_the_one_that_serves() -> None:
-    bus, mirrored = FakeBus("5"), list[tuple[Latch, ...]]()
+    bus, mirrored = FakeBus("5"), list[LatchRecord]()
     latch = Latch(b"a" * 16, "ann", "a cable is loose", fleet=True)
     first = await owned(bus)
     robot, _ = watched(first)
     taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, mirror=mirrored.append).take())
     await asyncio.sleep(1.0)
-    assert set(mirrored) == {()}
-    robot.latches = (latch,)
+    assert {*mirrored} == {LatchRecord()}
+    robot.latches, robot.autonomous = (latch,), True
     await asyncio.sleep(1.0)
-    assert mirrored[-1] == (latch,)
+    assert mirrored[-1] == LatchRecord((latch,), autonomous=True)
+    assert not taking.done()
+
+
+async def test_the_gateway_that_serves_hears_from_one_that_waits_that_the_robot_was_told_to_move_by_itself() -> None:
+    bus, known = FakeBus("5"), [False]
+    robot, _ = watched(await owned(bus))
+    taking = asyncio.create_task(Ownership(bus.join("1"), KEYS, autonomous=lambda: known[0]).take())
+    await asyncio.sleep(1.0)
+    assert robot.merged == []
+    known[0] = True
+    await asyncio.sleep(1.0)
+    assert {*robot.merged} == {LatchRecord(autonomous=True)}
     assert not taking.done()
 
 

@@ -77,14 +77,33 @@ class Faults:
         """Do one step now."""
         if self._over:
             return
+        if step.get("target") == "owner":
+            step = {**step, "target": self._simulation.checker.obligations.serving or "gw1"}
         if "fault" in step:
             self._simulation.checker.counts[f"fault {step['fault']}"] += 1
+            for role in self._roles(step):
+                self._simulation.checker.counts[f"{role}: {step['fault']}"] += 1
             getattr(self, f"_{step['fault']}")(step)
             return
         name = step["who"]
+        if step["do"] == "leave":
+            self._simulation.checker.counts["HQ program: leave"] += 1
         for who in (*self._simulation.drivers, *self._simulation.programs):
             if who.name == name:
                 who.do(step)
+
+    def _roles(self, step: dict[str, Any]) -> set[str]:
+        """Return whose fault it is: of processes by name, of links by the hosts of both ends but routers."""
+        simulation = self._simulation
+        hit = {step.get("target"), *step.get("between", ())}
+        roles = {"robot"} & hit
+        roles |= {"client" for each in simulation.drivers if hit & {each.name, each.host.name}}
+        roles |= {"HQ program" for each in simulation.programs if hit & {each.name, each.host.name}}
+        for each in simulation.gateways:
+            if hit & {each.name, each.host.name} and not roles:
+                roles |= {"gateway"} if each.serves else {"listener"}
+                roles |= {"listener"} if each.configuration["hq"] else set()
+        return roles
 
     def _later(self, step: dict[str, Any], undo: Callable[[], None]) -> None:
         self.world.after(step.get("for", 1.0), undo)
@@ -100,6 +119,14 @@ class Faults:
             member = simulation.members[name]
             return member.process if member.alive else None
         return next((each for each in simulation.programs if each.name == name), None)
+
+    @property
+    def paused(self) -> bool:
+        """Whether a process is paused now."""
+        simulation = self._simulation
+        processes = [simulation.robot, *simulation.programs]
+        processes += [member.process for member in simulation.members.values() if member.alive]
+        return any(process.paused for process in processes)
 
     # Faults
 

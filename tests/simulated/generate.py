@@ -11,8 +11,9 @@ from typing import Any
 
 from tests.simulated.faults import REACHED
 from tests.simulated.generate_restarts import restarts
+from tests.simulated.situations import arrange
 
-PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf", "wc2ec", "mixed")
+PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf", "wc2ec", "mixed", "situations")
 SECONDS = (25.0, 60.0)
 _WHEELS = {"differential": {"left": ["left"], "right": ["right"], "wheel_radius_m": 0.05, "track_m": 0.3}}
 _STATES = tuple(REACHED)
@@ -47,6 +48,9 @@ def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
         _add_programs(rng, made)
     if rng.random() < 0.2 or profile == "bus":
         made["network"]["reorders"] = rng.random() < 0.3
+    if profile == "situations":
+        arrange(rng, made)
+        return made
     steps = _acts(rng, made) + _faults(rng, made, profile)
     if profile == "restart":
         made["robot"]["options"]["splits_s"] = rng.choice((0.0, 0.02, 0.3))

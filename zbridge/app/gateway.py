@@ -216,8 +216,11 @@ class Gateway:
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         self.restarts.latches = store = LatchStore(self._keys, self.conditions, self._runtime.folder)
+        store.load()  # what it says is told to the gateway that serves the robot
         clock, chance = self._runtime.clock, self._runtime.chance
-        ownership = Ownership(bus, self._keys, clock, mirror=store.mirror, chance=chance)
+        ownership = Ownership(
+            bus, self._keys, clock, mirror=store.mirror, autonomous=lambda: store.autonomous, chance=chance
+        )
         incoming = self._incoming
         self.restarts.claim = ClaimPart(ownership)
         try:

@@ -27,6 +27,8 @@ KNOWN_S = 8.0
 """Two gateways that see each other for so long know the same latched stops."""
 MEET_S = 3.0
 """Two gateways that see each other for so long: exactly one grants."""
+LOOK_S = 0.6
+"""A gateway that waits asks the other one so often what it must write down."""
 MOST = 20
 """Violations that are kept."""
 HQ_DEADMAN_S = {"tcpudp": 1.3, "alf": 0.3, "wc2ec": 0.5}
@@ -78,6 +80,8 @@ class Checker:
         self.rules = (self.written, self.released, Shown(self))
         self.know_mode: set[str] = set()
         """The gateways that know that the robot was told to move by itself."""
+        self._mode_at = 0.0
+        """When another one began to know it."""
         self.world.watchers.append(self._watch)
 
     def violate(self, rule: str, text: str) -> None:
@@ -207,7 +211,8 @@ class Checker:
                 if a.running and b.running and self.simulation.fabric.works(a.session, b.session):
                     self._met.setdefault(pair, self.world.now)
                     self._share_latches(one, other)
-                    if self._met_for(one, other) > MEET_S and self.know_mode & pair:
+                    asked = self._met_for(one, other) > MEET_S and self.world.now - self._mode_at > LOOK_S
+                    if asked and self.know_mode & pair:
                         self.know_mode |= pair
                 else:
                     self._met.pop(pair, None)
@@ -242,10 +247,13 @@ class Checker:
         now = self.world.now
         for program in self.simulation.programs:
             most_s = HQ_DEADMAN_S[program.protocol] + 0.35
+            later: float | None = None  # of two wheels one may have the next value
             for at, value in reversed(self._gives[program.name]):
                 if now - at > most_s:
                     break
-                if abs(value - command.value) < 0.0052:
+                other = later if later is not None and program.protocol == "wc2ec" else value
+                later = value
+                if min(value, other) - 0.0052 < command.value < max(value, other) + 0.0052:
                     self.released.put(program.name, list(self._gives[program.name]))
                     return
         self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
@@ -291,8 +299,9 @@ class Checker:
             if kind == "mode" and value != 3.0:
                 continue
             self.counts[f"{kind} written"] += 1
-            if kind == "mode":
+            if kind == "mode" and gateway not in self.know_mode:
                 self.know_mode.add(gateway)
+                self._mode_at = self.world.now
             reason = self._judge(gateway, kind, 1.0 if kind == "mode" else value)
             if reason is not None:
                 self.violate(*reason)

@@ -15,7 +15,7 @@ from zbridge.app.handover.channel import Channel
 from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.messages import VERSION, Given, Go, Hello, Up
 from zbridge.app.handover.outgoing import Outgoing
-from zbridge.errors import HandoverError, NotReady
+from zbridge.errors import HandoverError, NotReady, Refused, Unsupported
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
 
@@ -27,12 +27,15 @@ class PlayedPart:
 
     def __init__(self, steps: list[str]) -> None:
         self._steps = steps
+        self.refuses: Refused | None = None
 
     async def prepare(self, reason: str, within_s: float) -> None:
         self._steps.append("prepare")
+        if self.refuses is not None:
+            raise self.refuses
 
     async def shut(self) -> None:
-        pass
+        self._steps.append("shut")
 
     def hold(self) -> None:
         self._steps.append("hold")
@@ -89,19 +92,25 @@ class Scene:
         self.steps: list[str] = []
         self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
         describe = lambda parcel: Given(VERSION, {}, 0)  # noqa: E731
-        self.outgoing = Outgoing(self.successor, lambda: [PlayedPart(self.steps)], describe, self._drain)
+        self.part = PlayedPart(self.steps)
+        self.outgoing = Outgoing(self.successor, lambda: [self.part], describe, self._drain)
         self.drained = asyncio.Event()
         self.drained.set()
 
     async def _drain(self) -> None:
         await self.drained.wait()
 
-    async def up(self) -> asyncio.Task[int]:
-        """Hand over until the successor is up; give the task, which waits to say *go*."""
-        self.drained.clear()
+    async def begun(self) -> asyncio.Task[int]:
+        """Begin to hand over, until the successor is started."""
         running = asyncio.ensure_future(self.outgoing.run())
         while not hasattr(self.successor, "channel"):  # noqa: ASYNC110
             await asyncio.sleep(0.001)
+        return running
+
+    async def up(self) -> asyncio.Task[int]:
+        """Hand over until the successor is up; give the task, which waits to say *go*."""
+        self.drained.clear()
+        running = await self.begun()
         await self.successor.comes_up()
         while "withdraw" not in self.steps:  # noqa: ASYNC110
             await asyncio.sleep(0.001)
@@ -127,7 +136,7 @@ async def test_the_supervisor_is_told_before_the_successor_hears_go(scene: Scene
     scene.drained.set()
     await scene.successor.channel.receive(Go, SOON_S)
     assert await running == scene.successor.process.pid
-    assert scene.steps == ["prepare", "hold", "withdraw", "handed over", "release"]
+    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "handed over", "release"]
 
 
 @supervised
@@ -136,7 +145,7 @@ async def test_from_go_on_nothing_leads_back_where_a_supervisor_looks_after_the_
     scene.successor.dies()
     scene.drained.set()
     await running
-    assert scene.steps == ["prepare", "hold", "withdraw", "handed over", "release"], "the successor has crashed"
+    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "handed over", "release"], "the successor has crashed"
 
 
 @alone
@@ -157,7 +166,7 @@ async def test_a_gateway_that_ends_meanwhile_takes_everything_back_first(scene: 
     scene.drained.set()
     with pytest.raises(NotReady, match="the gateway ends"):
         await running
-    assert scene.steps == ["prepare", "hold", "withdraw", "go on"]
+    assert scene.steps == ["prepare", "shut", "hold", "withdraw", "go on"]
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
 
 
@@ -191,6 +200,36 @@ async def test_without_the_supervisors_ear_nothing_is_handed_over(scene: Scene) 
         await running
     assert scene.steps[-1] == "go on"
     assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+
+
+async def test_a_successor_of_another_version_is_told_and_nothing_has_changed(scene: Scene) -> None:
+    running = await scene.begun()
+    await scene.successor.channel.send(Hello(VERSION + 1, scene.successor.process.pid))
+    told = f"the successor takes states of version {VERSION + 1}, this gateway has {VERSION}"
+    with pytest.raises(NotReady, match=told):
+        await running
+    with pytest.raises(HandoverError, match=told):
+        await scene.successor.channel.receive(Given, SOON_S)
+    assert scene.steps == []
+
+
+async def test_a_part_that_cannot_be_handed_over_refuses_the_restart_and_everything_goes_on(scene: Scene) -> None:
+    scene.part.refuses = Unsupported("this robot cannot be handed over")
+    running = await scene.begun()
+    await scene.successor.channel.send(Hello(VERSION, scene.successor.process.pid))
+    with pytest.raises(Unsupported, match="this robot cannot be handed over"):
+        await running
+    assert scene.steps == ["prepare", "go on"]
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL
+
+
+async def test_a_gateway_that_ends_meanwhile_takes_everything_back_to_take_leave(scene: Scene) -> None:
+    running = await scene.up()
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await running
+    assert scene.steps[-1] == "go on"
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL
 
 
 async def test_without_a_free_descriptor_a_restart_is_refused(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

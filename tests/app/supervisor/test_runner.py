@@ -242,6 +242,20 @@ async def test_a_successor_that_dies_before_its_first_deposit_leaves_what_it_was
     assert not scene.launcher.children[0].file.fault
 
 
+async def test_what_a_process_took_over_after_a_crash_is_left_to_the_next_one_if_it_dies_at_once(scene: Scene) -> None:
+    first = await scene.child(0)
+    first.serves("first", Partial(skip=9))
+    first.dies()
+    for number in (1, 2):
+        successor = await scene.child(number)
+        assert await successor.takes_over() == ("first", Partial(skip=9))
+        await successor.goes()
+        successor.opens()
+        if number == 1:
+            successor.dies()
+    assert scene.read() == 8 * b"stop.", "after each crash"
+
+
 async def test_a_successor_that_dies_at_the_word_to_go_has_crashed_though_its_end_is_seen_first(scene: Scene) -> None:
     first = await scene.child(0)
     first.serves("first")

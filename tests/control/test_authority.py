@@ -407,6 +407,28 @@ def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
         made(state).require_motion()
 
 
+@pytest.mark.parametrize("stops", [True, False])
+def test_the_neutral_of_a_part_that_did_not_move_allows_no_motion(stops: bool) -> None:
+    authority = made("moving")
+    authority.hold_back("busy", stops=stops)
+    applied(moving=False, part="left motor")(authority)  # a program that drives may say this all the time
+    must_be_neutral(authority, "busy")
+    NEUTRAL(authority)
+    authority.require_motion()
+
+
+def test_each_part_that_moved_is_neutral_before_motion_or_all_at_once() -> None:
+    for whole in (False, True):
+        authority = made("moving")
+        applied(moving=True, part="left motor")(authority)
+        authority.hold_back("busy")
+        authority.applied("drive", NOW, moving=False, whole=whole)
+        if not whole:
+            must_be_neutral(authority, "busy")
+            applied(moving=False, part="left motor")(authority)
+        authority.require_motion()
+
+
 # Time
 
 DEADMAN = f"stopped ann (deadman){STOPS}"

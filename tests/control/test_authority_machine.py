@@ -79,6 +79,8 @@ class Driving(RuleBasedStateMachine):
         self.driver: Driver | None = None
         self.stopped = False
         self.must_neutral = False
+        self.not_rested: set[str] = set()
+        """The parts that moved when the robot was held back, and that had no neutral since."""
         self.moving_parts: set[str] = set()
         self.on_its_own = False
         self.leases: list[Given] = []
@@ -105,6 +107,7 @@ class Driving(RuleBasedStateMachine):
         self.driver = Driver(request, given, lease_s, deadman_s, self.now + lease_s)
         self.leases = [*self.leases[1 - REMEMBERED :], given]
         self.stopped = self.must_neutral = False
+        self.not_rested.clear()
 
     @rule(number=which, name=st.sampled_from(["renew", "release"]))
     def question(self, number: int, name: str) -> None:
@@ -194,6 +197,7 @@ class Driving(RuleBasedStateMachine):
         """Become busy; or know that the robot stands, so that nobody need stop it."""
         self.authority.hold_back("robot lost" if stands else "busy", stops=not stands)
         self.must_neutral = True
+        self.not_rested |= self.moving_parts
         if stands:
             self.stand()
         self.take_events(must_stop=not stands)
@@ -311,7 +315,8 @@ class Driving(RuleBasedStateMachine):
             assert not self.must_neutral
             self.moving_parts.add(part)
         else:
-            self.must_neutral = False
+            self.not_rested.discard(part)
+            self.must_neutral = self.must_neutral and bool(self.not_rested)
             self.moving_parts.discard(part)
 
     def obey_by_itself(self) -> None:
@@ -325,6 +330,7 @@ class Driving(RuleBasedStateMachine):
         for event in events:
             if event.reason == "deadman":
                 self.must_neutral = True
+                self.not_rested |= self.moving_parts
                 assert self.moving_parts, "the deadman watches motion"
                 if self.driver is not None:
                     assert self.now >= self.driver.obeyed_at + self.driver.deadman_s, "and is not hasty"

@@ -82,6 +82,8 @@ class Authority:
         """The deadman of the current holder."""
         self._stop_at = math.inf
         self._held_back: str | None = None
+        self._moved: set[str] = set()
+        """The parts that moved when the robot was held back, and whose neutral has not come yet."""
         self._refusals = RefusalCounts()
         self._events: list[Event] = []
 
@@ -151,11 +153,14 @@ class Authority:
         if self._held_back is not None:
             raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
 
-    def applied(self, part: str, given_at: float, *, moving: bool, stale: bool = False) -> None:
+    def applied(
+        self, part: str, given_at: float, *, moving: bool, stale: bool = False, whole: bool = False
+    ) -> None:
         """Record that the holder's command for one part of the robot was carried out.
 
         given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends
-        motion and does not allow it again.
+        motion and does not allow it again. whole: a neutral counts for all parts; else a robot that was held back waits
+        for the neutral of each part that moved.
         """
         parts = self._moving
         if moving and part in parts:  # repeated motion is no input: it only postpones the deadman
@@ -164,6 +169,10 @@ class Authority:
         if not moving and not parts and self._held_back is None:  # nor is repeated neutral
             self._autonomous = False
             return
+        if not moving and not stale and self._moved:
+            self._moved = set() if whole else self._moved - {part}
+            if self._moved:  # a part that moved has not rested yet: its stick may still be pushed
+                return
         (parts.add if moving else parts.discard)(part)
         if stale and parts:  # motion of another part goes on, and with it its deadman
             return
@@ -334,6 +343,7 @@ class Authority:
         expires_at = now + lease_s
         self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, expires_at, age)
         self._held_back = None
+        self._moved.clear()
         self._events.append(Event(kind, who, priority=request.priority))
         max_age_s = age.limit_s if request.t is not UNSET and age.limit_s < math.inf else UNSET
         return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who, max_age_s=max_age_s)
@@ -379,6 +389,7 @@ class Authority:
         if stops or self.moving or self._held_back != reason:
             who = self._holders.current.who if self._holders.current else None
             self._events.append(Event(EventKind.STOPPED, who, reason, stops=stops))
+        self._moved |= self._moving
         self._still()
         self._held_back = reason
 
@@ -391,6 +402,7 @@ class Authority:
         holder, self.verifier = self._holders.end(reason), None
         self._still()
         self._held_back = None
+        self._moved.clear()
         self._deadman_s = self.deadman_s
         if kind is not EventKind.LATCHED:
             who = holder.who if holder else None

@@ -121,7 +121,8 @@ class Enforcer:
         authority = self.authority
         if moving:
             authority.require_motion()
-        authority.applied(path, sender.given_at, moving=moving, stale=sender.stale)
+        whole = isinstance(command, Drive)
+        authority.applied(path, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         if isinstance(command, Drive):
             if self._limits is not None:
                 self._limits.sent(command, now)

@@ -407,6 +407,15 @@ def test_only_a_neutral_that_was_carried_out_allows_motion_again() -> None:
         made(state).require_motion()
 
 
+def test_a_robot_that_moves_for_nobody_is_stopped_before_somebody_gets_it() -> None:
+    authority = made("stopped")
+    MOTION(authority)
+    assert authority.acquire(Acquire(who="bob"), NOW).ok
+    assert told(authority) == [f"stopped (moving for nobody when bob acquired){STOPS}", "acquired bob"]
+    assert not authority.moving
+    assert authority.deadline() == NOW + LEASE_S
+
+
 @pytest.mark.parametrize("stops", [True, False])
 def test_the_neutral_of_a_part_that_did_not_move_allows_no_motion(stops: bool) -> None:
     authority = made("moving")

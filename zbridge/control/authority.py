@@ -336,6 +336,8 @@ class Authority:
         deadman_s = capped("deadman_s", request.deadman_s, self.deadman_s)
         if self._holders.current is not None:
             self._end(f"taken over by {who}", EventKind.ENDED)
+        elif self.moving:
+            self._hold_back(f"moving for nobody when {who} acquired")
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)

@@ -74,7 +74,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.alf.conformance.hq_program import simulate_fragile_hq
+    from gateways.alf.conformance.fragile_hq import simulate_fragile_hq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("ALF HQ programs have no versions and no datagrams")

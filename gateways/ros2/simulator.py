@@ -48,7 +48,7 @@ from zbridge.ros2 import (
     types_of,
 )
 from zbridge.simulation.simulator import CATCH_UP_S, STEP_S
-from zbridge.simulation.ticker import Ticker
+from zbridge.simulation.timing import Ticker
 from zbridge.simulation.world import Body, Grid, cast
 from zbridge.transport import Conversation
 from zbridge.transport.samples import serve

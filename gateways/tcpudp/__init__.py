@@ -81,7 +81,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.conformance.hq_program import simulate_fragile_hq
+    from gateways.tcpudp.conformance.fragile_hq import simulate_fragile_hq
 
     version = simulation.version or "1.3"
     if simulation.dialect is not None:

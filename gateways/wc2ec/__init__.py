@@ -100,7 +100,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.conformance.hq_program import simulate_fragile_hq
+    from gateways.wc2ec.conformance.fragile_hq import simulate_fragile_hq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")

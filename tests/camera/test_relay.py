@@ -62,6 +62,7 @@ async def serving(port: int = 0, *allow: str, clients: int = 16) -> AsyncIterato
     finally:
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
+        assert scene.demand.clients == 0, "the end of a relay is the end of its clients"
         for writer in scene.writers:
             writer.transport.abort()
 
@@ -167,3 +168,33 @@ async def test_an_address_in_use_is_told_and_tried_again() -> None:
             await until(lambda: scene.told[-1] is None)
             scene.show(jpeg(1))
             assert await (await scene.ask(GET)).readexactly(len(HEAD)) == HEAD
+
+
+async def test_a_slow_client_gets_the_newest_picture_and_what_it_missed_is_counted() -> None:
+    async with serving() as scene:
+        scene.show(jpeg(1))
+        reader = await scene.ask(GET)
+        await reader.readexactly(len(HEAD + part(jpeg(1))))
+        scene.show(jpeg(2), jpeg(3), jpeg(4))  # before it is its turn
+        assert await reader.readexactly(len(part(jpeg(4)))) == part(jpeg(4))
+        await until(lambda: scene.metrics.total("camera_relay_pictures") == 2)
+        assert scene.metrics.total("camera_relay_skipped") == 2
+        assert scene.metrics.total("camera_relay_accepted") == 1
+        scene.latest.forget()
+        scene.show(jpeg(5))
+        assert await reader.readexactly(len(part(jpeg(5)))) == part(jpeg(5))
+        assert scene.metrics.total("camera_relay_skipped") == 2
+
+
+async def test_a_client_that_takes_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relays, "SEND_S", 0.05)
+    async with serving() as scene:
+        await scene.ask(GET)
+        await until(lambda: scene.demand.clients == 1)
+        for number in range(100):
+            scene.show(jpeg(number, size=2**20))
+            if scene.demand.clients == 0:
+                break
+            await asyncio.sleep(0.01)
+        await until(lambda: scene.demand.clients == 0)
+        assert scene.metrics.total("camera_relay_pictures") < 100

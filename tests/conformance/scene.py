@@ -6,6 +6,7 @@ bytes (``Scene.names``). The verbs that all judges share are methods here; those
 
 import asyncio
 import contextlib
+import re
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
@@ -15,7 +16,7 @@ import pytest
 
 from tests.machine import Patience
 
-LONG_S = 5.0
+LONG_S = 30.0
 VERBS = {">": "send", "<": "expect", "!": "violated", "!!": "violated_once", "?": "happened"}
 Script = tuple[dict[str, Any], list[str]]
 """The options of the judge, and the steps."""
@@ -24,6 +25,20 @@ Script = tuple[dict[str, Any], list[str]]
 def scripts(table: dict[str, Script]) -> pytest.MarkDecorator:
     """Parametrise a test over ``options`` and ``steps``; the keys are sentences."""
     return pytest.mark.parametrize(("options", "steps"), list(table.values()), ids=list(table))
+
+
+def table(lines: str, judges: dict[str, dict[str, Any]]) -> pytest.MarkDecorator:
+    """Parametrise a test over ``options`` and ``steps``; a line is a sentence, the judge it is about, and a script.
+
+    ``"a late probe | udp | probing; by_udp PROBE; ! too late"``; ``judges`` are the options by name. What is
+    indented more goes on with the line before.
+    """
+    found = {}
+    for line in re.sub(r"\n {8,}", " ", lines).strip().splitlines():
+        name, judge, script = (part.strip() for part in line.split(" | "))
+        assert name not in found, name
+        found[name] = (judges[judge], re.split(r"\s*;\s*", script))
+    return scripts(found)
 
 
 class Peer:

@@ -204,6 +204,63 @@ def test_wishes_are_granted_up_to_the_most(wish_s: float) -> None:
     assert authority.deadline() == NOW + min(wish_s, DEADMAN_S)
 
 
+ASKED = Acquire(who="ann", priority=5, alive="ann.1", t=1000)
+
+
+def test_a_program_whose_grant_was_lost_asks_again_and_gets_another_lease_in_place_of_the_first() -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, numbered())
+    first = authority.acquire(ASKED, NOW, 500.0)
+    authority.hold_back("robot lost", stops=False)
+    authority.events()
+    again = authority.acquire(msgspec.structs.replace(ASKED, t=2000), NOW + 1.0, 1500.0)
+    assert (first.ok, again.ok, again.code) == (True, True, None)
+    assert again.lease != first.lease
+    assert authority.report(NOW + 1.0).lease == again.lease
+    assert told(authority) == ["ended ann (taken over by ann)", "acquired ann"], "the robot was at rest"
+    authority.require_motion()
+    with pytest.raises(LeaseLost):
+        authority.admit(attach(ANN, SEQ), DRIVE, PAYLOAD, NOW + 1.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"t": 1000}, {"t": 999}, {"t": msgspec.UNSET}, {"alive": "ann.2"}, {"alive": None}, {"who": "ann.x"}],
+    ids=[
+        "the same question, delivered twice",
+        "an earlier one, held up",
+        "undated",
+        "another",
+        "no token",
+        "a namesake",
+    ],
+)
+def test_any_other_question_in_the_holders_name_is_denied(change: dict[str, object]) -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, numbered())
+    authority.acquire(ASKED, NOW, 500.0)
+    before = seen(authority)
+    denied = authority.acquire(msgspec.structs.replace(ASKED, **{"t": 2000, **change}), NOW + 1.0, 1500.0)
+    assert (denied.ok, denied.code) == (False, Code.HELD)
+    assert seen(authority) == before
+
+
+@pytest.mark.parametrize("used", ["a command", "a question"])
+def test_who_has_used_a_lease_has_got_it_and_is_denied_another(used: str) -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, numbered())
+    authority.acquire(ASKED, NOW, 500.0)
+    with contextlib.suppress(Refused):
+        if used == "a command":
+            authority.admit(attach(ANN, SEQ), DRIVE, PAYLOAD, NOW)
+        else:
+            question("renew")(authority)
+    assert not authority.acquire(msgspec.structs.replace(ASKED, t=2000), NOW + 1.0, 1500.0).ok
+
+
+def test_a_lease_that_was_granted_to_an_undated_question_is_not_granted_again() -> None:
+    authority = Authority(LEASE_S, DEADMAN_S, numbered())
+    authority.acquire(msgspec.structs.replace(ASKED, t=msgspec.UNSET), NOW)
+    assert not authority.acquire(ASKED, NOW + 1.0).ok
+
+
 ENDS: dict[str, tuple[Does, str]] = {
     "released": (question("release"), "free"),
     "holder lost": (lambda authority: authority.vanished("ann.1"), "stopped"),

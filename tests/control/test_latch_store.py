@@ -6,10 +6,11 @@ import os
 import stat
 from pathlib import Path
 
+import msgpack
 import pytest
 
 from zbridge.control.conditions import Conditions
-from zbridge.control.latch import Latches
+from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.latch_store import MOST_BYTES, LatchStore, state_folder
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
@@ -120,9 +121,9 @@ async def test_a_gateway_that_waits_keeps_what_the_other_one_says_beside_the_fil
     owner, waiting = store(folder), store(folder)
     owner.save(latches(ANN))
     await owner.flush()
-    waiting.mirror([ANN, BOB])
+    waiting.mirror(LatchRecord((ANN, BOB)))
     await waiting.flush()
-    waiting.mirror([BOB])
+    waiting.mirror(LatchRecord((BOB,)))
     await waiting.flush()
     taken = waiting.load()
     assert set(taken.in_force) == {ANN, BOB}
@@ -130,6 +131,30 @@ async def test_a_gateway_that_waits_keeps_what_the_other_one_says_beside_the_fil
     waiting.save(taken)
     await waiting.flush()
     assert store(folder).load().in_force == (ANN,), "what it waited with is in the owner's file from now on"
+
+
+async def test_that_the_robot_was_told_to_move_by_itself_is_kept_whoever_wrote_it_down(folder: Path) -> None:
+    owner, waiting = store(folder), store(folder)
+    assert not owner.load().autonomous
+    assert not owner.autonomous
+    waiting.mirror(LatchRecord(autonomous=True))
+    waiting.mirror(LatchRecord((BOB,)))  # of a gateway that does not know of it
+    await waiting.flush()
+    assert waiting.autonomous
+    taken = owner.load()
+    assert (taken.autonomous, owner.autonomous, taken.in_force) == (True, True, (BOB,))
+    taken.release(BOB.id, fleet=True)
+    owner.save(taken)
+    await owner.flush()
+    again = store(folder)
+    assert again.load().autonomous
+    assert again.autonomous
+
+
+async def test_a_file_of_an_earlier_version_says_nothing_of_motion_by_itself(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / "fleet@r1.latches").write_bytes(msgpack.packb({"latches": [], "released": [], "released_fleet": []}))
+    assert not store(folder).load().autonomous
 
 
 async def test_names_of_other_robots_and_realms_never_meet(folder: Path) -> None:

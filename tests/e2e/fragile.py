@@ -2,7 +2,8 @@
 
 ``python -m tests.e2e.fragile NAME HOST [OPTIONS]``: prints its port. The line ``cut`` on stdin breaks its connection;
 any other ends it, and it prints what it received and what was violated as one JSON object, bytes as hex. NAME is one of
-:data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``times``, and ``tells``, as a JSON object.
+:data:`ROBOTS`. OPTIONS: more arguments of the robot's class, ``times``, ``port`` (default any), and ``tells``, as a
+JSON object.
 
 A robot that ``tells`` prints a line ``AT SPEED`` (monotonic seconds, fraction of full scale) for each change of what it
 last obeyed, and waits for its own sends as long as its kernel does: deployed ones block in them.
@@ -13,7 +14,6 @@ import contextlib
 import json
 import math
 import re
-import socket
 import struct
 import sys
 import time
@@ -102,9 +102,9 @@ class _Controller(FragileController):
     Once its kernel's buffer is full it waits until that kernel tries again, which nobody else can hasten.
     """
 
-    async def _send(self, conn: socket.socket, messages: list[bytes]) -> None:
+    async def _send(self, messages: list[bytes]) -> None:
         begun = time.monotonic()
-        await super()._send(conn, messages)
+        await super()._send(messages)
         if telling and time.monotonic() - begun > HELD_UP_S:
             print(f"{time.monotonic():.6f} {GOES_ON}", flush=True)
 
@@ -163,9 +163,9 @@ async def main() -> None:
     global telling
     name, host, told = sys.argv[1:]
     options = {"tells": False, "times": {}, **json.loads(told)}
-    telling = options["tells"]
+    telling, port = options["tells"], options.pop("port", 0)
     robot = ROBOTS[name].make(**options)
-    serving = asyncio.create_task(robot.serve(host, 0, lambda port: print(port, flush=True)))
+    serving = asyncio.create_task(robot.serve(host, port, lambda port: print(port, flush=True)))
     while await asyncio.to_thread(sys.stdin.readline) == "cut\n":
         robot.cut()
     left = serving.done()

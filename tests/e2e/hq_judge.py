@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.e2e import mixed
 from tests.e2e.conftest import HOST, Bench, Gateway, device, listener
 from tests.e2e.fragile import DISTURBED, Fragile, charges, disturbed, fragile_robot
-from tests.e2e.hq_scene import playing, ports, soon
+from tests.e2e.hq_scene import playing, ports, pushed, soon
 from tests.e2e.processes import report
 from tests.ports import free_port
 
@@ -278,10 +279,9 @@ class Stage:
         program, forward, ends = self.program(name), DRIVES[name], time.monotonic() + seconds
         while True:
             before = self._place()
-            await program.drive(forward)
-            await soon(lambda: self._moved(before, forward), f"{name} moves {self.robot}")  # noqa: B023
             holder = f"hq.{program.name}.{program.number}"
-            assert (self.control["state"], self.control["holder"]) == ("held", holder), self.control
+            moves = partial(self._moves, before, forward, holder)
+            await pushed(program, forward, moves, f"{holder} moves {self.robot}")
             if time.monotonic() >= ends:
                 break
             await asyncio.sleep(0.3)
@@ -289,6 +289,10 @@ class Stage:
         await program.idle()
         await soon(lambda: self.robot != "alf" or not self._place()[0], f"{name} lets go of {self.robot}")
         await program.release()
+
+    def _moves(self, before: list[float], forward: float, holder: str) -> bool:
+        held = (self.control["state"], self.control["holder"]) == ("held", holder)
+        return held and self._moved(before, forward)
 
     def _place(self) -> list[float]:
         """Read what changes when the robot moves: its speed, what it sees around it, or its place along its way."""

@@ -16,6 +16,7 @@ from tests.ports import free_port
 T = TypeVar("T")
 ANSWER = bytes.fromhex("18000000 00 03 0b000000") + b"1.1,1.2,1.3" + bytes(7)
 """Packet 3 of a program of version 1.3 that has no feature, and no UDP."""
+PUSHES = 3
 NEUTRAL = bytes.fromhex("02000000 00 0d")
 
 
@@ -29,6 +30,23 @@ async def soon(condition: Callable[[], T], what: str, timeout_s: float = WAIT_S)
         if over:
             raise AssertionError(f"{what} not within {timeout_s} s")
         await asyncio.sleep(0.01)
+
+
+async def pushed(program: Any, forward: float, moved: Callable[[], object], what: str) -> None:
+    """Push a program's stick until the robot moves; centre it and push again, as people do, where nothing comes of it.
+
+    A gateway that a busy machine froze holds motion back until then.
+    """
+    for tries in range(PUSHES):
+        await program.drive(forward)
+        try:
+            await soon(moved, what)
+            return
+        except AssertionError:
+            if tries == PUSHES - 1:
+                raise
+        await program.idle()
+        await asyncio.sleep(0.5)
 
 
 def ports(count: int) -> list[int]:

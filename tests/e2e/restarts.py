@@ -54,14 +54,14 @@ class Numbered:
     period_s: ClassVar[float] = 0.01
     hello: ClassVar[bytes] = b""
 
-    def __init__(self, seed: int = 1) -> None:
+    def __init__(self, seed: int = 1, host: str = HOST) -> None:
         self.connections = 0
         self.sent = 0
         self.faults: list[str] = []
         self.moving = False
         self.commands = 0
         self._cuts = random.Random(seed)
-        self._server = socket.create_server((HOST, 0))
+        self._server = socket.create_server((host, 0))
         self._peers: list[socket.socket] = []
         self.port = int(self._server.getsockname()[1])
         self.pause = threading.Event()
@@ -127,8 +127,8 @@ class Package(Numbered):
 
     protocol, path, hello = "tcpudp", "pose", SETTINGS
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, host: str = HOST) -> None:
+        super().__init__(host=host)
         self._rest = b""
 
     def message(self, number: int) -> bytes:

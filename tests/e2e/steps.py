@@ -10,14 +10,15 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import socket
 import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from zbridge.app.handover import incoming, outgoing
 from zbridge.app.handover.channel import Channel
 from zbridge.app.handover.messages import Given, Go, Hello, Message, Up
+from zbridge.app.handover.processes import PROCESSES
 from zbridge.protocol.session import Role
 from zbridge.transport import Conversation, Parcel
 
@@ -69,8 +70,8 @@ def watch(folder: Path) -> None:
     """Let all gateways that are forked from here know their steps."""
     global _folder
     _folder = folder
-    outgoing.Channel = _Outgoing  # type: ignore[misc,attr-defined]
-    incoming.Channel = _Incoming  # type: ignore[misc,attr-defined]
+    PROCESSES.pair = _pair  # type: ignore[method-assign]
+    PROCESSES.channel = _Incoming  # type: ignore[method-assign,assignment]
     received = Conversation.received
 
     def noted(self: Conversation, data: bytes) -> None:
@@ -97,6 +98,11 @@ def _come(of: Of, step: str) -> None:
             new.write_text(str(time.monotonic()))
             new.rename(_folder / f"{_robot}.at")
             os.kill(os.getpid(), int(number))
+
+
+def _pair() -> tuple[Channel, socket.socket]:
+    near, far = socket.socketpair()
+    return _Outgoing(near), far
 
 
 class _Outgoing(Channel):

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from tests.e2e import steps
@@ -28,7 +29,10 @@ FORKS = "forks"
 
 
 class Supervised:
-    """A running supervisor: ``zbridge run FOLDER``, or that of this module (``hangs``). Its log goes to a file."""
+    """A running supervisor: ``zbridge run FOLDER``, or that of this module (``hangs``). Its log goes to a file.
+
+    enter: the command that runs it in another network namespace.
+    """
 
     def __init__(
         self,
@@ -37,6 +41,7 @@ class Supervised:
         *more: str,
         hangs: bool = False,
         environment: dict[str, str] | None = None,
+        enter: Sequence[str] = (),
     ) -> None:
         self.folder = folder
         self.orders = orders_of(folder)
@@ -45,6 +50,7 @@ class Supervised:
             module("supervised", folder) if hangs else [sys.executable, "-m", "zbridge", "run", str(folder), *more]
         )
         with self._log.open("ab") as log:
+            command = [*enter, *command]
             self.process = subprocess.Popen(command, stdout=log, stderr=log, text=True, cwd=ROOT, env=environment)
         stack.callback(end, self.process)
 

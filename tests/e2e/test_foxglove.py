@@ -370,6 +370,6 @@ def test_a_recording_is_played_paused_sped_up_and_sought(bench: Bench) -> None:
         assert viewer.shown["/r1/map"][-1][0] == BEGIN_NS  # the map of then
         viewer.play(speed=20.0, request="d")
         viewer.until(lambda: viewer.states[-1][0] == 3, "the end")
-        assert poses[-1][0] == BEGIN_NS + 1199 * 50_000_000
+        viewer.until(lambda: poses[-1][0] == BEGIN_NS + 1199 * 50_000_000, "the last pose")  # news overtake messages
         viewer.twist(1, forward=1.0)
         viewer.until(lambda: viewer.warned("channel 1 is not one of yours"), "a refusal")

@@ -83,7 +83,7 @@ async def test_old_hq_programs_stay_connected_and_drive_again_after_neutral(benc
         assert bench.fleet.last("r1/pose")["y"] == pytest.approx(still["y"])
         program.idle()
         await drives()
-        assert not [event for each in (program, vehicle, controller) for event in each.events if "ended" in event]
+        assert not any(each.ending for each in (program, vehicle, controller))
         program.idle()
         await vehicle.end()
         gateway.end()

@@ -7,6 +7,7 @@ import random
 import struct
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from gateways.ros2.conformance.strict_robot import HASHES, config
 from tests.e2e.conftest import HOST, Bench, device, listener, until
 from tests.e2e.fragile import charges
 from tests.e2e.hq_judge import DRIVES, LEASE_S, Alf, Ec, Program, Tcp
-from tests.e2e.hq_scene import playing, ports, soon
+from tests.e2e.hq_scene import playing, ports, pushed, soon
 from tests.e2e.ros_robot import KEY, WAYS, Scene, measure
 from tests.ports import free_port
 
@@ -52,8 +53,8 @@ async def test_old_programs_of_every_protocol_see_a_ros_robot_and_drive_it_in_tu
                 if program.name == "alf-scans":
                     continue
                 await soon(lambda: fleet.last("r1/control").get("state") == "free", "given back")
-                await program.drive(DRIVES[program.name])
-                await soon(lambda: scene.moves(DRIVES[program.name]), f"{program.name} drives")  # noqa: B023
+                forward = DRIVES[program.name]
+                await pushed(program, forward, partial(scene.moves, forward), f"{program.name} drives")
                 assert fleet.last("r1/control")["holder"] == f"hq.{program.name}.{program.number}"
                 await program.idle()
                 await soon(lambda: not any(robot.velocity), "at rest")

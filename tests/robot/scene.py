@@ -33,6 +33,7 @@ from zbridge.bus.fake import FakeBus, FakeQuery, meet
 from zbridge.bus.interface import Sort
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
+from zbridge.control.latch import Latches
 from zbridge.errors import LinkError
 from zbridge.fleet import topics
 from zbridge.fleet.topics import KeySpace
@@ -162,7 +163,15 @@ class Program:
 class Rig:
     """A device with everything around it played by the test; ``driver`` is the program that commands it."""
 
-    def __init__(self, *, lease_s: float = FOREVER_S, deadman_s: float = 2.0, bus: OpenBus | None = None, **more: Any):
+    def __init__(
+        self,
+        *,
+        lease_s: float = FOREVER_S,
+        deadman_s: float = 2.0,
+        bus: OpenBus | None = None,
+        latches: Latches | None = None,
+        **more: Any,
+    ) -> None:
         self.loop = asyncio.get_running_loop()
         self.bus = bus or OpenBus()
         self.hq = self.bus.join("2")
@@ -179,7 +188,7 @@ class Rig:
             protocol="tcpudp",
             keys=KeySpace("fleet", "r1"),
             bus=self.bus,
-            authority=Authority(lease_s, deadman_s, numbered()),
+            authority=Authority(lease_s, deadman_s, numbered(), latches=latches),
             manager=self.manager,
             metrics=self.metrics,
             audit=Audit("r1", self.audit_lines.append),

@@ -11,6 +11,7 @@ import pytest
 from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import scene_of
 from tests.robot.scene import COMMANDS, SETTINGS, STOP, Rig, established, serving
+from zbridge.control.latch import LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.robot.device import HEARD_S
 from zbridge.transport import Parcel
@@ -132,7 +133,7 @@ async def test_a_robot_that_has_not_agreed_is_not_healthy() -> None:
 
 async def test_latched_stops_of_the_other_gateway_are_in_force_from_the_first_moment(rig: Rig) -> None:
     await aside(rig)
-    rig.device.merge_latches([Latch(b"\x07" * 16, "ann", "wet floor")])
+    rig.device.merge(LatchRecord((Latch(b"\x07" * 16, "ann", "wet floor"),)))
     await rig.device.step_in()
     assert rig.control["state"] == "latched"
     assert [latch.who for latch in rig.device.standing.latches] == ["ann"]
@@ -169,3 +170,13 @@ async def test_a_successor_of_a_gateway_that_stands_aside_stands_aside_too(rig: 
     assert counts(rig) == before
     running.cancel()
     await asyncio.wait([running])
+
+
+async def test_who_has_left_the_commands_to_the_next_process_says_nothing_any_more(rig: Rig) -> None:
+    rig.device.withdraw()
+    published = counts(rig)
+    await asyncio.sleep(3.0)
+    assert counts(rig) == published, "it may be frozen before it learns that it has handed over"
+    await rig.device.go_on()
+    await asyncio.sleep(3.0)
+    assert counts(rig) > published

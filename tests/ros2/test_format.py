@@ -18,6 +18,7 @@ from zbridge.ros2 import (
     Node,
     QoS,
     Reliability,
+    all_tokens,
     dds_type,
     endpoints_of,
     is_ros_name,
@@ -178,3 +179,54 @@ def test_types_are_written_with_colons_and_read_back() -> None:
 
 def test_tokens_of_a_topic_are_asked_for_by_its_name() -> None:
     assert endpoints_of(3, Kind.PUBLISHER, "/r1/scan") == "@ros2_lv/3/*/*/*/MP/*/*/*/%r1%scan/*/*/*"
+
+
+def test_all_tokens_of_a_domain_or_of_a_kind_are_asked_for() -> None:
+    assert all_tokens(3) == "@ros2_lv/3/**"
+    assert endpoints_of(3, Kind.SERVER) == "@ros2_lv/3/*/*/*/SS/*/*/*/*/*/*/*"
+
+
+FOREIGN_QOS = {  # other numbers of rmw's policies, as rmw_zenoh may write them
+    "1:2:1,7:,:,:,,": QoS(depth=7),
+    "0:0:0,:,:,:,,": QoS(depth=42),
+    "3:3:3,1:,:,:,,": QoS(depth=1),
+    "2:1:2,9:,:,:,,": QoS(Reliability.BEST_EFFORT, Durability.TRANSIENT_LOCAL, 0),
+    "::,10:,:,:,,:more": KEEP_LAST_10,
+    "4::,10:,:,:,,": None,
+    ":4:,10:,:,:,,": None,
+    "::4,10:,:,:,,": None,
+    "::10:,:,:,,": None,
+    "::,x:,:,:,,": None,
+    "::,-1:,:,:,,": None,
+    "::,\u0663:,:,:,,": None,
+    "::,1000000000000000000:,:,:,,": None,
+}
+
+
+@pytest.mark.parametrize("text", FOREIGN_QOS)
+def test_qos_of_others_is_read_or_is_none(text: str) -> None:
+    assert read_qos(text) == FOREIGN_QOS[text]
+
+
+NUMBERS = {"7": 7, "0": 0, "007": "007", "d": "d", "\u0663": "\u0663", "9" * 18: 10**18 - 1, "9" * 19: "9" * 19}
+
+
+@pytest.mark.parametrize("text", NUMBERS)
+def test_a_number_of_a_token_is_text_where_it_would_be_written_otherwise(text: str) -> None:
+    node = read_token(f"@ros2_lv/2/aa/{text}/0/NN/%/%/n")
+    assert isinstance(node, Node)
+    assert node.number == NUMBERS[text]
+
+
+def test_a_token_may_be_long_and_say_more_than_is_known() -> None:
+    token = f"{LISTENER}/%{'c' * 100}/std_msgs::msg::dds_::String_/{STRING}/::,10:,:,:,,"
+    longest = token.replace("c" * 100, "c" * (100 + 2048 - len(token)))
+    assert isinstance(read_token(longest), Endpoint)
+    assert read_token(longest.replace("c", "cc", 1)) is None
+    assert isinstance(read_token(f"{token}/more"), Endpoint)
+
+
+def test_an_endpoint_of_a_session_without_a_number_has_the_gid_of_its_token_alone() -> None:
+    endpoint = Endpoint(Node(0, "zz", 0, "/", "n"), 1, Kind.PUBLISHER, "/scan", "sensor_msgs/msg/Imu", STRING)
+    assert endpoint.gids() == (endpoint.gid(),)
+    assert endpoint.key == f"0/scan/sensor_msgs::msg::dds_::Imu_/{STRING}"

@@ -174,6 +174,7 @@ class _Namer:
         return (
             self.leases[lease], holder.who, current and self._ago(holder.expires_at),
             current and self.tokens[holder.alive or ""], holder.ended or "",
+            current and not holder.numbers and self._age(holder.asked_ms),
             tuple((kind, self.numbers.rank(lease, kind, holder.numbers.get(kind, -1)))
                   for kind in ("commands", "questions")),
             round(holder.age._baseline_ms / 100) if current and holder.age._baseline_ms is not None else -1,

@@ -14,6 +14,7 @@ from zbridge.control.events import EventKind
 from zbridge.control.proof import read
 
 TOLERANCE_S = 1e-6
+_NONE: frozenset[str] = frozenset()
 
 
 class Account(NamedTuple):
@@ -29,6 +30,11 @@ class Account(NamedTuple):
     released: frozenset[str] = frozenset()
     moving: frozenset[str] = frozenset()
     """Parts of the robot that move, by the commands that were carried out."""
+    alive: str = ""
+    """The token that the holder's question named."""
+    asked_at: float = 0.0
+    used: bool = False
+    """Whether anything was sent with the lease."""
     moved: frozenset[str] = frozenset()
     """Parts that moved when neutral began to be owed, and have not rested since."""
 
@@ -42,6 +48,7 @@ class Account(NamedTuple):
             tuple(sorted(self.released)),
             tuple(sorted(self.moving)),
             tuple(sorted(self.moved)),
+            self.lease is None or self.used or round(world.now - self.asked_at, 1),
         )
 
 
@@ -102,12 +109,15 @@ def _was_late(world: World) -> bool:
 
 
 def _acquire(account: Account, world: World, said: Any) -> Account:
-    program, question, reply = said
+    query, reply = said
+    program, question = query.program, query.question
     account = _expired(account, world)
     taking = "/takeover/" in question.key
     held = account.lease is not None
     outranks = held and world.programs[program].priority > world.programs[account.program].priority
-    allowed = not account.latched and (not held or taking or outranks)
+    same = (program, query.alive) == (account.program, account.alive)
+    again = held and not account.used and same and question.asked_at > account.asked_at
+    allowed = not account.latched and (not held or taking or outranks or again)
     if reply.ok != allowed:
         raise Violation(
             f"a question for the lease was {'granted' if reply.ok else 'refused'}: {account}, {reply.reason}"
@@ -115,8 +125,9 @@ def _acquire(account: Account, world: World, said: Any) -> Account:
     if not reply.ok:
         return account
     return account._replace(
-        lease=reply.lease, program=program, expires_at=world.now + LEASE_S, owes=False, moving=frozenset(),
-        moved=frozenset(), baseline_s=world.now - question.asked_at,
+        lease=reply.lease, program=program, expires_at=world.now + LEASE_S, owes=False, moving=_NONE,
+        moved=_NONE, baseline_s=world.now - question.asked_at, alive=query.alive,
+        asked_at=question.asked_at, used=False,
     )  # fmt: skip
 
 
@@ -127,7 +138,7 @@ def _renew(account: Account, world: World, said: Any) -> Account:
         raise Violation("a lease was renewed that is not held")
     if shown.lease != account.lease or not reply.ok:
         return account
-    account, stale = _dated(account, world.now - shown.t / 1000)
+    account, stale = _dated(account._replace(used=True), world.now - shown.t / 1000)
     return account if stale else account._replace(expires_at=world.now + LEASE_S)
 
 
@@ -146,7 +157,7 @@ def _admitted(account: Account, world: World, said: Any) -> Account:
     account = _expired(account, world)
     if read(command.attachment).lease != account.lease:
         raise Violation("a command of somebody else was admitted")
-    account, stale = _dated(account, world.now - command.given_ms / 1000)
+    account, stale = _dated(account._replace(used=True), world.now - command.given_ms / 1000)
     if stale != sender.stale:
         raise Violation(f"a command that was late is {'stale' if stale else 'fresh'}, and was not taken for it")
     return account if stale else account._replace(expires_at=world.now + LEASE_S)
@@ -182,9 +193,7 @@ def _carried_out(account: Account, what: str, stale: bool) -> Account:
 def _owes(account: Account) -> Account:
     """Owe neutral from now on: the robot is at rest."""
     held = account.lease is not None
-    return account._replace(
-        owes=held, moved=(account.moved | account.moving) if held else frozenset(), moving=frozenset()
-    )
+    return account._replace(owes=held, moved=(account.moved | account.moving) if held else _NONE, moving=frozenset())
 
 
 def _recorded(account: Account, world: World, said: Any) -> Account:

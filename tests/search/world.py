@@ -277,7 +277,7 @@ class World:
                 request = payloads.decode(Acquire, question.payload)
                 take = self.authority.takeover if "/takeover/" in question.key else self.authority.acquire
                 reply = take(request, self.now, now_ms)
-                self.decisions.append(("acquire", (query.program, question, reply)))
+                self.decisions.append(("acquire", (query, reply)))
             elif gate(question.key, question.payload, len(question.payload), lambda: b"") is None:
                 return
             elif question.key == RENEW:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.simulated.generate import PROFILES, scenario
+from tests.simulated.rows import counted, table
 from tests.simulated.scenario import Outcome, run
 from tests.simulated.shrink import shrink
 
@@ -28,13 +29,22 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="a folder: shrink what fails, and write it there")
     parser.add_argument("--first", action="store_true", help="end with the first scenario that fails")
     parser.add_argument("--twice", action="store_true", help="run each scenario twice and compare the traces")
+    parser.add_argument(
+        "--rows", action="store_true", help="print how often each row of the tables in docs was reached"
+    )
     parser.add_argument("--verbose", action="store_true", help="print the counts of what was reached")
     options = parser.parse_args()
     if options.replay is not None:
         return show(run(json.loads(options.replay.read_text()), keep_trace=True))
     if options.trace:
         return show(run(scenario(options.seed, options.profile), keep_trace=True))
-    return campaign(options)
+    if options.rows:
+        with counted(reached := Counter[str]()):
+            failed = campaign(options, reached)
+        for name, row, count in table(reached):
+            print(f"  {name:13} {row:58} {count:8}")
+        return failed
+    return campaign(options, Counter())
 
 
 def show(outcome: Outcome) -> int:
@@ -44,9 +54,9 @@ def show(outcome: Outcome) -> int:
     return bool(outcome.violations)
 
 
-def campaign(options: Any) -> int:
-    """Run one scenario after the other."""
-    begun, simulated, failed, counts = time.process_time(), 0.0, 0, Counter[str]()
+def campaign(options: Any, counts: Counter[str]) -> int:
+    """Run one scenario after the other. counts: is added what they reached."""
+    begun, simulated, failed = time.process_time(), 0.0, 0
     ran = 0
     for seed in itertools.count(options.seed):
         if time.process_time() - begun > options.seconds or ran == options.count:
@@ -54,7 +64,7 @@ def campaign(options: Any) -> int:
         made = scenario(seed, options.profile)
         outcome = run(made)
         ran, simulated = ran + 1, simulated + outcome.seconds
-        counts += outcome.counts
+        counts.update(outcome.counts)
         if options.twice and run(made).hash != outcome.hash:
             print(f"seed {seed} ({made['profile']}): two runs differ")
             failed += 1

@@ -66,6 +66,8 @@ class Grant:
         self.autonomous = False
         self.last_motion: Command | None = None
         self.held_back = False
+        self.used = False
+        """Whether anything was sent with it."""
 
     def __repr__(self) -> str:
         return f"lease {self.lease.hex()[:6]} of {self.asker} at {self.gateway}"
@@ -79,8 +81,13 @@ class Grant:
         """Whether it ended more than so long ago."""
         return self.ended_at is not None and now > self.ended_at + slack_s
 
+    def asks_again(self, asker: str, request: dict[str, Any]) -> bool:
+        """Whether its own program asks once more: the grant did not reach it, and it used nothing."""
+        return asker == self.asker and self.alive is not None and request.get("alive") == self.alive and not self.used
+
     def received(self, command: Command, now: float) -> None:
         """Follow a command that reached the gateway: when motion must wait for neutral."""
+        self.used = True
         late_s = now - command.put_at
         self.base_s = min(self.base_s, late_s)
         late_s -= self.base_s

@@ -78,6 +78,7 @@ class Fabric:
         self.paths = paths
         self.rng = world.rng("bus")
         self.sessions: list[SimSession] = []
+        self.on_put: list[Callable[[str, str, bytes], None]] = []
         self.routers = {name: Router(self, name) for name in ("router1", "router2")}
         self.between = Link(self, ("router1", "router2"), world.after, ROUTERS, self._between_changed)
         self.news_late_s = 0.0

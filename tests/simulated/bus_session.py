@@ -76,6 +76,8 @@ class SimBus:
         session, fabric = self.session, self.fabric
         if not session.open or not session.process.alive:
             return
+        for tell in fabric.on_put:
+            tell(session.process.name, key, payload)
         if "@" in key or "status" in key or "control" in key:
             fabric.world.note(session.process.name, "puts", key, payload, attachment)
         size = len(payload) + len(attachment or b"")

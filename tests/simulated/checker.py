@@ -12,6 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from tests.simulated.accounts import MAX_AGE_S, TOLERANCE, Command, Grant, motions, read
 from tests.simulated.obligations import Obligations
+from tests.simulated.released import Released
+from tests.simulated.shown import Shown
+from tests.simulated.written import Written
 
 if TYPE_CHECKING:
     from tests.simulated.scenario import Simulation
@@ -71,6 +74,10 @@ class Checker:
             "crashed": self._on_crashed,
         }
         self.obligations = Obligations(self)
+        self.written, self.released = Written(self), Released(self)
+        self.rules = (self.written, self.released, Shown(self))
+        self.know_mode: set[str] = set()
+        """The gateways that know that the robot was told to move by itself."""
         self.world.watchers.append(self._watch)
 
     def violate(self, rule: str, text: str) -> None:
@@ -85,6 +92,8 @@ class Checker:
         if handler is not None:
             handler(who, *fields)
         self.obligations.watch(who, what, fields)
+        for rules in self.rules:
+            rules.watch(who, what, fields)
 
     # Leases
 
@@ -104,14 +113,15 @@ class Checker:
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
             stands = last is not None and last.ended_at is None and last.shown
-            if verb == "acquire" and stands and not request.get("priority"):
+            again = last is not None and last.asks_again(asker, request)
+            if verb == "acquire" and stands and not again and not request.get("priority"):
                 self.violate("held", f"{grant} granted while {last} stands")
             self._grant(grant, request)
         elif verb == "release" and gateway in self.current:
             if request.get("lease") == self.current[gateway].lease:
                 self._released(self.current[gateway], answer, asker)
         elif answer.get("ok") and verb == "renew" and gateway in self.current:
-            self.current[gateway].renewed_at = self.world.now
+            self.current[gateway].renewed_at, self.current[gateway].used = self.world.now, True
 
     def _released(self, grant: Grant, answer: dict[str, Any], asker: str) -> None:
         """Only the holder ends its lease, and may do so."""
@@ -151,7 +161,7 @@ class Checker:
         grant = self.current.get(gateway)
         if grant is not None and grant.ended_at is None:
             grant.end(self.world.now, why)
-            if why in ("stop", "superseded"):
+            if why in ("stop", "superseded", "gateway restarted"):
                 self._taken_at[grant.who] = self.world.now
             self.counts[f"lease ended: {why}"] += 1
             self.obligations.lease_ended(grant)
@@ -197,6 +207,8 @@ class Checker:
                 if a.running and b.running and self.simulation.fabric.works(a.session, b.session):
                     self._met.setdefault(pair, self.world.now)
                     self._share_latches(one, other)
+                    if self._met_for(one, other) > MEET_S and self.know_mode & pair:
+                        self.know_mode |= pair
                 else:
                     self._met.pop(pair, None)
 
@@ -234,6 +246,7 @@ class Checker:
                 if now - at > most_s:
                     break
                 if abs(value - command.value) < 0.0052:
+                    self.released.put(program.name, list(self._gives[program.name]))
                     return
         self.violate("hq-motion", f"{listener} put {command}, which no HQ program said lately")
 
@@ -243,6 +256,8 @@ class Checker:
 
     def _on_receives(self, gateway: str, key: str, payload: bytes, attachment: bytes | None) -> None:
         now = self.world.now
+        if gateway not in self.gateways:
+            return
         if key.endswith("@cmd/stop"):
             fields = read(payload)
             self.end(gateway, "stop")
@@ -271,10 +286,13 @@ class Checker:
             self._written(self.by_host[source[0]], bytes.fromhex(data))
 
     def _written(self, gateway: str, data: bytes) -> None:
+        self.written.written(gateway, data)
         for kind, value in motions(self.protocol, data):
             if kind == "mode" and value != 3.0:
                 continue
             self.counts[f"{kind} written"] += 1
+            if kind == "mode":
+                self.know_mode.add(gateway)
             reason = self._judge(gateway, kind, 1.0 if kind == "mode" else value)
             if reason is not None:
                 self.violate(*reason)

@@ -38,6 +38,7 @@ class World:
         """Exceptions that nobody handled, and logged errors that are our own bugs."""
         self.watchers: list[Callable[[str, str, tuple[Any, ...]], None]] = []
         """Called with every note of the trace: faults that wait for a state, and the checker."""
+        self.by_pid: dict[int, Process] = {}
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._count = 0
         self._hash = hashlib.blake2b(digest_size=16)
@@ -127,9 +128,13 @@ class Process:
         self.on_death: list[Callable[[], None]] = []
         """What the operating system does when the process has ended: closes its sockets and bus sessions."""
         self.on_pause: list[Callable[[bool], None]] = []
+        self.on_go: list[Callable[[], None]] = []
+        """What happens when another process has handed everything over to this one."""
         self.paused_at = 0.0
         self.resumed_at = 0.0
         self.descriptors: dict[int, Any] = {}
+        self.pid = len(self.world.by_pid) + 1
+        self.world.by_pid[self.pid] = self
         self._next_descriptor = 3
         self._late: list[Callable[[], None]] = []
 
@@ -180,11 +185,19 @@ class Process:
         """End it at once, as SIGKILL does."""
         if not self.alive:
             return
-        self.alive = False
         self.world.note(self.name, "killed")
+        self.exit()
+
+    def exit(self) -> None:
+        """Let the operating system clean up: what no other process has open is closed."""
+        if not self.alive:
+            return
+        self.alive = False
         for tell in self.on_death:
             tell()
-        self.descriptors.clear()
+        things, self.descriptors = tuple(self.descriptors.values()), {}
+        for thing in things:
+            thing.left(self)
         if self.loop is not None:
             self.loop.abandon()
 
@@ -350,7 +363,7 @@ class SimLoop(asyncio.AbstractEventLoop):
     def remove_reader(self, fd):  # type: ignore[no-untyped-def, override]
         thing = self.process.descriptors.get(fd)
         if thing is not None:
-            thing.watch(None, None)
+            thing.watch(self, None)
         return thing is not None
 
     async def create_connection(self, protocol_factory, host=None, port=None, *, sock=None, **_):  # type: ignore[no-untyped-def, override]
@@ -367,6 +380,11 @@ class SimLoop(asyncio.AbstractEventLoop):
         tasks = [task for task in self.abandoned if not task.done()]
         timers = sum(not handle._cancelled for _, _, handle in self._timers)
         return tasks, timers + len(self._ready)
+
+    @property
+    def waiting(self) -> list[str]:
+        """What the timers would call."""
+        return [str(handle._callback) for _, _, handle in self._timers if not handle._cancelled]
 
     def abandon(self) -> None:
         """Run nothing any more."""

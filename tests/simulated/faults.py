@@ -28,6 +28,16 @@ REACHED: dict[str, Callable[[str, str, tuple[Any, ...]], bool]] = {
     "released": lambda who, what, fields: what == "released",
 }
 """The states that a fault can wait for."""
+_SAID = ("Hello", "Given", "Up", "Go")
+HANDOVER: dict[str, Callable[[str, str, tuple[Any, ...]], bool]] = {
+    f"{said} {what}": lambda who, noted, fields, what=what, said=said: (  # type: ignore[misc]
+        noted == f"handover {what}" and fields[0] == said
+    )
+    for said in _SAID
+    for what in ("unsent", "sent", "got")
+}
+"""The steps of a restart: before a message is sent, after, and when it was received."""
+HANDOVER["restarting"] = lambda who, what, fields: what == "told to restart"
 
 
 class Faults:
@@ -57,7 +67,7 @@ class Faults:
                 self._overheard = (who, *fields)
         if not self._waiting:
             return
-        for state in [state for state in self._waiting if REACHED[state](who, what, fields)]:
+        for state in [state for state in self._waiting if (REACHED.get(state) or HANDOVER[state])(who, what, fields)]:
             steps = self._waiting.pop(state)
             for step in steps:
                 self.reached[state] = self.reached.get(state, 0) + 1
@@ -67,14 +77,33 @@ class Faults:
         """Do one step now."""
         if self._over:
             return
+        if step.get("target") == "owner":
+            step = {**step, "target": self._simulation.checker.obligations.serving or "gw1"}
         if "fault" in step:
             self._simulation.checker.counts[f"fault {step['fault']}"] += 1
+            for role in self._roles(step):
+                self._simulation.checker.counts[f"{role}: {step['fault']}"] += 1
             getattr(self, f"_{step['fault']}")(step)
             return
         name = step["who"]
+        if step["do"] == "leave":
+            self._simulation.checker.counts["HQ program: leave"] += 1
         for who in (*self._simulation.drivers, *self._simulation.programs):
             if who.name == name:
                 who.do(step)
+
+    def _roles(self, step: dict[str, Any]) -> set[str]:
+        """Return whose fault it is: of processes by name, of links by the hosts of both ends but routers."""
+        simulation = self._simulation
+        hit = {step.get("target"), *step.get("between", ())}
+        roles = {"robot"} & hit
+        roles |= {"client" for each in simulation.drivers if hit & {each.name, each.host.name}}
+        roles |= {"HQ program" for each in simulation.programs if hit & {each.name, each.host.name}}
+        for each in simulation.gateways:
+            if hit & {each.name, each.host.name} and not roles:
+                roles |= {"gateway"} if each.serves else {"listener"}
+                roles |= {"listener"} if each.configuration["hq"] else set()
+        return roles
 
     def _later(self, step: dict[str, Any], undo: Callable[[], None]) -> None:
         self.world.after(step.get("for", 1.0), undo)
@@ -83,10 +112,21 @@ class Faults:
         simulation = self._simulation
         if name == "robot":
             return simulation.robot
+        if name[-1] in "+-":  # of a restart
+            life = simulation.members[name[:-1]].part(name[-1])
+            return life.process if life is not None else None
         if name in simulation.members:
             member = simulation.members[name]
             return member.process if member.alive else None
         return next((each for each in simulation.programs if each.name == name), None)
+
+    @property
+    def paused(self) -> bool:
+        """Whether a process is paused now."""
+        simulation = self._simulation
+        processes = [simulation.robot, *simulation.programs]
+        processes += [member.process for member in simulation.members.values() if member.alive]
+        return any(process.paused for process in processes)
 
     # Faults
 
@@ -97,9 +137,17 @@ class Faults:
             self._later(step, process.resume)
 
     def _kill(self, step: dict[str, Any]) -> None:
+        if step["target"][-1] in "+-":
+            if (process := self._process(step["target"])) is not None:
+                process.kill()
+            return
         member = self._simulation.members[step["target"]]
         member.kill()
         self._later(step, member.start)
+
+    def _restart(self, step: dict[str, Any]) -> None:
+        """Let a gateway hand everything over to another process."""
+        self._simulation.members[step["target"]].restart()  # type: ignore[attr-defined]
 
     def _end(self, step: dict[str, Any]) -> None:
         member = self._simulation.members[step["target"]]
@@ -219,6 +267,8 @@ class Faults:
         paths.slow.clear()
         processes = [simulation.robot, *simulation.programs]
         processes += [member.process for member in simulation.members.values() if member.alive]
+        parts = [gateway.part(which) for gateway in simulation.gateways for which in "+-"]
+        processes += [part.process for part in parts if part is not None]
         for process in processes:
             process.resume()
         for member in simulation.members.values():

@@ -10,11 +10,14 @@ import random
 from typing import Any
 
 from tests.simulated.faults import REACHED
+from tests.simulated.generate_restarts import restarts
+from tests.simulated.situations import arrange
 
-PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf", "wc2ec", "mixed")
+PROFILES = ("link", "bus", "ownership", "hq", "restart", "latch", "tcpudp", "alf", "wc2ec", "mixed", "situations")
 SECONDS = (25.0, 60.0)
 _WHEELS = {"differential": {"left": ["left"], "right": ["right"], "wheel_radius_m": 0.05, "track_m": 0.3}}
 _STATES = tuple(REACHED)
+_WITH_PROGRAMS = ("mixed", "link", "latch", "restart", "tcpudp", "alf", "wc2ec")
 _DRIVEN = ("moving", "moving", "mode read", "drive received", "stopping", "stop unwritten")
 """The states in which a fault of the robot or its link hurts."""
 
@@ -25,7 +28,7 @@ def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
     profile = profile or rng.choice(PROFILES)
     stripped = rng.random() < 1 / 3
     protocol = profile if profile in ("alf", "wc2ec") else rng.choice(("tcpudp", "tcpudp", "tcpudp", "alf", "wc2ec"))
-    if profile in ("tcpudp", "restart"):
+    if profile == "tcpudp":
         protocol = "tcpudp"
     made: dict[str, Any] = {
         "seed": f"{seed} {profile}",
@@ -38,13 +41,21 @@ def scenario(seed: int | str, profile: str | None = None) -> dict[str, Any]:
         "programs": [],
         "network": {"delay_s": rng.choice((0.0005, 0.002, 0.02)), "jitter_s": rng.choice((0.0005, 0.005))},
     }
-    if profile == "ownership" or (profile in ("mixed", "latch") and rng.random() < 0.5):
+    share = {"ownership": 1.0, "mixed": 0.5, "latch": 0.5, "restart": 0.3}.get(profile, 0.0)
+    if share == 1.0 or (share and rng.random() < share):
         made["gateways"].append({"name": "gw2", "host": "gw2", "router": rng.choice(("router1", "router2"))})
-    if profile == "hq" or (profile in ("mixed", "link", "latch", "tcpudp", "alf", "wc2ec") and rng.random() < 0.4):
+    if profile == "hq" or (profile in _WITH_PROGRAMS and rng.random() < 0.4):
         _add_programs(rng, made)
     if rng.random() < 0.2 or profile == "bus":
         made["network"]["reorders"] = rng.random() < 0.3
-    made["steps"] = sorted(_acts(rng, made) + _faults(rng, made, profile), key=lambda step: step["t"])
+    if profile == "situations":
+        arrange(rng, made)
+        return made
+    steps = _acts(rng, made) + _faults(rng, made, profile)
+    if profile == "restart":
+        made["robot"]["options"]["splits_s"] = rng.choice((0.0, 0.02, 0.3))
+        steps += restarts(rng, made)
+    made["steps"] = sorted(steps, key=lambda step: step["t"])
     return made
 
 

@@ -70,6 +70,7 @@ class HqProgram(Process):
     def disconnect(self) -> None:
         """Close the connection."""
         if self.end is not None:
+            self.world.note(self.name, "leaves listener")
             self.lost(self.end)
 
     def greet(self, end: End) -> None:

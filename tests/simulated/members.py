@@ -6,9 +6,7 @@ import asyncio
 import hashlib
 import hmac
 import itertools
-import shutil
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import Any
 
 import msgpack
@@ -17,15 +15,13 @@ from tests.simulated.bus import Fabric, SimSession
 from tests.simulated.bus_session import SimBus
 from tests.simulated.engine import Host, Process, SimLoop
 from tests.simulated.net import Network
-from tests.simulated.sockets import SimKernel
-from zbridge.app.config import plan
-from zbridge.app.gateway import Gateway
-from zbridge.app.runtime import Runtime
 from zbridge.client.fleet import Fleet
 from zbridge.errors import Held, LeaseLost, NeutralFirst, Refused, ZbridgeError
 from zbridge.metrics import Metrics
 
 ROBOT = "r1"
+RESTART_S = 10.0
+"""Longest wait for the answer to a restart."""
 
 
 class Member:
@@ -64,15 +60,20 @@ class Member:
         self.ending = False
         if self.task is not None:
             self._graves.append((self.process, self.task))
-        self.starts += 1
-        self.process = Process(self.host, self.name)
-        self.process.rng = self.host.world.rng(f"{self.name} {self.starts}")
-        self.host.world.note(self.name, "started")
-        loop = SimLoop(self.process)
-        loop.network = self.network
+        self.process = self.new_process(self.name)
         self.session = SimSession(self.fabric, self.process, self.router)
-        self.task = loop.create_task(self._main())
+        assert self.process.loop is not None
+        self.task = self.process.loop.create_task(self._main())
         self.task.add_done_callback(self._look)
+
+    def new_process(self, name: str) -> Process:
+        """Begin a process with an event loop."""
+        self.starts += 1
+        process = Process(self.host, name)
+        process.rng = self.host.world.rng(f"{self.name} {self.starts}")
+        self.host.world.note(name, "started")
+        SimLoop(process).network = self.network
+        return process
 
     def _look(self, task: asyncio.Task[None]) -> None:
         """An exception that ends a process is a violation."""
@@ -105,43 +106,6 @@ class Member:
         """End it at once."""
         if self.alive:
             self.process.kill()
-
-
-class GatewayMember(Member):
-    """A gateway: the product's own, with the simulation's clocks, randomness and sockets."""
-
-    def __init__(
-        self,
-        host: Host,
-        name: str,
-        network: Network,
-        fabric: Fabric,
-        router: str,
-        configuration: dict[str, Any],
-        folder: Path,
-    ) -> None:
-        super().__init__(host, name, network, fabric, router)
-        self.configuration = configuration
-        self.folder = folder / name
-        shutil.rmtree(self.folder, ignore_errors=True)
-        self.gateway: Gateway | None = None
-        self.serves = "device" in configuration
-        """Whether it may serve the robot; else it only has listeners."""
-
-    async def run(self, bus: SimBus) -> None:
-        process, rng = self.process, self.process.rng
-        runtime = Runtime(
-            clock=self.host.monotonic,
-            clock_ns=self.host.wall_ns,
-            raw_ms=self.host.raw_ms,
-            suspended_s=lambda: self.host.suspended_s,
-            chance=rng.random,
-            secret=rng.randbytes,
-            kernel=SimKernel(process, self.network),
-            folder=self.folder,
-        )
-        self.gateway = Gateway(plan(self.configuration), runtime=runtime)
-        await self.gateway.run_on(bus)
 
 
 class DriverMember(Member):
@@ -222,6 +186,8 @@ class DriverMember(Member):
             await (fleet.latch() if step.get("fleet") else robot.latch())
         elif step["do"] == "unlatch":
             await (fleet.unlatch() if step.get("fleet") else robot.unlatch())
+        elif step["do"] == "restart":
+            await self.bus.ask(f"fleet/{ROBOT}/@rpc/restart/{self.name}", timeout_s=RESTART_S)
         self.note("done", step["do"])
 
     async def _drive(self, step: dict[str, Any]) -> None:

@@ -165,8 +165,8 @@ MUTANTS = (
         "stale motion is not refused",
         "bus",
         COMMANDS,
-        "            self._enforcer.require_fresh(sender)\n        try:",
-        "            pass\n        try:",
+        "            self._enforcer.require_fresh(sender)\n        else:",
+        "            pass\n        else:",
     ),
     Mutant(
         "suspension not noticed", "mixed", ENFORCER, "if suspended_s > self._suspended_s + SUSPENDED_S:", "if False:"
@@ -210,21 +210,21 @@ MUTANTS = (
     ),
     Mutant(
         "stalled link is written to",
-        "link",
+        "situations",
         "zbridge/transport/stalls.py",
         "        blocked = waited_s > (0.0 if self.blocked else STALLED_S)",
         "        blocked = False",
     ),
     Mutant(
         "drives wait for a stalled link for ever",
-        "link",
+        "situations",
         PRESENCE,
         '            self._enforcer.hold_back("the robot\'s link took nothing", stops=True)',
         "            pass",
     ),
     Mutant(
         "a reconnected robot is not stopped",
-        "link",
+        "situations",
         PRESENCE,
         "            self._standstill.stop()\n        for topic",
         "            pass\n        for topic",
@@ -267,12 +267,12 @@ MUTANTS = (
     ),
     Mutant(
         "a yielded gateway never returns",
-        "ownership",
+        "situations",
         OWNERSHIP,
         "            Input.BEST: (_show, State.OWNING),\n            Input.OUTBID: (_withdraw, State.LOOKING),",
         "            Input.OUTBID: (_withdraw, State.LOOKING),",
     ),
-    Mutant("robot not stopped by who yields", "ownership", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
+    Mutant("robot not stopped by who yields", "situations", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
     Mutant(
         "claim without latches",
         "ownership",
@@ -317,6 +317,35 @@ MUTANTS = (
         "State.LATCHED if self.latches else State.FREE",
         "State.FREE",
     ),
+    # motion by itself
+    Mutant(
+        "mode 3 is not written down",
+        "situations",
+        ENFORCER,
+        "        self.authority.latches.autonomous = True\n        return self._keep",
+        "        return self._keep",
+    ),
+    Mutant(
+        "mode 3 does not wait for the disk",
+        "situations",
+        COMMANDS,
+        "            if writing is not None:",
+        "            if False:",
+    ),
+    Mutant(
+        "a waiting gateway does not learn of mode 3",
+        "situations",
+        OWNERSHIP,
+        "        return LatchRecord(self.latches, autonomous=self.autonomous)",
+        "        return LatchRecord(self.latches)",
+    ),
+    Mutant(
+        "what was written down of mode 3 stops nobody",
+        "situations",
+        TCPUDP,
+        "        self._was_autonomous = True\n",
+        "        return\n",
+    ),
     # HQ programs
     Mutant(
         "HQ deadman ignored",
@@ -332,35 +361,37 @@ MUTANTS = (
         "            Input.MOTION: (Action.REFUSE, State.IDLE_OWES),",
         "            Input.MOTION: (Action.ACQUIRE, State.ASKING),",
     ),
-    Mutant(
+    Mutant(  # both: what holds the lease gives it back with its token
         "a lost HQ program keeps the lease",
-        "hq",
+        "situations",
         "zbridge/hq/operator.py",
-        '            self._release("disconnected")',
-        "            pass",
+        '        if self.intent.held:\n            self._release("disconnected")\n        self._lease.close()',
+        "        pass",
     ),
-    Mutant("old neutral counts at once", "hq", INTENT, "        if self._waited:\n", "        if False:\n"),
-    Mutant(
+    Mutant("old neutral counts at once", "situations", INTENT, "        if self._waited:\n", "        if False:\n"),
+    Mutant(  # both: what was queued meanwhile takes the robot from its program too
         "a frozen listener goes on",
-        "hq",
-        "zbridge/hq/listener.py",
-        "            client.let_go(FROZEN)",
-        "            pass",
+        "situations",
+        "zbridge/hq/freeze.py",
+        "        if frozen_s >= FROZEN_S:",
+        "        if False:",
     ),
     Mutant(
         "HQ programs hold the robot for ever",
-        "hq",
+        "situations",
         INTENT,
         "        return self.held and now - used_at >=",
         "        return self.held and now - used_at >= 1000 +",
     ),
     # what is shown
-    Mutant(
+    Mutant(  # both: what is not published at once is published 0.05 s later
         "control is not published",
         None,
         ENFORCER,
+        "            if self._control_due is None:\n"
+        "                self._control_due = self._loop.call_later(_CONTROL_S, self.report)\n"
         "        if changed:\n            self.report()",
-        "        if False:\n            self.report()",
+        "            pass",
     ),
     Mutant(
         "no heartbeat",
@@ -378,7 +409,7 @@ MUTANTS = (
     ),
     Mutant(
         "the client never learns of a loss",
-        "bus",
+        "situations",
         "zbridge/client/driver.py",
         "        self.lost.set()",
         "        pass",

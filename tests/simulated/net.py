@@ -85,6 +85,8 @@ class End:
         """Whether the peer's end of stream was reached."""
         self.broken: Exception | None = None
         self.closed = False
+        self.described = False
+        """Whether processes have descriptors of it; else it is its process's own."""
         self.unacknowledged = 0
         self.user_timeout_s = 60.0
         self.heard_at = 0.0
@@ -248,16 +250,17 @@ class Network:
         if found is None or not found[0].alive:
             process.after(2 * self.paths.delay(here, host), lambda: done(None, "Connection refused"))
             return
-        owner, accept = found
-        near, far = End(self, process, (here, self.port())), End(self, owner, (host, port))
+        owner = found[0]
+        near, far = End(self, process, (here, self.port())), End(self, getattr(owner, "process", owner), (host, port))
         near.peer, far.peer = far, near
         near.heard_at = far.heard_at = self.world.now
         self.ends += [near, far]
         process.on_death.append(lambda: _die(near))
-        owner.on_death.append(lambda: _die(far))
+        far.process.on_death.append(lambda: _die(far))
 
         def arrive() -> None:
-            if not owner.alive or not accept(far):
+            found = self.listeners.get((host, port))
+            if found is None or not found[0].alive or not found[1](far):
                 near.closed = far.closed = True
                 self.forget(near)
                 process.after(self.paths.delay(host, here), lambda: done(None, "Connection refused"))
@@ -322,6 +325,8 @@ class Network:
 
 
 def _die(end: End) -> None:
+    if end.described:
+        return
     end.close(ConnectionResetError("reset by peer") if end.received else None)
     end.broken = end.broken or ConnectionResetError()
 

@@ -9,6 +9,21 @@ from tests.simulated.accounts import Grant, read
 if TYPE_CHECKING:
     from tests.simulated.checker import Checker
 
+DISTURBS = frozenset(
+    (
+        "paused",
+        "resumed",
+        "started",
+        "told to end",
+        "was suspended",
+        "cut",
+        "healed",
+        "link lost",
+        "link back",
+        "crashed",
+    )
+)
+"""What the trace says of faults."""
 TICK_S = 0.1
 REST_S = 1.5
 """Longest time to rest, once the robot and its link work; docs/what-happens.md."""
@@ -41,9 +56,10 @@ class Obligations:
         self._granted_to: dict[str, float] = {}
         self._probe: dict[str, float] = {}
         self._dropped_at = -1.0
-        self._mode_at = 0.0
-        self._disturbed_dead = -1.0
-        """When a gateway was killed last."""
+        self._calm_from = 0.0
+        """When anything was last disturbed."""
+        self.serving: str | None = None
+        """The gateway that reached the robot last."""
         self.reachable_long = False
         self.world.after(TICK_S, self._tick)
 
@@ -56,9 +72,12 @@ class Obligations:
                 self._on_control(who, read(fields[1]))
         elif what == "killed" and who in self.checker.gateways:
             self._tokens.pop(who, None)
-            self._disturbed[who] = self._disturbed_dead = self.world.now
-        elif what in ("paused", "resumed", "started", "told to end", "was suspended"):
-            self._disturbed[who] = self.world.now
+            self._disturbed[who] = self._calm_from = self.world.now
+        elif what in DISTURBS:
+            self._disturbed[who] = self._calm_from = self.world.now
+        elif what == "took over":
+            has_token = self._tokens.pop(f"{who}+", float("inf")) <= self.world.now
+            self._tokens[who] = self.world.now if has_token else float("inf")
         elif what in ("announces", "withdraws") and fields[0].endswith("/@alive/gateway"):
             self._tokens[who] = self.world.now if what == "announces" else float("inf")
         elif who == "robot":
@@ -76,8 +95,6 @@ class Obligations:
             self.checker.counts[f"robot {what}"] += 1
         elif what == "moving":
             self.checker.counts[f"robot {'moves' if fields[0] else f'rests: {fields[1]}'}"] += 1
-        elif what == "reads" and fields[0] == "mode":
-            self._mode_at = self.world.now
         elif what == "reads" and fields[0] == "motion":
             self._probe.setdefault("read", self.world.now)
 
@@ -93,29 +110,39 @@ class Obligations:
         if grant is None:
             return
         grant.shown = True
-        if grant.over(self.world.now, TOLD_S) and self._undisturbed(gateway, grant.ended_at or 0.0):
+        if grant.over(self.world.now, TOLD_S) and self.undisturbed(gateway, grant.ended_at or 0.0):
             self.checker.violate("control", f"{gateway} shows {grant}, which has ended: {grant.why}")
 
     def _ended_unexplained(self, grant: Grant) -> None:
         """A lease whose holder drives does not end for no reason: one gateway, and nothing that ended it."""
         alone = sum(each.serves for each in self.simulation.gateways) == 1
         driven = grant.last_motion is not None and self.world.now - grant.last_motion.put_at < 0.5
-        if grant.ended_at is None and alone and driven and self._undisturbed(grant.gateway, grant.at):
+        if grant.ended_at is None and alone and driven and self.undisturbed(grant.gateway, grant.at):
             self.checker.violate("lost-lease", f"{grant} ended for no reason while it was used")
 
-    def _undisturbed(self, who: str, since: float) -> bool:
+    def undisturbed(self, who: str, since: float) -> bool:
         """Whether a process ran all the time since then."""
         member = self.simulation.members.get(who)
         return member is not None and member.running and self._disturbed.get(who, -1.0) < since - 0.1
 
-    def _serves(self, gateway: str) -> bool:
+    def calm_since(self, since: float) -> bool:
+        """Whether no path, link or process was disturbed since then, and none is."""
+        paths, fabric = self.simulation.paths, self.simulation.fabric
+        noisy = paths.cuts or paths.slow or fabric.news_lost or fabric.news_late_s or fabric.duplicates
+        return self._calm_from < since and not noisy and not self.simulation.faults.paused
+
+    def disturb(self) -> None:
+        """Judge what needs calm anew: a violation was noted."""
+        self._calm_from = self.world.now
+
+    def serves(self, gateway: str) -> bool:
         return self.world.now - self._status_at.get(gateway, -9.0) < STATUS_S
 
     def granted(self, grant: Grant) -> None:
         """``control`` shows a lease that was granted."""
 
         def look() -> None:
-            if not grant.shown and self._undisturbed(grant.gateway, grant.at):
+            if not grant.shown and self.undisturbed(grant.gateway, grant.at):
                 self.checker.violate("control", f"{grant.gateway} does not show {grant}")
 
         self.world.after(TOLD_S, look)
@@ -125,7 +152,7 @@ class Obligations:
 
         def look() -> None:
             shown = self._control.get(grant.gateway, {}).get("lease")
-            running = self._undisturbed(grant.gateway, grant.ended_at or 0.0) and self._serves(grant.gateway)
+            running = self.undisturbed(grant.gateway, grant.ended_at or 0.0) and self.serves(grant.gateway)
             if shown == grant.lease and running:
                 self.checker.violate("control", f"{grant.gateway} still shows {grant}: {grant.why}")
 
@@ -138,7 +165,7 @@ class Obligations:
 
         def learnt() -> None:
             gateway = self.checker.gateways[grant.gateway]
-            if not (self._undisturbed(asker, begun) and self._undisturbed(grant.gateway, begun)):
+            if not (self.undisturbed(asker, begun) and self.undisturbed(grant.gateway, begun)):
                 return
             if not self.simulation.fabric.works(member.session, gateway.session):
                 return
@@ -158,7 +185,7 @@ class Obligations:
         def look() -> None:
             shown = self._control.get(gateway, {}).get("state")
             in_force = self.checker.latches[gateway] and min(self.checker.latches[gateway].values()) <= at
-            if in_force and shown != "latched" and self._undisturbed(gateway, at) and self._serves(gateway):
+            if in_force and shown != "latched" and self.undisturbed(gateway, at) and self.serves(gateway):
                 self.checker.violate("latched", f"{gateway} shows {shown} while latched")
 
         self.world.after(TOLD_S, look)
@@ -168,6 +195,8 @@ class Obligations:
     def _tick(self) -> None:
         self.checker.expire()
         self.checker.meet()
+        for rules in self.checker.rules:
+            rules.tick()
         self._look_at_robot()
         self._look_for_heartbeats()
         self.world.after(TICK_S, self._tick)
@@ -177,11 +206,11 @@ class Obligations:
         now = self.world.now
         for gateway, since in self._tokens.items():
             said = max(self._status_at.get(gateway, 0.0), since)
-            if now - said > HEARTBEAT_S and self._undisturbed(gateway, now - HEARTBEAT_S - 1.0):
+            if now - said > HEARTBEAT_S and self.undisturbed(gateway, now - HEARTBEAT_S - 1.0):
                 self.checker.violate("heartbeat", f"{gateway} published no status for {now - said:.1f} s")
                 self._status_at[gateway] = now
 
-    def _works(self) -> str | None:
+    def works(self) -> str | None:
         """Return the gateway that serves the robot and reaches it now, by a connection that is established."""
         simulation, robot = self.simulation, self.simulation.robot
         if robot.paused or robot.crashed or not robot.alive:
@@ -195,7 +224,7 @@ class Obligations:
             if gateway is None or not up or slow or end.peer.broken or end.peer.closed:
                 continue
             member = simulation.members[gateway]
-            if member.running and self._serves(gateway) and self.world.now - self._connected_at > settles_s:
+            if member.running and self.serves(gateway) and self.world.now - self._connected_at > settles_s:
                 return gateway
         return None
 
@@ -213,7 +242,8 @@ class Obligations:
         return False
 
     def _look_at_robot(self) -> None:
-        now, robot, gateway = self.world.now, self.simulation.robot, self._works()
+        now, robot, gateway = self.world.now, self.simulation.robot, self.works()
+        self.serving = gateway or self.serving
         self._works_since = (self._works_since or now) if gateway is not None else None
         self.reachable_long = gateway is not None and self._works_since is not None and now - self._works_since > 3.0
         if not robot.moving or self._deserved():
@@ -230,11 +260,11 @@ class Obligations:
 
     def excused_until(self) -> float:
         """Datagrams that are lost, and robots that lose the stops of the first second, where no more are sent."""
+        if self.simulation.robot.by_itself and self.serving not in self.checker.know_mode:
+            self.checker.counts["excused: the gateway never met one that knew of the mode"] += 1
+            return float("inf")  # docs/what-happens.md: it was cut off since before the mode was chosen
         if self.simulation.scenario.get("control", {}).get("idle_stop_s") == 0:
             return float("inf") if self._dropped_at >= 0 else 0.0
-        if self.simulation.robot.by_itself and self._disturbed_dead > self._mode_at:
-            self.checker.counts["excused: a gateway was killed while the robot drove itself"] += 1
-            return float("inf")  # docs/reliability.md: no other process knows of the mode
         return 0.0
 
     # The last test

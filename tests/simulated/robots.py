@@ -37,6 +37,11 @@ class SimRobot(Process):
         self.crashed: str | None = None
         self.ends: list[End] = []
         self.lossless = False
+        self.splits_s: float = options.get("splits_s", 0.0)
+        """Seconds between the two parts in which telemetry leaves; 0: it leaves whole."""
+        self._rests: dict[End, bytes] = {}
+        self.told = 0
+        """Telemetry messages that were sent, each with its number."""
         self._commanded = 0
         self._value = 0.0
         network.listen(self, port, self.accept)
@@ -72,6 +77,31 @@ class SimRobot(Process):
 
     def tell(self, end: End) -> None:
         """Send telemetry once."""
+
+    def put(self, end: End, data: bytes) -> None:
+        """Write a telemetry message, in two parts perhaps."""
+        self.told += 1
+        self.world.note(self.name, "tells", self.told)
+        if not self.splits_s or end in self._rests:
+            self.write(end, data)
+            return
+        cut = self.rng.randrange(1, len(data))
+        end.send(data[:cut])
+        self._rests[end] = data[cut:]
+
+        def rest() -> None:
+            data = self._rests.pop(end)
+            if not end.closed:
+                end.send(data)
+
+        self.after(self.splits_s, rest)
+
+    def write(self, end: End, data: bytes) -> None:
+        """Write a message, after the rest of the one before."""
+        if end in self._rests:
+            self._rests[end] += data
+        else:
+            end.send(data)
 
     def read(self, end: End) -> None:
         """Read what came."""
@@ -164,11 +194,11 @@ class TcpUdpRobot(SimRobot):
     def send(self, end: End, kind: int, body: bytes = b"") -> None:
         """Write a packet."""
         if not end.closed:
-            end.send(_PACKET.pack(2 + len(body), 1, kind) + body)
+            self.write(end, _PACKET.pack(2 + len(body), 1, kind) + body)
 
     def tell(self, end: End) -> None:
         if self.world.now >= self._asleep_until:
-            self.send(end, 55, struct.pack("<fff", 1.0, 2.0, 3.0))
+            self.put(end, _PACKET.pack(14, 1, 55) + struct.pack("<fff", self.told + 1, 2.0, 3.0))
 
     def read_delay(self, end: End) -> float:
         asleep_s = max(0.0, self._asleep_until - self.world.now)
@@ -292,10 +322,10 @@ class AlfRobot(SimRobot):
 
     def tell(self, end: End) -> None:
         if self.binary:
-            end.send(struct.pack("<BB6hf", 4, int(abs(self._value)), 0, 0, 1, 0, 0, 0, 36.5))
+            self.put(end, struct.pack("<BB6hf", 4, int(abs(self._value)), 0, 0, 1, 0, 0, 0, self.told + 1))
         else:
-            rest = b"|".join([b"0.000000"] * 7)
-            end.send(b"4|%d|%s;" % (int(abs(self._value)), rest))
+            rest = b"|".join([b"0.000000"] * 6)
+            self.put(end, b"4|%d|%s|%d.000000;" % (int(abs(self._value)), rest, self.told + 1))
 
     def read(self, end: End) -> None:
         if end not in self.ends:
@@ -310,7 +340,7 @@ class AlfRobot(SimRobot):
                 self.heard("motion" if speed else "stop", speed, "tcp", end)
                 self.drive(speed)
             elif fields[0] == 255:
-                end.send(b"\xff\x01" if self.binary else b"255|1;")
+                self.write(end, b"\xff\x01" if self.binary else b"255|1;")
                 self.after(0.05, lambda: self.lost(end))
 
     def cut(self) -> list[float] | None:
@@ -358,7 +388,7 @@ class WebotsRobot(SimRobot):
             end.send(bytes([0, kind, number, len(name)]) + name)
 
     def tell(self, end: End) -> None:
-        end.send(bytes([1, 37, 2]) + struct.pack("<d", 500.0))
+        self.put(end, bytes([1, 37, 2]) + struct.pack("<d", self.told + 1))
 
     def read(self, end: End) -> None:
         if end not in self.ends:

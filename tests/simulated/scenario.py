@@ -14,6 +14,7 @@ import os
 import shutil
 import sys
 import tempfile
+import warnings
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,11 @@ from tests.simulated.bus import Fabric
 from tests.simulated.checker import Checker
 from tests.simulated.engine import Host, World
 from tests.simulated.faults import Faults
+from tests.simulated.gateway_member import GatewayMember
 from tests.simulated.hq_programs import HQ_PROGRAMS, HqProgram
-from tests.simulated.members import DriverMember, GatewayMember, Member
+from tests.simulated.members import DriverMember, Member
 from tests.simulated.net import Network, Paths
+from tests.simulated.restart_rules import RestartRules
 from tests.simulated.robots import ROBOTS
 
 HEAL_S = 14.0
@@ -74,6 +77,7 @@ class Simulation:
         self.programs = [self._program(number, each) for number, each in enumerate(scenario.get("programs", []))]
         self.members: dict[str, Member] = {each.name: each for each in [*self.gateways, *self.drivers]}
         self.checker = Checker(self)
+        self.restart_rules = RestartRules(self)
         self.faults = Faults(self)
 
     def host(self, name: str) -> Host:
@@ -133,6 +137,7 @@ class Simulation:
         self.checker.probe()
         world.run_until(seconds + HEAL_S + PROBE_S)
         self.checker.probed()
+        self.restart_rules.ended()
         for driver in self.drivers:
             driver.stop()
         for gateway in self.gateways:
@@ -179,6 +184,11 @@ class _Quiet(logging.Handler):
         return self
 
     def __exit__(self, *_: object) -> None:
+        with warnings.catch_warnings():  # of coroutines that a killed process never began
+            warnings.simplefilter("ignore", RuntimeWarning)
+            self._leave()
+
+    def _leave(self) -> None:
         world, self.world = self.world, None
         if world is not None:
             world.watchers.clear()

@@ -14,33 +14,46 @@ SEND_BUFFER = 64 * 1024
 
 
 class Described:
-    """Something with descriptors; it closes with the last one."""
+    """Something with descriptors, of several processes perhaps; it closes with the last one."""
 
-    def __init__(self, process: Process) -> None:
-        self.process = process
-        self.references = 0
-        self.loop: SimLoop | None = None
-        self.callback: Callable[[], None] | None = None
+    def __init__(self) -> None:
+        self.holders: list[Process | None] = []
+        """The process of each descriptor; None for one that is on its way to another process."""
+        self._watchers: dict[SimLoop, Callable[[], None]] = {}
 
-    def watch(self, loop: SimLoop | None, callback: Callable[[], None] | None) -> None:
-        """Call back when there is something to read."""
-        self.loop, self.callback = loop, callback
-        if callback is not None and self.readable:
-            self.ready()
+    @property
+    def process(self) -> Process:
+        """The process that has had a descriptor for the shortest time."""
+        return next(holder for holder in reversed(self.holders) if holder is not None)
+
+    def watch(self, loop: SimLoop, callback: Callable[[], None] | None) -> None:
+        """Call back when there is something to read; None: no more."""
+        self._watchers.pop(loop, None)
+        if callback is not None:
+            self._watchers[loop] = callback
+            if self.readable:
+                self.ready()
 
     def ready(self) -> None:
-        """Tell the watching loop."""
-        loop, callback = self.loop, self.callback
-        if loop is not None and callback is not None:
-            loop.io.append(lambda: self.callback() if self.callback is not None and self.loop is loop else None)
+        """Tell the watching loops."""
+        for loop in self._watchers:
+            loop.io.append(lambda loop=loop: self._watchers[loop]() if loop in self._watchers else None)
             loop.poke()
 
     @property
     def readable(self) -> bool:
         return False
 
-    def shut(self) -> None:
-        """Close: no descriptor is left."""
+    def left(self, process: Process | None, *, died: bool = True) -> None:
+        """Close one descriptor of a process."""
+        self.holders.remove(process)
+        if process is not None and process not in self.holders and process.loop is not None:
+            self._watchers.pop(process.loop, None)
+        if not self.holders:
+            self.shut(died=died)
+
+    def shut(self, *, died: bool) -> None:
+        """Close: no descriptor is left. died: with the process."""
 
 
 class SimSocket:
@@ -49,8 +62,7 @@ class SimSocket:
     def __init__(self, process: Process, thing: Described) -> None:
         self.process = process
         self.thing = thing
-        thing.references += 1
-        thing.process = process
+        thing.holders.append(process)
         self._number = process.descriptor(thing)
 
     @classmethod
@@ -58,7 +70,6 @@ class SimSocket:
         """Return the socket of a number, which belongs to it from now on."""
         self = cls.__new__(cls)
         self.process, self.thing, self._number = process, process.descriptors[number], number
-        self.thing.process = process
         return self
 
     def fileno(self) -> int:
@@ -87,43 +98,47 @@ class SimSocket:
     def close(self) -> None:
         """Close the descriptor; the last one closes the thing."""
         if self.process.descriptors.pop(self._number, None) is not None:
-            self.thing.references -= 1
-            if not self.thing.references:
-                self.thing.shut()
+            self.thing.left(self.process, died=False)
 
 
 class Stream(Described):
     """A connection."""
 
-    def __init__(self, process: Process, end: End) -> None:
-        super().__init__(process)
+    def __init__(self, end: End) -> None:
+        super().__init__()
         self.end = end
         self.address = end.address
         self.abortive = False
+        end.described = True
 
-    def shut(self) -> None:
+    def shut(self, *, died: bool) -> None:
         self.end.close(ConnectionResetError("reset by peer") if self.abortive or self.end.received else None)
+        if died:
+            self.end.broken = self.end.broken or ConnectionResetError()
 
 
 def StreamSocket(process: Process, end: End) -> SimSocket:  # noqa: N802 - makes one
     """Give a connection a descriptor."""
-    return SimSocket(process, Stream(process, end))
+    return SimSocket(process, Stream(end))
 
 
 class Listening(Described):
     """A port where connections are accepted, or wait."""
 
-    def __init__(self, process: Process, network: Network, address: tuple[str, int]) -> None:
-        super().__init__(process)
+    def __init__(self, network: Network, address: tuple[str, int]) -> None:
+        super().__init__()
         self.network = network
         self.address = address
         self.waiting: deque[End] = deque()
-        network.listeners[address] = (process, self.arrive)
-        process.on_death.append(self.shut)
+        network.listeners[address] = (self, self.arrive)
+
+    @property
+    def alive(self) -> bool:
+        """Whether a process has the port."""
+        return any(holder is not None for holder in self.holders)
 
     def arrive(self, end: End) -> bool:
-        self.network.listeners[self.address] = (self.process, self.arrive)
-        end.process = self.process
+        end.process, end.described = self.process, True
         self.waiting.append(end)
         self.ready()
         return True
@@ -132,7 +147,7 @@ class Listening(Described):
     def readable(self) -> bool:
         return bool(self.waiting)
 
-    def shut(self) -> None:
+    def shut(self, *, died: bool) -> None:
         self.network.listeners.pop(self.address, None)
         for end in self.waiting:
             end.close(ConnectionResetError("reset by peer"))
@@ -140,19 +155,18 @@ class Listening(Described):
 
 def ListeningSocket(process: Process, network: Network, address: tuple[str, int]) -> SimSocket:  # noqa: N802
     """Give a port a descriptor."""
-    return SimSocket(process, Listening(process, network, address))
+    return SimSocket(process, Listening(network, address))
 
 
 class Datagrams(Described):
     """A UDP port."""
 
-    def __init__(self, process: Process, network: Network, address: tuple[str, int]) -> None:
-        super().__init__(process)
+    def __init__(self, network: Network, address: tuple[str, int]) -> None:
+        super().__init__()
         self.network = network
         self.address = address
         self.waiting: deque[tuple[bytes, tuple[str, int]]] = deque(maxlen=256)
         network.datagram_sockets[address] = self.arrive
-        process.on_death.append(lambda: network.datagram_sockets.pop(address, None))
 
     def arrive(self, data: bytes, source: tuple[str, int]) -> None:
         self.waiting.append((data, source))
@@ -167,7 +181,7 @@ class Datagrams(Described):
     def readable(self) -> bool:
         return bool(self.waiting)
 
-    def shut(self) -> None:
+    def shut(self, *, died: bool) -> None:
         self.network.datagram_sockets.pop(self.address, None)
 
 
@@ -192,7 +206,7 @@ class SimKernel:
         port = port or self._network.port()
         if (host, port) in self._network.datagram_sockets:
             raise OSError(98, "Address already in use")
-        return SimSocket(self._process, Datagrams(self._process, self._network, (host, port)))
+        return SimSocket(self._process, Datagrams(self._network, (host, port)))
 
     def unacknowledged(self, sock: Any) -> int:
         return min(sock.thing.end.unacknowledged, SEND_BUFFER)
@@ -216,7 +230,7 @@ class SimServer:
 
     def close(self) -> None:
         for sock in self.sockets:
-            sock.thing.watch(None, None)
+            sock.thing.watch(self._loop, None)
             sock.close()
         self.sockets = []
 
@@ -236,6 +250,7 @@ class SimTransport:
         self._over: list[Exception | None] = []
         self._held_back = False
         end = self._end
+        end.process = loop.process
         end.on_data, end.on_close, end.on_ack = self._readable, self._ended, self._acknowledged
 
     @classmethod
@@ -337,8 +352,9 @@ class SimTransport:
         if self._lost:
             return
         self._lost = True
-        self._end.on_data = lambda: None
-        self._end.on_close = lambda error: None
-        self._end.on_ack = lambda: None
+        if self._end.on_data == self._readable:  # else another process has it
+            self._end.on_data = lambda: None
+            self._end.on_close = lambda error: None
+            self._end.on_ack = lambda: None
         self._sock.close()
         self._protocol.connection_lost(error)

@@ -7,7 +7,6 @@ import asyncio
 import pytest
 
 from zbridge.simulation.hq_program import LET_GO_S, NEUTRAL_S, HqProgram, run_hq_program
-from zbridge.simulation.judge import Judge
 
 pytestmark = pytest.mark.jumping
 
@@ -16,7 +15,7 @@ class Toy(HqProgram):
     """Is ready after 2 s, and notes what it is told."""
 
     def __init__(self, fails: OSError | None = None) -> None:
-        self.judge = Judge(keep=10, note=None)
+        super().__init__()
         self.told: list[tuple[float, str]] = []
         self.seen = "nothing"
         self._fails = fails
@@ -32,12 +31,12 @@ class Toy(HqProgram):
             raise self._fails
         await asyncio.sleep(2.0)
         self._ready = "connected"
-        self.judge._event("it reads no more")
+        self._event("it reads no more")
         await asyncio.sleep(8.0)
-        self.judge.alive, self.judge.death = False, "a bad packet"
+        self.alive, self.death = False, "a bad packet"
 
     @property
-    def ready(self) -> str:
+    def agreed(self) -> str:
         return self._ready
 
     def shown(self) -> str:

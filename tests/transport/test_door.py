@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
+from unittest.mock import Mock
 
 import pytest
 
 from tests.transport.recorder import LOCAL, Recorder, connected, until
 from zbridge.errors import ProtocolError
 from zbridge.transport import Door, Parcel, listen
+from zbridge.transport.kernel import KERNEL
 from zbridge.transport.tcp import take_over
 
 pytestmark = pytest.mark.both_loops
@@ -70,3 +73,20 @@ def test_a_descriptor_is_taken_once_and_the_rest_is_closed() -> None:
         parcel.close()
         parcel.close()
         taken.close()
+
+
+async def test_a_connection_that_ended_before_it_was_attached_is_closed_once() -> None:
+    adopted: list[socket.socket] = []
+
+    def adopt(descriptor: int) -> socket.socket:
+        adopted.append(socket.socket(fileno=descriptor))
+        return adopted[0]
+
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as peer:
+        connection, _ = server.accept()
+        peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closes with a reset
+    receiver = Recorder()
+    await take_over({"tcp": 0}, Parcel([connection.detach()]), receiver, Mock(wraps=KERNEL, adopt=adopt))
+    await receiver.until("lost")
+    await asyncio.sleep(0.01)
+    assert adopted[0].fileno() == -1, "its number may be that of another file by now"

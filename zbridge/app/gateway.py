@@ -21,7 +21,7 @@ import msgspec
 from zbridge.app.audit import open_audit
 from zbridge.app.config import Plan
 from zbridge.app.handover import ClaimPart, Incoming, Restarts, Successor
-from zbridge.app.joining import CertificateEnded, join_bus, watch_certificate
+from zbridge.app.joining import CertificateEnded, watch_certificate
 from zbridge.app.prometheus import serve_metrics
 from zbridge.app.runtime import RUNTIME, Runtime
 from zbridge.app.serving import SERVED_ELSEWHERE, Begin, Serving
@@ -91,9 +91,13 @@ class Gateway:
         self._observer = observer
         self._keys = KeySpace(plan.config.robot.realm, plan.config.robot.name)
         self._incoming = (
-            Incoming(predecessor, plan.setup, supervised=observer is not None) if predecessor is not None else None
+            Incoming(predecessor, plan.setup, supervised=observer is not None, processes=runtime.processes)
+            if predecessor is not None
+            else None
         )
-        self.restarts = Restarts(plan, self._keys, self._incoming, successor)
+        self.restarts = Restarts(
+            plan, self._keys, self._incoming, successor, runtime.clock, runtime.processes, runtime.kernel
+        )
         """What a successor would be handed, and how."""
         self.left = True
         """Whether the bus was closed in order; if not, one of its threads may hang."""
@@ -118,7 +122,7 @@ class Gateway:
         """
         with open_audit(self._plan, self.metrics, self.conditions) as audit:
             while True:
-                bus = await join_bus(self._plan, self.metrics)
+                bus = await self._runtime.join(self._plan, self.metrics)
                 try:
                     await self._run(bus, audit)
                     return
@@ -165,7 +169,7 @@ class Gateway:
                 stack.callback(self._show_sessions(bus, self._process).close)
             if metrics and self._plan.metrics is not None:
                 work.append(self._serve_metrics(self._plan.metrics))
-            await until(self.restarts.gone, together(*work))
+            await until(self.restarts.gone, together(*work, first=self.restarts.settle))
 
     async def _serve_metrics(self, address: Address) -> None:
         """Serve the counters, once a predecessor has let go."""
@@ -212,8 +216,11 @@ class Gateway:
     async def _robot(self, bus: Bus, audit: Audit, plan: DevicePlan) -> None:
         """Serve the robot whenever no other gateway does."""
         self.restarts.latches = store = LatchStore(self._keys, self.conditions, self._runtime.folder)
+        store.load()  # what it says is told to the gateway that serves the robot
         clock, chance = self._runtime.clock, self._runtime.chance
-        ownership = Ownership(bus, self._keys, clock, mirror=store.mirror, chance=chance)
+        ownership = Ownership(
+            bus, self._keys, clock, mirror=store.mirror, autonomous=lambda: store.autonomous, chance=chance
+        )
         incoming = self._incoming
         self.restarts.claim = ClaimPart(ownership)
         try:

@@ -16,9 +16,9 @@ from typing import Any
 
 from zbridge.bus import Handle
 from zbridge.control.conditions import Conditions
+from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held
-from zbridge.fleet.messages import Latch
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import Claim, Ownership, Standing
 
@@ -65,7 +65,7 @@ class Serving:
         self._filming: asyncio.Task[None] | None = None
         self._camera_failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._told_at = -math.inf
-        self._owners_latches: tuple[Latch, ...] = ()
+        self._owners_record = LatchRecord()
 
     def __repr__(self) -> str:
         return f"<Serving {self._device!r}>"
@@ -107,14 +107,19 @@ class Serving:
     def heard(self, claims: Mapping[str, Claim]) -> None:
         """Take the latched stops of other gateways, and report them."""
         if self._ownership.yielded:
-            owners = [claim.latches for claim in claims.values() if not claim.yielded]
-            self._owners_latches = owners[0] if owners else self._owners_latches
-            self._store.mirror(self._owners_latches)
+            owners = [claim.record for claim in claims.values() if not claim.yielded]
+            self._owners_record = owners[0] if owners else self._owners_record
+            self._store.mirror(self._owners_record)
             self._conditions.set(_RIVALS, None)
             return
         for claim in claims.values():
-            self._device.merge_latches(claim.latches)
+            self._device.merge(claim.record)
         self._report(claims)
+
+    def merge(self, record: LatchRecord) -> None:
+        """Take what a gateway knows that waits for this robot."""
+        if not self._ownership.yielded:
+            self._device.merge(record)
 
     async def step_aside(self) -> None:
         """Stop the robot, and leave it to the gateway with the better claim."""
@@ -123,7 +128,7 @@ class Serving:
 
     async def step_in(self) -> None:
         """Serve the robot again, with the latched stops of the gateway that served it meanwhile."""
-        self._device.merge_latches(self._owners_latches)
+        self._device.merge(self._owners_record)
         await self._device.step_in()
         self._open()
 

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import signal
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -44,8 +44,11 @@ class Background:
             log.error("%s", error, exc_info=error)
 
 
-async def together(*work: Coroutine[Any, Any, None]) -> None:
-    """Run coroutines until all have ended, or one fails: then cancel the others and raise its exception."""
+async def together(*work: Coroutine[Any, Any, None], first: Callable[[], Awaitable[None]] | None = None) -> None:
+    """Run coroutines until all have ended, or one fails: then cancel the others and raise its exception.
+
+    first: awaited before any of them is cancelled.
+    """
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
@@ -53,9 +56,13 @@ async def together(*work: Coroutine[Any, Any, None]) -> None:
             if task.done():
                 task.result()
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
+        try:
+            if first is not None:
+                await asyncio.shield(first())
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.shield(asyncio.gather(*tasks, return_exceptions=True))
 
 
 async def until(event: asyncio.Event, work: Coroutine[Any, Any, None]) -> None:

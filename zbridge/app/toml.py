@@ -23,6 +23,9 @@ FILE_BYTES = 1_000_000
 """Largest file that is read, unless a host allows more for its robot files."""
 _SHOWN = 200
 """Characters of a wrong value that an error shows."""
+_KEY_PARTS = 1000
+"""A longer dotted key is not read: the time that tomllib needs grows with the square of its parts."""
+_BETWEEN_KEYS = re.compile(rb"[,=\[\]{}#\r\n]")
 _PATH = re.compile(r" - at `\$(?:\.(?P<path>[^`]+)|(?P<index>\[[^`]+))?`$")
 
 
@@ -55,6 +58,8 @@ def read_toml(path: Path, most_bytes: int = FILE_BYTES) -> dict[str, Any]:
 
 def parse_toml(path: Path, content: bytes) -> dict[str, Any]:
     """Read the content of a TOML file; raise ConfigError, which names the file."""
+    if any(part.count(b".") >= _KEY_PARTS for part in _BETWEEN_KEYS.split(content)):
+        raise ConfigError(f"{path}: not TOML: nested too deeply")
     try:
         return tomllib.loads(content.decode("utf-8"))
     except ValueError as error:  # also of numbers with thousands of digits, and of bytes that are not UTF-8

@@ -33,7 +33,7 @@ from msgspec import UNSET
 
 from zbridge.control.command_age import MAX_AGE_S, CommandAge
 from zbridge.control.events import Event, EventKind, Input, Sender, State
-from zbridge.control.latch import STOPS, Latches, latch_of
+from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of
 from zbridge.control.proof import Holder, Holders, Verifier
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.control.wishes import capped, name_of
@@ -108,10 +108,11 @@ class Authority:
     # Questions about the lease. received_ms: the gateway's raw clock, for the age of what is dated.
 
     def acquire(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
-        """Grant the lease of a robot that is free or stopped, or held with a lower priority."""
+        """Grant the lease of a robot that is free or stopped, held with a lower priority, or by who asks again."""
         self.expire(now)
         outranks = self._holders.current is not None and request.priority > self._holders.current.priority
-        asked = Input.OUTRANK if outranks else Input.ACQUIRE
+        again = self._holders.current is not None and self._holders.current.asks_again(request)
+        asked = Input.OUTRANK if outranks else Input.AGAIN if again else Input.ACQUIRE
         return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now, received_ms)
 
     def takeover(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
@@ -218,11 +219,10 @@ class Authority:
         for latch in self.latches.adopt(answers):
             self._latch(latch)
 
-    def merge(self, latches: Iterable[Latch]) -> None:
-        """Take over the latched stops that another gateway of this robot knows."""
-        for latch in latches:
-            if self.latches.add(latch):
-                self._latch(latch)
+    def merge(self, record: LatchRecord) -> None:
+        """Take over what another gateway of this robot knows."""
+        for latch in self.latches.merge(record):
+            self._latch(latch)
 
     def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
         """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""
@@ -341,7 +341,9 @@ class Authority:
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
         age.late_s(request.t, received_ms)
         expires_at = now + lease_s
-        self._holders.current = Holder(who, request.priority, self.verifier, lease_s, request.alive, expires_at, age)
+        self._holders.current = Holder(
+            who, request.priority, self.verifier, lease_s, request.alive, expires_at, age, request.t
+        )
         self._held_back = None
         self._moved.clear()
         self._events.append(Event(kind, who, priority=request.priority))
@@ -436,6 +438,7 @@ class Authority:
     _HOLDER: ClassVar[Row] = {
         Input.ACQUIRE: (_deny, None),
         Input.OUTRANK: (_grant, State.HELD),
+        Input.AGAIN: (_grant, State.HELD),
         Input.TAKEOVER: (_grant, State.HELD),
         Input.RENEW: (_extend, None),
         Input.RELEASE: (_give_back, State.FREE),

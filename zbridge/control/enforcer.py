@@ -22,12 +22,12 @@ from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.events import Event, EventKind, Sender
 from zbridge.control.gate import CommandGate, Sieve
-from zbridge.control.latch import Latches, read_stop
+from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Latch, Mode, Motor, Raw
+from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
@@ -81,6 +81,7 @@ class Enforcer:
         self._same_stops = context.metrics.count("stops_folded")
         self._slowed = context.metrics.count("drives_slowed")
         self._stale = context.metrics.count("commands_stale")
+        self._remind()
 
     def __repr__(self) -> str:
         return f"<Enforcer {self._context.keys.robot} {self.authority!r}>"
@@ -159,10 +160,26 @@ class Enforcer:
         self.authority.adopt(answers)
         self.settle()
 
-    def merge(self, latches: Iterable[Latch]) -> None:
-        """Take over the latched stops that another gateway of this robot knows."""
-        self.authority.merge(latches)
+    def merge(self, record: LatchRecord) -> None:
+        """Take over what another gateway of this robot knows; a robot that may move by itself is stopped."""
+        known = self.authority.latches.autonomous
+        self.authority.merge(record)
         self.settle()
+        if self.authority.latches.autonomous and not known:
+            self._remind()
+            self._keep_latches()
+            if not self.authority.driven:
+                self._send_stop()
+
+    def restore(self, latches: Latches) -> None:
+        """Take over what was written down, before the robot is served; raise ProtocolError."""
+        self.authority.restore_latches(latches.export())
+        self._remind()
+
+    def write_autonomous(self) -> asyncio.Future[None] | None:
+        """Write down that the robot is told to move by itself; return what ends when that is done, None where it is."""
+        self.authority.latches.autonomous = True
+        return self._keep(self.authority.latches)
 
     def hold_back(self, reason: str, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
@@ -257,6 +274,14 @@ class Enforcer:
         if not self._keeping:
             self.authority.latches_kept()
             self.report()
+
+    def _remind(self) -> None:
+        """Let the robot's stops end its own motion too, where a gateway before may have chosen that."""
+        if self.authority.latches.autonomous:
+            try:
+                self._context.robot.was_autonomous()
+            except Exception as error:
+                self._context.faults.note("was_autonomous", error)
 
     def _send_stop(self) -> None:
         session = self._context.robot.driving

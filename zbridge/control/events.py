@@ -25,6 +25,7 @@ class Input(StrEnum):
 
     ACQUIRE = "acquire"
     OUTRANK = "acquire with a higher priority"
+    AGAIN = "acquire asked again"
     TAKEOVER = "takeover"
     RENEW = "renew"
     RELEASE = "release"

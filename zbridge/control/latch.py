@@ -6,6 +6,9 @@ in which order a partitioned network delivers latches and releases, or how often
 of each robot: a gateway that was away learns of it from the others (:meth:`Latches.adopt`), unless one of them knows
 that it was released.
 
+Beside them stands whether the robot was ever told to move by itself (:attr:`Latches.autonomous`): whichever gateway
+comes next must stop such a robot in a way that ends that too. Nothing resets it: no robot confirms that it stopped.
+
 Bounds: :data:`LATCHES` ids are in force; one more replaces the last, and the robot stays latched. The last
 :data:`RELEASED` released ids of each kind are remembered.
 Source: the design's "Latched stop".
@@ -14,7 +17,7 @@ Source: the design's "Latched stop".
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import msgspec
 
@@ -34,11 +37,15 @@ WHO, REASON = 64, 128
 
 
 class LatchRecord(msgspec.Struct, frozen=True):
-    """What is kept over a restart: the latched stops in force, and the released ids."""
+    """What is kept over a restart: the latched stops in force, and the released ids.
+
+    autonomous: whether the robot was ever told to move by itself.
+    """
 
     latches: tuple[Latch, ...] = ()
     released: tuple[StopId, ...] = ()
     released_fleet: tuple[StopId, ...] = ()
+    autonomous: bool = False
 
 
 def read_stop(payload: bytes) -> Stop:
@@ -67,6 +74,8 @@ class Latches:
         self._in_force = {latch.id: latch for latch in record.latches[:LATCHES]}
         self._released = deque(record.released, maxlen=RELEASED)
         self._released_fleet = deque(record.released_fleet, maxlen=RELEASED)
+        self.autonomous = record.autonomous
+        """Whether the robot was ever told to move by itself, by this gateway or one before."""
 
     def __bool__(self) -> bool:
         return bool(self._in_force)
@@ -92,7 +101,7 @@ class Latches:
     @property
     def record(self) -> LatchRecord:
         """What must survive a restart."""
-        return LatchRecord(self.in_force, tuple(self._released), tuple(self._released_fleet))
+        return LatchRecord(self.in_force, tuple(self._released), tuple(self._released_fleet), self.autonomous)
 
     @property
     def described(self) -> str:
@@ -154,11 +163,12 @@ class Latches:
             known.extend(stop_id for stop_id in released if stop_id not in known)
             for stop_id in released:
                 self._in_force.pop(stop_id, None)
-        self.merge(record.latches)
+        self.merge(record)
 
-    def merge(self, latches: Sequence[Latch]) -> bool:
-        """Let the latches of another gateway of this robot come into force; return whether anything changed."""
-        return sum(self.add(latch) for latch in latches) > 0
+    def merge(self, record: LatchRecord) -> tuple[Latch, ...]:
+        """Take over what another gateway of this robot knows to be in force; return the latches that are new."""
+        self.autonomous = self.autonomous or record.autonomous
+        return tuple(latch for latch in record.latches if self.add(latch))
 
 
 _PLAIN = Stop()

@@ -1,5 +1,7 @@
 """Keeps the latched stops of one robot on disk: a gateway that starts reads them before it serves its robot.
 
+With them it keeps whether the robot was ever told to move by itself (:attr:`Latches.autonomous`).
+
 A gateway that owns its robot writes ``<realm>@<robot>.latches``. One that waits for another gateway writes what that
 one says to ``<realm>@<robot>.standby.latches``: both may run on one machine, and neither may overwrite what the other
 knows. A file that cannot be read means latched: nobody knows what stood in it.
@@ -13,7 +15,7 @@ import contextlib
 import logging
 import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
@@ -68,7 +70,7 @@ class LatchStore:
         standby = self._read(self._standby)
         if standby is not None:
             self._written[self._standby] = standby
-            latches.merge(standby.latches)
+            latches.merge(standby)
         return latches
 
     def save(self, latches: Latches) -> asyncio.Future[None] | None:
@@ -81,9 +83,15 @@ class LatchStore:
             self._put(self._standby, LatchRecord())
         return self._writing
 
-    def mirror(self, latches: Sequence[Latch]) -> None:
+    @property
+    def autonomous(self) -> bool:
+        """Whether any file says that the robot was told to move by itself; after :meth:`load`."""
+        return any(record.autonomous for record in self._written.values())
+
+    def mirror(self, record: LatchRecord) -> None:
         """Write what the gateway that owns the robot says, on a thread."""
-        self._put(self._standby, LatchRecord(tuple(latches)))
+        autonomous = record.autonomous or self._written.get(self._standby, LatchRecord()).autonomous
+        self._put(self._standby, LatchRecord(record.latches, autonomous=autonomous))
 
     async def flush(self) -> None:
         """Wait until everything is written, or could not be, for at most :data:`FLUSH_S`."""

@@ -24,7 +24,7 @@ from msgspec import UNSET, UnsetType
 
 from zbridge.control.command_age import CommandAge
 from zbridge.errors import Code, Held, LeaseLost, Malformed, PayloadError
-from zbridge.fleet.messages import Authorization, Lease
+from zbridge.fleet.messages import Acquire, Authorization, Lease
 
 LEASE_BYTES = 8
 TOKEN_BYTES = 32
@@ -112,7 +112,7 @@ class Verifier:
 
 
 class Holder(msgspec.Struct):
-    """A program that has the lease, or had it. ``ended``: why its lease ended."""
+    """A program that has the lease, or had it. asked_ms: its raw clock when it asked. ended: why its lease ended."""
 
     who: str
     priority: int
@@ -121,6 +121,7 @@ class Holder(msgspec.Struct):
     alive: str | None
     expires_at: float
     age: CommandAge
+    asked_ms: int | UnsetType = UNSET
     numbers: dict[str, int] = msgspec.field(default_factory=dict)
     """The highest number used, of commands and of questions."""
     ended: str | None = None
@@ -131,6 +132,16 @@ class Holder(msgspec.Struct):
             return self.age.late_s(shown.t, received_ms)
         except Malformed as error:
             raise Malformed(str(error), who=self.who) from None
+
+    def asks_again(self, request: Acquire) -> bool:
+        """Return whether the holder repeats its own question because the grant did not reach it.
+
+        That is a later question of the same name and liveliness token, while the lease was not used. A question that
+        was held up on the way is an earlier one: it must not end the lease that was granted to a later one.
+        """
+        unused = not self.numbers and self.alive is not None and self.asked_ms is not UNSET
+        same = (request.who, request.alive) == (self.who, self.alive)
+        return unused and same and request.t is not UNSET and request.t > self.asked_ms  # type: ignore[operator]
 
     @property
     def described(self) -> str:

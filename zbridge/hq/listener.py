@@ -118,7 +118,9 @@ class Listener:
             try:
                 await self._attend()
             finally:
-                if not self.handover.released.is_set():
+                if self.handover.released.is_set():
+                    self._refusals.close()
+                else:
                     await asyncio.shield(self._leave())
 
     def _make_context(self, plan: ListenerPlan, robot: RobotSubscription, metrics: Metrics) -> ListenerContext:

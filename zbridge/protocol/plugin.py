@@ -80,6 +80,13 @@ class Robot(Kept, ABC):
     def stop(self, now: float, until: float) -> None:
         """Send the robot its stop before anything else, and repeat it until ``until``; once if ``until`` is ``now``."""
 
+    def was_autonomous(self) -> None:
+        """Note that the robot was told to move by itself, perhaps by another gateway: every stop must end that too.
+
+        Called once that is known, before the first session too. Override where a stop alone does not end it.
+        """
+        return
+
     @property
     def idle_stop_s(self) -> float:
         """Most seconds between two stops while nobody drives; ``inf``: as many as the configuration says."""

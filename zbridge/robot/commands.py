@@ -5,12 +5,15 @@ A command that is refused is counted and shown on ``control``; none is dropped s
 
 from __future__ import annotations
 
+import msgspec
+
 from zbridge.bus import Sample
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.events import Sender
 from zbridge.control.gate import OF_THE_HOLDER, is_stop
-from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported
+from zbridge.control.proof import Verifier
+from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
@@ -21,6 +24,18 @@ from zbridge.protocol.session import Session, State
 LINK_BLOCKED = "the robot's link takes nothing"
 _MOTIONS = (Drive, Motor)
 _ESTABLISHED = State.ESTABLISHED
+WRITE_S = 0.4
+"""Longest time that mode autonomous waits until it is written down, seconds."""
+
+
+class _Awaiting(msgspec.Struct, frozen=True):
+    """Mode autonomous on its way to the disk. verifier: of the lease then. since: seconds."""
+
+    topic: Topic
+    command: FleetMessage
+    sender: Sender
+    verifier: Verifier | None
+    since: float
 
 
 class Commands:
@@ -34,6 +49,8 @@ class Commands:
         self._clock = context.clock
         self._pump = context.pump
         self._closing: str | None = None
+        self._awaiting: _Awaiting | None = None
+        """A mode that is carried out once it is written down."""
         self.blocked = False
         """Whether the robot's link takes nothing: drives are not written, all other commands are refused."""
         self._topics = {context.keys.key(topics.CMD_DRIVE.path): topics.CMD_DRIVE}
@@ -60,9 +77,7 @@ class Commands:
                 sender = self._enforcer.admit(sample, now)
             self._carry_out(topic, sample.payload, now, sender)
         except (Refused, PayloadError, EncodeError) as error:
-            refused = error if isinstance(error, Refused) else Malformed(str(error))
-            who = refused.who or (sender.who if sender is not None else None)
-            self._enforcer.refuse(sample.key.rpartition("@cmd/")[2], refused, who)
+            self._refuse(sample.key.rpartition("@cmd/")[2], error, sender)
         self._enforcer.settle()
 
     def require_ready(self) -> Session[object]:
@@ -81,7 +96,11 @@ class Commands:
 
     def refuse_all(self, reason: str | None) -> None:
         """Take nothing but stops from now on; None: take commands again."""
-        self._closing = reason
+        self._closing, self._awaiting = reason, None
+
+    def _refuse(self, command: str, error: ZbridgeError, sender: Sender | None) -> None:
+        refused = error if isinstance(error, Refused) else Malformed(str(error))
+        self._enforcer.refuse(command, refused, refused.who or (sender.who if sender is not None else None))
 
     def _find(self, key: str) -> Topic:
         if not topics.is_concrete(key):
@@ -98,12 +117,42 @@ class Commands:
         if sender is not None and isinstance(command, _MOTIONS):
             self._move(topic, command, now, sender)
             return
+        if sender is not None:
+            self._awaiting = None
+        self._require_allowed(command, sender)
+        if sender is not None and _is_autonomous(command):
+            writing = self._enforcer.write_autonomous()
+            if writing is not None:
+                waiting = self._awaiting = _Awaiting(topic, command, sender, self._enforcer.authority.verifier, now)
+                writing.add_done_callback(lambda _: self._on_written(waiting))
+                return
+        self._command(topic, command, now, sender)
+
+    def _on_written(self, waiting: _Awaiting) -> None:
+        """Carry out a mode that is written down now, or could not be; unless a newer command or a stop came."""
+        self._enforcer.keep_time()
+        if waiting is not self._awaiting or waiting.verifier is not self._enforcer.authority.verifier:
+            return
+        self._awaiting, now = None, self._clock()
+        try:
+            if now - waiting.since > WRITE_S:
+                raise NotReady(f"the disk took {now - waiting.since:.1f} s to write that the robot moves by itself")
+            self._require_allowed(waiting.command, waiting.sender)
+            self._command(waiting.topic, waiting.command, now, waiting.sender)
+        except (Refused, PayloadError, EncodeError) as error:
+            self._refuse(waiting.topic.path.removeprefix("@cmd/"), error, waiting.sender)
+        self._enforcer.settle()
+
+    def _require_allowed(self, command: FleetMessage, sender: Sender | None) -> None:
+        """Raise Refused where a command that is no drive must not reach the robot now."""
         session = self.require_ready()
         self.require_flowing()
         if sender is not None and (isinstance(command, Raw) or _is_autonomous(command)):
             self._enforcer.require_fresh(sender)
             _require_sure(session)
             self._enforcer.require_motion()
+
+    def _command(self, topic: Topic, command: FleetMessage, now: float, sender: Sender | None) -> None:
         self._show(topic, self._tell(topic, command, now), sender)
         self._enforcer.commanded(command)
         self._pump()
@@ -113,6 +162,8 @@ class Commands:
         moving = command.moving
         if moving:
             self._enforcer.require_fresh(sender)
+        else:
+            self._awaiting = None
         try:
             session = self.require_ready()
             if moving:

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import random
 import time
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -24,12 +24,11 @@ from zbridge.control.conditions import Conditions
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer, Keep
 from zbridge.control.faults import Faults
-from zbridge.control.latch import Latches
+from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
-from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
@@ -181,7 +180,7 @@ class Device:
         """Serve the robot until cancelled; then stop it if it moves, and take leave of it.
 
         Returns where :meth:`release` was called. ``begin``: after :meth:`take_over`, waited for once everything is
-        declared; until then nothing is read, written or published.
+        declared; until then nothing is read or written, and only ``control`` is published, which confirms stops.
         """
         if begin is None:
             self._show()
@@ -289,7 +288,7 @@ class Device:
         while True:
             await asyncio.sleep(HEARTBEAT_S)
             self._publishers.expire()
-            if not self._aside:
+            if self._commanded:  # else another gateway, or the next process, says it
                 self._presence.publish_status()
                 self._enforcer.beat()
 
@@ -299,21 +298,21 @@ class Device:
     def standing(self) -> Standing:
         """How this gateway stands with the robot."""
         session, talk = self._context.robot.driving, self._links.first.conversation
-        latches = self._enforcer.authority.latches.in_force
+        latches = self._enforcer.authority.latches
         if talk is None or session is None:
-            return Standing(latches=latches)
+            return Standing(latches=latches.in_force, autonomous=latches.autonomous)
         established = session.state is State.ESTABLISHED and session.doubtful is None
         healthy = established and not talk.stalled and talk.unheard_s <= HEARD_S
-        return Standing(healthy, talk.connected_s, latches)
+        return Standing(healthy, talk.connected_s, latches.in_force, latches.autonomous)
 
     @property
     def must_stay(self) -> bool:
         """Whether there is a connection that must not be closed while another gateway has one."""
         return not self._context.robot.closing_harmless and any(connection.is_up for connection in self._links)
 
-    def merge_latches(self, latches: Iterable[Latch]) -> None:
-        """Take over the latched stops that another gateway of this robot knows."""
-        self._enforcer.merge(latches)
+    def merge(self, record: LatchRecord) -> None:
+        """Take over what another gateway of this robot knows: latched stops, and whether the robot moves by itself."""
+        self._enforcer.merge(record)
 
     async def step_aside(self) -> None:
         """Stop the robot once, and leave it to another gateway: only what keeps the connections alive is written.
@@ -446,7 +445,7 @@ class Device:
 
     def restore_latches(self, latches: Latches) -> None:
         """Take over latched stops that were written down, before the robot is served."""
-        self._enforcer.authority.restore_latches(latches.export())
+        self._enforcer.restore(latches)
 
     async def go_on(self) -> None:
         """Read, write and take commands: again, or for the first time with what was taken over."""

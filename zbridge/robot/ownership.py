@@ -39,6 +39,7 @@ from typing import ClassVar, Protocol
 import msgspec
 
 from zbridge.bus import Bus, Handle, IncomingQuery
+from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
@@ -77,18 +78,20 @@ class Standing(msgspec.Struct, frozen=True):
     """How a gateway stands with its robot.
 
     healthy: the robot is established, not in doubt, and was heard of a moment ago. connected_s: age of the connection,
-    0 where there is none. latches: the robot's latched stops.
+    0 where there is none. latches: the robot's latched stops. autonomous: it was told to move by itself.
     """
 
     healthy: bool = False
     connected_s: float = 0.0
     latches: tuple[Latch, ...] = ()
+    autonomous: bool = False
 
 
 class Claim(msgspec.Struct, frozen=True):
     """What a gateway claims. held_s: seconds since the robot is served, 0 while it is not.
 
-    healthy, connected_s, latches: its :class:`Standing`. yielded: to a better claim. leaving: it ends in good order.
+    healthy, connected_s, latches, autonomous: its :class:`Standing`. yielded: to a better claim. leaving: it ends in
+    good order.
     """
 
     held_s: float = 0.0
@@ -97,6 +100,12 @@ class Claim(msgspec.Struct, frozen=True):
     yielded: bool = False
     leaving: bool = False
     latches: tuple[Latch, ...] = ()
+    autonomous: bool = False
+
+    @property
+    def record(self) -> LatchRecord:
+        """What other gateways of the robot write down."""
+        return LatchRecord(self.latches, autonomous=self.autonomous)
 
     @property
     def plausible(self) -> bool:
@@ -121,10 +130,14 @@ class Claim(msgspec.Struct, frozen=True):
 
 
 class _Question(msgspec.Struct, frozen=True):
-    """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too."""
+    """A question for claims. zid: who asks, so that a gateway knows its own question; serves: whether it owns too.
+
+    autonomous: who asks knows that the robot was told to move by itself.
+    """
 
     zid: str = ""
     serves: bool = False
+    autonomous: bool = False
 
 
 _read = msgspec.msgpack.Decoder(Claim).decode
@@ -145,6 +158,9 @@ class Served(Protocol):
 
     def heard(self, claims: Mapping[str, Claim]) -> None:
         """Take what other gateways that serve the robot claim, by their session ids; after every look."""
+
+    def merge(self, record: LatchRecord) -> None:
+        """Take what a gateway knows that does not serve the robot."""
 
     async def step_aside(self) -> None:
         """Leave the robot to another gateway, and stay connected."""
@@ -177,7 +193,8 @@ class Input(StrEnum):
 class Ownership:
     """The right to be a robot's gateway, from :meth:`take` to :meth:`release` or the end of :meth:`watch`.
 
-    mirror: is told the latched stops of the gateway that owns the robot while this one does not. chance: 0 to 1.
+    mirror: is told the latched stops of the gateway that owns the robot while this one does not. autonomous: whether
+    this gateway knows that the robot was told to move by itself. chance: 0 to 1.
     """
 
     def __init__(
@@ -186,13 +203,15 @@ class Ownership:
         keys: KeySpace,
         clock: Callable[[], float] = time.monotonic,
         *,
-        mirror: Callable[[tuple[Latch, ...]], object] = lambda latches: None,
+        mirror: Callable[[LatchRecord], object] = lambda record: None,
+        autonomous: Callable[[], bool] = lambda: False,
         chance: Callable[[], float] = random.random,
     ) -> None:
         self._bus = bus
         self._keys = keys
         self._clock = clock
         self._mirror = mirror
+        self._autonomous = autonomous
         self._chance = chance
         self._state = State.LOOKING
         self._looks = 1
@@ -202,6 +221,7 @@ class Ownership:
         self._held_since: float | None = None
         self._leaving = False
         self._standing: Callable[[], Standing] = Standing
+        self._merge: Callable[[LatchRecord], object] = lambda record: None
         self._connected = asyncio.Event()
         self._was_connected = False
         self._came = asyncio.Event()
@@ -246,7 +266,7 @@ class Ownership:
 
     async def watch(self, served: Served) -> None:
         """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
-        self._standing = lambda: served.standing
+        self._standing, self._merge = lambda: served.standing, served.merge
         if self._state is State.YIELDED:
             await served.step_aside()
         self._untold = LOOKS
@@ -365,6 +385,7 @@ class Ownership:
     def _withdraw(self) -> None:
         handles, self._claimed, self._shown = self._claimed + self._shown, [], []
         self._held_since, self._standing, self._looks = None, Standing, LOOKS
+        self._merge = lambda record: None
         for handle in handles:
             handle.close()
 
@@ -405,7 +426,7 @@ class Ownership:
         claims = await self._claims() if token else {}
         serving = [claim for claim in claims.values() if claim.held_s]
         if serving:
-            self._mirror(serving[0].latches)
+            self._mirror(serving[0].record)
         return others.seen(token, bool(claims), leaving=any(claim.leaving for claim in serving))
 
     def _better(self, own: Claim, claims: Mapping[str, Claim]) -> bool:
@@ -416,7 +437,7 @@ class Ownership:
         """Ask for the claims of others; return the best by session id, the best first. Implausible ones are ignored."""
         claims: list[tuple[Claim, str]] = []
         heard = {self._bus.zid}
-        question = _write(_Question(self._bus.zid, self._held_since is not None))
+        question = _write(_Question(self._bus.zid, self._held_since is not None, self._autonomous()))
         for answer in await self._bus.ask(self._keys.key(CLAIM), question, timeout_s=ASK_S):
             if answer.replier is None or answer.replier in heard:
                 continue
@@ -441,6 +462,7 @@ class Ownership:
             yielded=self._state is State.YIELDED or self._waits,
             leaving=self._leaving,
             latches=standing.latches,
+            autonomous=standing.autonomous,
         )
 
     def _on_question(self, question: IncomingQuery) -> None:
@@ -449,6 +471,8 @@ class Ownership:
             if asker.serves and asker.zid != self._bus.zid:
                 self._asked.set()
                 self._was_asked = True
+            if asker.autonomous and asker.zid != self._bus.zid:
+                self._merge(LatchRecord(autonomous=True))
         question.answer(_write(self._claim()))
 
     TABLE: ClassVar[dict[State, dict[Input, tuple[Callable[[Ownership], None], State]]]] = {

@@ -1,4 +1,4 @@
-"""What fragile robots share: a server that serves one connection. And what the command line prints of any judge.
+"""The scaffold of judges with a connection: their tasks, what they write and read, and a robot that listens.
 
 Shares no code with the gateway's transport. Knows no protocol.
 """
@@ -7,34 +7,134 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import enum
 import logging
 import socket
 import sys
 from abc import abstractmethod
 from collections.abc import Callable, Coroutine, Iterable
-from typing import Any
+from typing import Any, Unpack
 
-from zbridge.simulation.judge import Ended, Judge
+from zbridge.simulation.judge import Bounds, Ended, Judge, MessageReader
 from zbridge.simulation.sockets import bind_tcp, send_at_once
 
 _UNANSWERED = 16
 Work = Coroutine[Any, Any, None]
+_log = logging.getLogger(__name__)
 
 
-class FragileServer(Judge):
-    """A robot that serves one connection per start; it accepts every later one and never answers it.
+class FragilePeer(Judge):
+    """A judge at one end of a connection. Its tasks end together: one raises Ended, or somebody cancels them all.
 
-    A protocol contributes :meth:`_begin`, :meth:`_phase_name` and :meth:`_work`, and ends its tasks by raising Ended.
+    A protocol contributes :meth:`_work` and :meth:`_before_close`; where it reads a stream of messages, whatever the
+    reads, also ``_reader``, :meth:`_receive` and :meth:`_judge_end`.
     """
 
-    def __init__(self, *, keep: int, note: Callable[[str], None] | None) -> None:
-        super().__init__(keep=keep, note=note)
+    _phase: enum.Enum
+    _reader: MessageReader[Any]
+
+    def __init__(self, **bounds: Unpack[Bounds]) -> None:
+        super().__init__(**bounds)
         self.ending = ""
         """Why it ended by itself, "" if it did not."""
         self._over = asyncio.Event()
         """Set once the conversation is over."""
+        self._conn: socket.socket | None = None
+        self._broken = ""
+        """The error that a write met: the kernel reports it once, and a later read sees a mere end."""
+        self._sending, self._midway = asyncio.Lock(), False
         self._tasks: asyncio.TaskGroup | None = None
         self._running: list[asyncio.Task[None]] = []
+
+    def __repr__(self) -> str:
+        state = f"{self._phase_name()} violations={len(self.violations)} alive={self.alive}"
+        return f"<{type(self).__name__} {state}>"
+
+    def _phase_name(self) -> str:
+        return self._phase.name
+
+    def _work(self) -> Iterable[Work]:
+        """Give the tasks to start with."""
+        return ()
+
+    def _before_close(self) -> None:
+        """Send what is last, while the sockets are open; must not block."""
+
+    async def _run(self, *work: Work) -> None:
+        """Run these tasks, and those of :meth:`_work`, until they end."""
+        try:
+            async with asyncio.TaskGroup() as self._tasks:
+                for one in (*work, *self._work()):
+                    self._start(one)
+        except* Ended as ended:
+            self.ending = str(ended.exceptions[0])
+            if self.ending:
+                self._event(self.ending)
+        finally:
+            self._before_close()
+
+    def _start(self, work: Work) -> None:
+        """Run one more task that ends with the others."""
+        assert self._tasks is not None
+        self._running.append(self._tasks.create_task(work))
+
+    def _stop(self) -> None:
+        """End all tasks."""
+        for task in self._running:
+            task.cancel()
+
+    # The connection
+
+    @property
+    def _tcp(self) -> socket.socket:
+        assert self._conn is not None
+        return self._conn
+
+    async def _write(self, data: bytes, most_s: float | None = None) -> None:
+        """Write a message whole, unless the connection is broken; raise TimeoutError after ``most_s``."""
+        if self._broken:
+            return
+        self._midway = True
+        try:
+            async with asyncio.timeout(most_s):
+                await asyncio.get_running_loop().sock_sendall(self._tcp, data)
+        except TimeoutError:
+            raise
+        except OSError as error:
+            self._broken = repr(error)
+        else:
+            self._midway = False
+
+    def _write_now(self, data: bytes) -> None:
+        """Write a message that is too short to be sent in part, without waiting; between two others."""
+        with contextlib.suppress(OSError):
+            self._tcp.send(data)
+
+    def _take(self, data: bytes, end: str) -> None:
+        """Judge the messages that end in ``data``, and the end of the connection ("" while it is open)."""
+        for message in self._reader.take(data):
+            self._receive(message)
+        if end:
+            self._judge_end(self._broken or end)
+
+    def _receive(self, message: Any) -> None:
+        """Judge a message of the peer, and obey it."""
+
+    def _judge_end(self, end: str) -> None:
+        """Judge how the connection ended, and leave it."""
+
+    def _shut(self, how: int = socket.SHUT_RDWR) -> None:
+        """End both directions of the connection, or one; its socket is closed later: a write may be waiting for it."""
+        if self._conn is not None:
+            with contextlib.suppress(OSError):
+                self._conn.shutdown(how)
+
+
+class FragileServer(FragilePeer):
+    """A robot that serves one connection per start; it accepts every later one and never answers it.
+
+    A protocol also contributes :meth:`_begin`, and :meth:`_free` where it serves more.
+    """
 
     async def serve(self, host: str, port: int, ready: Callable[[int], None]) -> None:
         """Serve on ``port`` (0: any; ``ready`` is called with it) until dead, ended or cancelled."""
@@ -42,53 +142,20 @@ class FragileServer(Judge):
             with contextlib.ExitStack() as sockets:
                 server = self._bind(host, port, sockets)
                 ready(server.getsockname()[1])
-                try:
-                    async with asyncio.TaskGroup() as self._tasks:
-                        for work in (self._accept(server, sockets), *self._work()):
-                            self._start(work)
-                except* Ended as ended:
-                    self.ending = str(ended.exceptions[0])
-                    self._event(self.ending)
-                finally:
-                    self._before_close()
+                await self._run(self._accept(server, sockets))
         finally:
             self._over.set()
-
-    # What a protocol contributes
 
     @abstractmethod
     def _begin(self, conn: socket.socket) -> None:
         """Begin to serve a connection."""
 
-    @abstractmethod
-    def _phase_name(self) -> str:
-        """Name what the robot does now, for a sentence."""
-
     def _free(self) -> bool:
         """True if the next connection is to be served."""
         return False
 
-    def _work(self) -> Iterable[Work]:
-        """Give what runs besides, whoever is connected."""
-        return ()
-
-    def _before_close(self) -> None:
-        """Send what is last, while the sockets are open; must not block."""
-
-    # What a protocol calls
-
     def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:
         return sockets.enter_context(bind_tcp(host, port))
-
-    def _start(self, work: Work) -> None:
-        """Run a task that ends with the robot."""
-        assert self._tasks is not None
-        self._running.append(self._tasks.create_task(work))
-
-    def _stop(self) -> None:
-        """End all tasks, and so :meth:`serve`."""
-        for task in self._running:
-            task.cancel()
 
     async def _accept(self, server: socket.socket, sockets: contextlib.ExitStack) -> None:
         """Serve the first connection, and those that :meth:`_free` admits; accept all others and say nothing."""
@@ -99,25 +166,26 @@ class FragileServer(Judge):
             sockets.enter_context(conn)
             if first or self._free():
                 send_at_once(conn)
+                self._conn, first = conn, False
                 self._begin(conn)
-                first = False
                 continue
-            self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase_name()}")
+            self._event(f"second connection, from {peer[0]}:{peer[1]}, while {self._phase_name().lower()}")
             unanswered.append(conn)
             for old in unanswered[:-_UNANSWERED]:
                 old.close()
             del unanswered[:-_UNANSWERED]
 
 
-def log_violations(log: logging.Logger, name: str = "") -> Callable[[str], None]:
+async def simulate(robot: FragileServer, host: str, port: int, ready: Callable[[int], None]) -> None:
+    """Run a robot until cancelled, dead or left; print why it ended."""
+    await robot.serve(host, port, ready)
+    if robot.ending:
+        print_line(robot.ending)
+
+
+def log_violations(name: str = "") -> Callable[[str], None]:
     """Make the ``note`` of a judge: it logs each violation, with the judge's name if there are several."""
-    return lambda text: log.error("violation%s: %s", name and f", {name}", text)
-
-
-def print_death(judge: Judge) -> None:
-    """Print what a judge died of, if it did."""
-    if not judge.alive:
-        print_line(f"died: {judge.death}")
+    return lambda text: _log.error("violation%s: %s", name and f", {name}", text)
 
 
 def print_line(line: str) -> None:

@@ -1,40 +1,66 @@
-"""An HQ program to play with: prints what it does and what it is shown, and pushes its stick if it is told to.
+"""The scaffold of judges that connect, and one of them to play with: an HQ program, in a person's hands or in a test's.
 
-Shares no code with the gateway. Knows no protocol: a protocol contributes a :class:`HqProgram`.
+Shares no code with the gateway. Knows no protocol.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from abc import ABC, abstractmethod
-from collections.abc import Coroutine
-from typing import Any
+from abc import abstractmethod
+from collections.abc import Iterable
+from typing import ClassVar, Unpack
 
-from zbridge.simulation.fragile import print_death, print_line
-from zbridge.simulation.judge import Judge
+from zbridge.simulation.fragile import FragilePeer, print_line
+from zbridge.simulation.judge import Bounds
+from zbridge.simulation.sockets import connected
 
 NEUTRAL_S = 1.0
-"""Seconds of neutral before motion: whoever connects must centre the stick first."""
+"""Seconds of neutral before motion: a program must centre the stick before it drives."""
 LET_GO_S = 0.3
 """Seconds from the last neutral to the end of the connection."""
 SHOWN_S = 1.0
 """Seconds between two lines of what it is shown, where that changes."""
 _LOOK_S = 0.05
+_READ_BYTES = 65536
 
 
-class HqProgram(ABC):
-    """One HQ program in a person's hands. judge: records what the robot does wrong."""
+class HqProgram(FragilePeer):
+    """A judge that connects: an HQ program, for one connection.
 
-    judge: Judge
+    A protocol also contributes what a person sees and does: :attr:`agreed`, :meth:`shown`, :meth:`neutral`,
+    :meth:`push`.
+    """
 
-    @abstractmethod
-    def run(self, host: str, port: int) -> Coroutine[Any, Any, None]:
+    OPTIONS: ClassVar[Iterable[tuple[int, int, int]]] = ()
+    """Options of its socket."""
+
+    def __init__(self, **bounds: Unpack[Bounds]) -> None:
+        super().__init__(**bounds)
+        self.connected = asyncio.Event()
+
+    async def run(self, host: str, port: int) -> None:
         """Connect, and serve until cancelled, dead, or the robot closes; raise OSError if nobody listens."""
+        try:
+            async with connected(host, port, self.OPTIONS) as self._conn:
+                self.connected.set()
+                await self._run()
+        finally:
+            self._conn = None
+            self._over.set()
+
+    async def _read(self) -> None:
+        """Read once and judge it, or the end of the connection."""
+        data, end = b"", "EOF"
+        try:
+            data = await asyncio.get_running_loop().sock_recv(self._tcp, _READ_BYTES)
+        except OSError as error:
+            end = repr(error)
+        self._take(data, "" if data else end)
 
     @property
     @abstractmethod
-    def ready(self) -> str:
+    def agreed(self) -> str:
         """Say what was agreed, once the program can drive; until then an empty text."""
 
     @abstractmethod
@@ -65,14 +91,15 @@ async def run_hq_program(program: HqProgram, host: str, port: int, drive: tuple[
     try:
         await asyncio.wait((running,))
     except asyncio.CancelledError:
-        if drive is not None and program.ready:
+        if drive is not None and program.agreed:
             await _let_go(program)
         raise
     finally:
         for task in (running, *beside):
             task.cancel()
         await asyncio.gather(running, *beside, return_exceptions=True)
-        print_death(program.judge)
+        if program.death:
+            print_line(f"died: {program.death}")
     running.result()
 
 
@@ -98,16 +125,16 @@ async def _drive(program: HqProgram, ready: asyncio.Event, forward: float, turn:
 async def _print(program: HqProgram, is_ready: asyncio.Event) -> None:
     """Print what happens when it happens, and what it is shown once a second at most."""
     loop = asyncio.get_running_loop()
-    ready, shown, due, printed = "", "", 0.0, 0
+    agreed, shown, due, printed = "", "", 0.0, 0
     while True:
-        if program.ready != ready:
-            ready = program.ready
-            print_line(ready)
+        if program.agreed != agreed:
+            agreed = program.agreed
+            print_line(agreed)
             is_ready.set()
-        for event in program.judge.events[printed:]:
+        for event in program.events[printed:]:
             printed += 1
             print_line(event)
-        if ready and loop.time() >= due and (now := program.shown()) != shown:
+        if agreed and loop.time() >= due and (now := program.shown()) != shown:
             shown, due = now, loop.time() + SHOWN_S
             print_line(f"is shown {shown}")
         await asyncio.sleep(_LOOK_S)

@@ -1,30 +1,51 @@
-"""The accounts of a judge: violations, events, and the cause of its death. Sans-IO; knows no protocol.
+"""What every judge records: violations, events and the cause of its death. Sans-IO; knows no protocol.
 
-A judge is a simulated peer as fragile as the deployed ones. Judges share this module with each other, and no code with
-the gateway that they judge.
+A judge is a simulated peer as fragile as the deployed ones. Judges share their scaffold (this module, ``fragile``,
+``hq_program``, ``sockets`` and ``timing``), and no code with the gateway that they judge.
 """
 
 from __future__ import annotations
 
+import random
+from collections import deque
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, ClassVar, Generic, NoReturn, TypedDict, TypeVar, Unpack
+
+M = TypeVar("M")
 
 
 class Ended(Exception):
-    """A judge died, or has nothing left to do: raised to end its tasks."""
+    """A judge died, or has nothing left to do: raised to end its tasks. Without a text the end is no event."""
+
+
+class Bounds(TypedDict, total=False):
+    """What every judge takes. ``keep``: most entries of each list, default its ``KEEP``; ``note``: called with each
+    violation.
+    """
+
+    keep: int
+    note: Callable[[str], None]
 
 
 class Judge:
-    """The accounts of one judge. ``keep``: most entries of every list; ``note``: called with each violation."""
+    """The records of one judge."""
 
-    def __init__(self, *, keep: int, note: Callable[[str], None] | None) -> None:
+    KEEP: ClassVar[int] = 10_000
+
+    def __init__(self, **bounds: Unpack[Bounds]) -> None:
+        self._keep = bounds.get("keep", self.KEEP)
+        self._note = bounds.get("note")
         self.violations: list[str] = []
         self.events: list[str] = []
+        self.received: deque[Any] = self._rows()
+        """A row for each message, valid or not: monotonic seconds first, then what the protocol adds."""
         self.alive = True
         self.death = ""
         """The violation that killed it."""
-        self._keep = keep
-        self._note = note
+
+    def _rows(self) -> deque[Any]:
+        """Make a list that keeps its newest entries."""
+        return deque(maxlen=self._keep)
 
     def _violate(self, text: str) -> None:
         """Record what the protocol page forbids; beyond ``keep`` entries it is only noted."""
@@ -43,6 +64,64 @@ class Judge:
         self.alive, self.death = False, text
         self._violate(text)
         raise Ended(f"died: {text}")
+
+    def _report(self, problem: str, raw: str, *, deadly: bool = False) -> bool:
+        """Record what is wrong with a message, if anything; tell whether something is. Raise Ended if it is deadly."""
+        if deadly:
+            self._die(f"{problem}: {raw}")
+        if problem:
+            self._violate(f"{problem}: {raw}")
+        return bool(problem)
+
+
+class Chances(dict[str, random.Random]):
+    """One stream of random numbers for each thing that a peer leaves to chance, by name: none disturbs another."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._seed = seed
+
+    def __missing__(self, name: str) -> random.Random:
+        return self.setdefault(name, random.Random(f"{self._seed} {name}"))
+
+
+class MessageReader(Generic[M]):
+    """Cuts the stream of a peer into messages of the judge; a protocol says how long a message is and what it means."""
+
+    def __init__(self) -> None:
+        self.rest = b""
+        """The part of a message at the end of what was read."""
+        self.dead = False
+        """True once nothing more can be read."""
+
+    def take(self, data: bytes) -> list[M]:
+        """Read the messages that end in ``data``."""
+        messages: list[M] = []
+        self.rest += data
+        while self.rest and not self.dead:
+            if problem := self._lost(self.rest):
+                messages.append(self._lose(problem, after=len(messages)))
+            elif len(self.rest) < (size := self._size(self.rest)):
+                break
+            else:
+                raw, self.rest = self.rest[:size], self.rest[size:]
+                messages.append(self._read(raw))
+        return messages
+
+    def _lost(self, data: bytes) -> str:
+        """Tell why the length of the message at the start of ``data`` is unknowable, empty if it is not."""
+        raise NotImplementedError
+
+    def _lose(self, problem: str, after: int) -> M:
+        """Give a message for what cannot be framed, ``after`` others in this read; set ``dead`` or clear ``rest``."""
+        raise NotImplementedError
+
+    def _size(self, data: bytes) -> int:
+        """Give the bytes of the message, or as many as are needed to know."""
+        raise NotImplementedError
+
+    def _read(self, raw: bytes) -> M:
+        raise NotImplementedError
 
 
 def show(data: bytes, limit: int = 60) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 from zbridge.errors import EncodeError, Refused
 from zbridge.protocol.plugin import Simulation
 from zbridge.protocol.session import Session, State
-from zbridge.simulation.ticker import Ticker
+from zbridge.simulation.timing import Ticker
 from zbridge.transport import Accepted, Conversation, Link, Receiver, listen
 
 STEP_S = 0.02

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
+from typing import TypeVar
 
 from zbridge.errors import ProtocolError
 from zbridge.protocol.address import Address
@@ -20,6 +21,7 @@ from zbridge.transport.udp import DatagramHub
 
 Accept = Callable[[Receiver], asyncio.BufferedProtocol]
 """``accept(receiver)``: makes the link of an accepted peer."""
+L = TypeVar("L", bound=asyncio.BaseProtocol)
 
 
 class Door:
@@ -96,7 +98,7 @@ class Door:
         """Attach an accepted peer that was handed over, with the source of its datagrams."""
         connection = self.kernel.adopt(self._parcel.take(number))
         connection.setblocking(False)
-        _, link = await asyncio.get_running_loop().create_connection(lambda: self._accept(receiver), sock=connection)
+        link = await attach(connection, lambda: self._accept(receiver))
         if source is not None and self._hub is not None:
             self._hub.bind(link, receiver, source)  # type: ignore[arg-type]
 
@@ -107,3 +109,16 @@ class Door:
             self._hub.close()
         for bound in self._sockets:
             bound.close()
+
+
+async def attach(sock: socket.socket, make: Callable[[], L]) -> L:
+    """Make a link of a connected socket, whose descriptor belongs to the link from now on; raise OSError.
+
+    Where the peer has already gone, uvloop closes the descriptor before it knows the socket object. That object must
+    not close it once more: by then the number may be that of another file of this process.
+    """
+    transport, link = await asyncio.get_running_loop().create_connection(make, sock=sock)
+    inner = transport.get_extra_info("socket")
+    if transport.is_closing() and (inner is None or inner.fileno() < 0):
+        sock.detach()
+    return link

@@ -19,7 +19,7 @@ from zbridge.metrics import Count
 from zbridge.protocol.address import Address
 from zbridge.protocol.kept import Exported
 from zbridge.transport.backlog import Backlog
-from zbridge.transport.door import Door
+from zbridge.transport.door import Door, attach
 from zbridge.transport.kernel import KERNEL, Kernel
 from zbridge.transport.link import NOBODY, STALLED_S, Receiver
 from zbridge.transport.parcel import Parcel
@@ -293,9 +293,7 @@ async def take_over(given: Exported, parcel: Parcel, receiver: Receiver, kernel:
     sock = kernel.adopt(parcel.take(given.get("tcp")))
     sock.setblocking(False)
     udp = kernel.adopt(parcel.take(given["udp"])) if given.get("udp") is not None else None
-    loop = asyncio.get_running_loop()
-    _, link = await loop.create_connection(lambda: TcpLink(receiver, given_udp=udp, kernel=kernel), sock=sock)
-    return link
+    return await attach(sock, lambda: TcpLink(receiver, given_udp=udp, kernel=kernel))
 
 
 @contextlib.asynccontextmanager

@@ -1,7 +1,4 @@
-"""The simulated vehicle of the judge: it drives and measures. Sans-IO: no channel, no clock.
-
-Section names in the docstrings are those of the protocol page ``alf.md``.
-"""
+"""The simulated vehicle of the judge: it drives and measures. Sans-IO: no channel, no clock."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from random import Random
 
 import numpy as np
 
-from gateways.alf.conformance.parser import ANGLES, FULL_PERCENT, POINTS, Dialect, Scale
+from gateways.alf.conformance.parser import ANGLES, FULL_PERCENT, POINTS, Dialect
 from zbridge.simulation.world import Body, cast
 
 _ANGLE_MIN_DEG, _STEP_DEG = -135.0, 360 / 1024
@@ -19,16 +16,17 @@ _RANGES_MM = (20, 5600)
 _FIRST_VALID, _LAST_VALID = 44, 725
 _FULL_M_S, _WHEELBASE_M, _WHEEL_RAD, _LAG_S = 1.0, 0.3, math.radians(30), 0.2
 _GRAVITY_M_S2 = 9.81
+_COUNTS_PER_G, _COUNTS_PER_DEG_S = 1000.0, 10.0
+"""Of message 4 in ``binary`` ("Scale of accelerations and gyro")."""
 
 
 class Machine:
-    """One vehicle: drives, measures and shines."""
+    """One vehicle, at a seeded place; ``points``: of a measurement."""
 
-    def __init__(self, random: Random, points: int = POINTS, speed_full: int = FULL_PERCENT) -> None:
-        """Set up at a seeded place; ``points``: of a measurement; ``speed_full``: the field that is full speed."""
+    def __init__(self, random: Random, points: int = POINTS) -> None:
         self.place = Body.somewhere(random)
         self.light = False
-        self.points, self._speed_full = points, speed_full
+        self.points = points
         self._random = random
         self._valid = (points * _FIRST_VALID // POINTS, points * _LAST_VALID // POINTS)
         self._target_m_s = self._wheel_rad = 0.0
@@ -36,16 +34,16 @@ class Machine:
 
     @property
     def moving(self) -> bool:
-        """Whether the motor is told to turn."""
+        """Whether the motor is commanded to turn."""
         return self._target_m_s != 0.0
 
-    def obey(self, dialect: Dialect, fields: Sequence[int]) -> None:
+    def obey(self, dialect: Dialect, fields: Sequence[float]) -> None:
         """Take the fields of message 3 ("Dialect ..." 3: negative is left, 0 is full left)."""
         speed, direction, angle, light = fields
-        speed = min(speed, self._speed_full) if dialect == "binary" else speed
+        speed = min(speed, FULL_PERCENT) if dialect == "binary" else speed
         low, high = ANGLES[dialect]
         self._wheel_rad = (2 * (min(max(angle, low), high) - low) / (high - low) - 1) * _WHEEL_RAD
-        self._target_m_s = (-1 if direction else 1) * speed / self._speed_full * _FULL_M_S
+        self._target_m_s = (-1 if direction else 1) * speed / FULL_PERCENT * _FULL_M_S
         self.light = bool(light)
 
     def stop(self) -> None:
@@ -79,15 +77,15 @@ class Machine:
                 points[index] = self._random.randrange(_RANGES_MM[0])
         return [*points, first, last]
 
-    def feel(self, dialect: Dialect, scale: Scale) -> list[int | float]:
+    def feel(self, dialect: Dialect) -> list[int | float]:
         """Give the fields of message 4 ("Translation": lateral to the right, vertical towards the ground)."""
         lateral_m_s2 = -self._speed_m_s * self._turn_rad_s
         accelerations_g = [self._gain_m_s2 / _GRAVITY_M_S2, lateral_m_s2 / _GRAVITY_M_S2, 1.0]
         gyro_deg_s = [0.0, 0.0, math.degrees(self._turn_rad_s)]
-        speed = min(round(abs(self._speed_m_s) / _FULL_M_S * self._speed_full), 255)
+        speed = min(round(abs(self._speed_m_s) / _FULL_M_S * FULL_PERCENT), 255)
         temperature = 36.53 + self._random.uniform(-0.5, 0.5)
         if dialect == "text":
             return [speed, *accelerations_g, *gyro_deg_s, temperature]
-        counts = [value * scale.counts_per_g for value in accelerations_g]
-        counts += [value * scale.counts_per_deg_s for value in gyro_deg_s]
+        counts = [value * _COUNTS_PER_G for value in accelerations_g]
+        counts += [value * _COUNTS_PER_DEG_S for value in gyro_deg_s]
         return [speed, *(min(max(round(count), -32768), 32767) for count in counts), temperature]

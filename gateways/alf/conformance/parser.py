@@ -1,22 +1,21 @@
-"""The messages of both judges, sans-IO: streams cut into messages, messages judged and written.
-
-Shares no code with the gateway's messages, so that an error there cannot hide here.
-Section names in the docstrings are those of the protocol page ``alf.md``.
-"""
+"""The messages of both judges, sans-IO: streams cut into messages, messages judged and written."""
 
 from __future__ import annotations
 
+import enum
+import math
 import re
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import msgspec
 
-from zbridge.simulation.judge import shorten
+from zbridge.simulation.judge import MessageReader, shorten
 from zbridge.simulation.judge import show as show_hex
 
 Dialect = Literal["text", "binary"]
+Fields = tuple[int | float, ...]
 
 SCAN, INIT, DRIVE, INFO, END = 1, 2, 3, 4, 255
 NO_ID = -1
@@ -25,7 +24,7 @@ POINTS = 769
 LONGEST_BYTES = 65536
 """Most bytes of a text message from the HQ; its longest good one is ``3|100|1|-90|1;``."""
 ANGLES = {"text": (-90, 90), "binary": (0, 180)}
-"""Steering angle of full left and of full right, by dialect."""
+"""Steering angle of full left and of full right, by dialect; straight is in the middle."""
 FULL_PERCENT = 100
 """Speed that is full speed; a vehicle takes more without clamping in ``text``, as 100 in ``binary``."""
 MAX_INT = 2**31 - 1
@@ -34,9 +33,26 @@ NUMBER = re.compile(r"-?[0-9]*\.?[0-9]+")
 INTEGERS = re.compile(rb"(0|-?[1-9][0-9]*)(\|(0|-?[1-9][0-9]*))*;")
 """A message of integers, as std::to_string prints them."""
 
-_NAMES = {DRIVE: ("speed", "direction", "steering angle", "light"), END: ("end",)}
-_SIZES = {DRIVE: 4, END: 1}
 _MOST_DIGITS = 11
+_COUNTS = {DRIVE: 4, END: 1}
+_DRIVE_FIELDS = ("speed", "direction", "steering angle", "light")
+_INT, _FLOAT = rb"\|(?:0|-?[1-9][0-9]*)", rb"\|-?(?:0|[1-9][0-9]*)\.[0-9]{6}"
+_FORMS = {INIT: re.compile(b"2" + 3 * _FLOAT + 3 * _INT + b";"), INFO: re.compile(b"4" + _INT + 7 * _FLOAT + b";")}
+_FLOATS = {INIT: range(3), INFO: range(1, 8)}
+_NOT_POINTS, _LONGEST_NUMBER = 4, 12
+
+
+class Phase(enum.Enum):
+    """What either judge does."""
+
+    WAITING = enum.auto()
+    """There is no connection yet."""
+    CONNECTED = enum.auto()
+    ENDING = enum.auto()
+    """The judge sent END, its peer has not."""
+    CLOSING = enum.auto()
+    """Both sent END."""
+    OVER = enum.auto()
 
 
 class Times(msgspec.Struct, frozen=True, kw_only=True):
@@ -68,26 +84,14 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time one message may take to send."""
 
 
-class Heard(msgspec.Struct, frozen=True):
-    """One message from the HQ: its id and fields, what is wrong with it, and whether that kills the vehicle."""
+class Message(msgspec.Struct, frozen=True):
+    """One message of the peer: its id and fields, what is wrong with it, and whether the judge dies of it."""
 
     kind: int
-    fields: tuple[int, ...]
+    fields: Fields
     raw: bytes
     problem: str = ""
     deadly: bool = False
-
-    @property
-    def whole(self) -> bool:
-        """Whether it has the fields of its id, good or bad."""
-        return len(self.fields) == len(_NAMES.get(self.kind, ()))
-
-
-class Scale(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of message 4 in ``binary`` for one g and for one degree/s ("Scale of accelerations and gyro")."""
-
-    counts_per_g: float = 1000.0
-    counts_per_deg_s: float = 10.0
 
 
 def deadly(number: str) -> str:
@@ -111,81 +115,165 @@ def show(data: bytes, dialect: Dialect, limit: int = 60) -> str:
     return shorten(repr(data[:limit])[1:], data, limit) if dialect == "text" else show_hex(data, limit)
 
 
-class TextReader:
-    """Cuts and judges the stream of a ``text`` HQ ("Dialect `text`")."""
+def reader(dialect: Dialect, ids: Collection[int], speed_full: int) -> CommandReader:
+    """Make the reader of a vehicle's server."""
+    return CommandReader(dialect, ids, speed_full)
 
-    def __init__(self, ids: Collection[int], speed_full: int) -> None:
-        """Set up for a server that knows the messages ``ids`` from an HQ."""
-        self.rest = b""
-        self._ids, self._speed_full = ids, speed_full
 
-    def take(self, data: bytes) -> list[Heard]:
+class _Reader(MessageReader[Message]):
+    """Cuts the stream of a peer in either dialect. ``counts``: of the fields, by the id of a known message."""
+
+    _unknown: str
+
+    def __init__(self, dialect: Dialect, counts: Mapping[int, int], longest: int = LONGEST_BYTES) -> None:
+        super().__init__()
+        self._dialect, self._counts, self._longest = dialect, counts, longest
+        self._layouts = {kind: _layout(kind, count) for kind, count in counts.items()}
+
+    def take(self, data: bytes) -> list[Message]:
         """Read the messages that end in ``data``."""
-        *messages, self.rest = (self.rest + data).split(b";")
-        heard = [self._read(message + b";") for message in messages]
-        if len(self.rest) > LONGEST_BYTES:
+        if self._dialect == "binary":
+            return super().take(data)
+        *texts, self.rest = (self.rest + data).split(b";")
+        messages = [self._read_text(text + b";") for text in texts]
+        if len(self.rest) > self._longest:
             problem = f"a message without end, {len(self.rest)} bytes"
-            heard.append(Heard(NO_ID, (), self.rest, problem, deadly=True))
-        return heard
+            messages.append(Message(NO_ID, (), self.rest, problem, deadly=True))
+        return messages
 
-    def _read(self, raw: bytes) -> Heard:
-        """Read a message as deployed readers do: every number is a field, all else separates."""
+    def whole(self, message: Message) -> bool:
+        """Tell whether a message has as many fields as its id has, valid or not."""
+        return len(message.fields) == self._counts.get(message.kind)
+
+    def _lost(self, data: bytes) -> str:
+        return "" if data[0] in self._counts else f"id {data[0]}, {self._unknown}: the framing is lost"
+
+    def _lose(self, problem: str, after: int) -> Message:
+        self.dead = True
+        return Message(self.rest[0], (), self.rest, problem, deadly=True)
+
+    def _size(self, data: bytes) -> int:
+        return self._layouts[data[0]].size
+
+    def _read(self, raw: bytes) -> Message:
+        kind, *fields = self._layouts[raw[0]].unpack(raw)
+        return self._judge(kind, tuple(fields), raw)
+
+    def _read_text(self, raw: bytes) -> Message:
+        """Read a message as deployed readers do: every number is a field, all else separates ("Dialect `text`")."""
+        raise NotImplementedError
+
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+        raise NotImplementedError
+
+
+class CommandReader(_Reader):
+    """Cuts and judges the stream of an HQ, for a server that knows the messages ``ids``."""
+
+    _unknown = "of which this server knows nothing"
+
+    def __init__(self, dialect: Dialect, ids: Collection[int], speed_full: int) -> None:
+        super().__init__(dialect, {kind: _COUNTS[kind] for kind in ids})
+        speeds = (0, speed_full if dialect == "text" else 255)
+        self._bounds = {DRIVE: (speeds, (0, 1), ANGLES[dialect], (0, 1)), END: ((1, 1),)}
+
+    def _read_text(self, raw: bytes) -> Message:
         numbers = NUMBER.findall(raw.decode("latin-1"))
         problem = next(filter(None, map(deadly, numbers)), "")
-        if problem:
-            return Heard(NO_ID, (), raw, problem, deadly=True)
-        kind, *fields = [integer(number) for number in numbers] or [NO_ID]
-        if not numbers:
-            problem = "a message without a number"
-        elif not INTEGERS.fullmatch(raw):
+        if problem or not numbers:
+            return Message(NO_ID, (), raw, problem or "a message without a number", deadly=bool(problem))
+        kind, *fields = map(integer, numbers)
+        return self._judge(kind, tuple(fields), raw)
+
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+        if self._dialect == "text" and not INTEGERS.fullmatch(raw):
             problem = "not written as std::to_string prints integers"
-        elif kind not in self._ids:
-            problem = f"id {kind}, of which this server knows nothing"
+        elif kind not in self._counts:
+            problem = f"id {kind}, {self._unknown}"
+        elif len(fields) != self._counts[kind]:
+            problem = f"{len(fields)} fields instead of {self._counts[kind]}"
         else:
-            problem = _problem("text", kind, fields, self._speed_full)
-        return Heard(kind, tuple(fields), raw, problem)
+            problem = self._out_of_bounds(kind, fields)
+        return Message(kind, fields, raw, problem)
+
+    def _out_of_bounds(self, kind: int, fields: Fields) -> str:
+        names = _DRIVE_FIELDS if kind == DRIVE else ("end",)
+        for name, value, (low, high) in zip(names, fields, self._bounds[kind], strict=True):
+            if not low <= value <= high:
+                return f"{name} {value} instead of " + (f"{low}" if low == high else f"{low}..{high}")
+        return ""
 
 
-class BinaryReader:
-    """Cuts and judges the stream of a ``binary`` HQ ("Dialect `binary`")."""
+class VehicleReader(_Reader):
+    """Cuts and judges the stream of a vehicle; ``points``: of a measurement, which nothing on the wire tells."""
 
-    def __init__(self, ids: Collection[int]) -> None:
-        """Set up for a server that knows the messages ``ids`` from an HQ."""
-        self.rest = b""
-        self._ids, self._dead = ids, False
+    _unknown = "which no vehicle sends"
 
-    def take(self, data: bytes) -> list[Heard]:
-        """Read the messages that end in ``data``; nothing can be read after an unknown id."""
-        heard: list[Heard] = []
-        self.rest += data
-        while self.rest and not self._dead:
-            kind = self.rest[0]
-            size = 1 + _SIZES.get(kind, 0)
-            if kind not in self._ids:
-                problem = f"id {kind}, of which this server knows nothing: the framing is lost"
-                heard.append(Heard(kind, (), self.rest, problem, deadly=True))
-                self._dead = True
-            elif len(self.rest) < size:
-                break
-            else:
-                raw, self.rest = self.rest[:size], self.rest[size:]
-                fields = tuple(raw[1:])
-                heard.append(Heard(kind, fields, raw, _problem("binary", kind, fields, 255)))
-        return heard
+    def __init__(self, dialect: Dialect, points: int) -> None:
+        counts = {SCAN: points + _NOT_POINTS, INIT: 6, INFO: 8, END: 1}
+        super().__init__(dialect, counts, max(LONGEST_BYTES, 2 * _LONGEST_NUMBER * counts[SCAN]))
+        self._points = points
+
+    def _read_text(self, raw: bytes) -> Message:
+        first, *numbers = NUMBER.findall(raw.decode("latin-1")) or [str(NO_ID)]
+        if first == str(NO_ID):
+            return Message(NO_ID, (), raw, "a message without an id")
+        kind = NO_ID if deadly(first) else integer(first)
+        is_float = [at in _FLOATS.get(kind, ()) for at in range(len(numbers))]
+        breaks = ["NaN" if b"nan" in raw.lower() else "", deadly(first), *map(_breaks, numbers, is_float)]
+        if problem := next(filter(None, breaks), ""):
+            return Message(kind, (), raw, problem, deadly=True)
+        fields = (float(number) if real else integer(number) for number, real in zip(numbers, is_float, strict=True))
+        return self._judge(kind, tuple(fields), raw)
+
+    def _judge(self, kind: int, fields: Fields, raw: bytes) -> Message:
+        """Judge a message by its fields ("The gateway as vehicle": what they break on; "Dialect ...")."""
+        if breaks := self._deadly(kind, fields):
+            return Message(kind, fields, raw, breaks, deadly=True)
+        if kind not in self._counts:
+            problem = f"id {kind}, {self._unknown}"
+        elif len(fields) != self._counts[kind]:
+            problem = f"{len(fields)} fields instead of {self._counts[kind]}"
+        elif self._dialect == "text" and not _FORMS.get(kind, INTEGERS).fullmatch(raw):
+            problem = "not written as std::to_string prints numbers"
+        else:
+            problem = self._wrong(kind, fields)
+        return Message(kind, fields, raw, problem)
+
+    def _deadly(self, kind: int, fields: Fields) -> str:
+        if kind == SCAN and len(fields) > self._counts[SCAN]:
+            return f"{len(fields) - _NOT_POINTS} points instead of {self._points}"
+        if any(map(math.isnan, fields)):
+            return "NaN"
+        over = [one for one in fields if isinstance(one, int) and not -MAX_INT - 1 <= one <= MAX_INT]
+        return f"an integer over 2^31-1, {over[0]}" if over else ""
+
+    def _wrong(self, kind: int, fields: Fields) -> str:
+        """Tell what is wrong with the values, where nothing breaks."""
+        if not all(map(math.isfinite, fields)):
+            return "an infinite number"
+        if kind == END and fields[0] != 1:
+            return f"end {fields[0]} instead of 1"
+        if kind != SCAN:
+            return ""
+        sequence, stamp, *_, first, last = fields
+        if sequence < 0 or stamp < 0:
+            return f"sequence {sequence}, timestamp {stamp}: below 0"
+        if not (0 <= first < self._points and 0 <= last < self._points):
+            return f"valid indices {first} and {last} of {self._points} points"
+        return ""
 
 
-def reader(dialect: Dialect, ids: Collection[int], speed_full: int) -> TextReader | BinaryReader:
-    """Make the reader of a dialect."""
-    return TextReader(ids, speed_full) if dialect == "text" else BinaryReader(ids)
+def _breaks(number: str, is_float: bool) -> str:
+    """Tell why an HQ breaks on a number: a float may be large, but needs its leading digit."""
+    bare = number.lstrip("-").startswith(".")
+    return deadly(number) if bare or not is_float else ""
 
 
 class Repeats:
     """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link stands)."""
 
     def __init__(self, times: Times) -> None:
-        """Begin with the connection."""
-        self.longest_s = 0.0
-        """Longest time without a command so far."""
         self._times, self._limit_s = times, times.first_s
         self._silent_s, self._noted = 0.0, False
         self._window_s, self._commands = 0.0, 0
@@ -193,13 +281,11 @@ class Repeats:
     def cycle(self, passed_s: float, commands: int) -> str:
         """Tell what is wrong after one more cycle, empty if nothing."""
         self._silent_s += passed_s
-        self.longest_s = max(self.longest_s, self._silent_s)
-        silent_s = self._silent_s
         if commands:
             self._silent_s, self._noted, self._limit_s = 0.0, False, self._times.gap_s
         elif self._silent_s > self._limit_s and not self._noted:
             self._noted, self._window_s, self._commands = True, 0.0, 0
-            return f"no drive command for {silent_s:.2f} s"
+            return f"no drive command for {self._silent_s:.2f} s"
         return "" if self._noted else self._window(passed_s, commands)
 
     def _window(self, passed_s: float, commands: int) -> str:
@@ -207,10 +293,10 @@ class Repeats:
         self._commands += commands
         if self._window_s < self._times.window_s:
             return ""
-        told = f"{self._commands} drive commands in {self._window_s:.2f} s"
+        rate = f"{self._commands} drive commands in {self._window_s:.2f} s"
         few = self._commands < self._times.window_commands
         self._window_s, self._commands = 0.0, 0
-        return told if few else ""
+        return rate if few else ""
 
 
 def write(dialect: Dialect, kind: int, fields: Sequence[int | float]) -> bytes:
@@ -218,17 +304,15 @@ def write(dialect: Dialect, kind: int, fields: Sequence[int | float]) -> bytes:
     if dialect == "text":
         texts = [f"{value:.6f}" if isinstance(value, float) else str(value) for value in fields]
         return "|".join([str(kind), *texts]).encode("ascii") + b";"
-    layout = {SCAN: f"<BII{len(fields) - 4}qII", INIT: "<B3f3i", DRIVE: "<5B", INFO: "<BB6hf", END: "<BB"}[kind]
-    return struct.pack(layout, kind, *fields)
+    return _layout(kind, len(fields)).pack(kind, *fields)
 
 
-def _problem(dialect: Dialect, kind: int, fields: Sequence[int], speed_full: int) -> str:
-    """Tell what is wrong with the fields of a message that the server knows."""
-    names = _NAMES[kind]
-    if len(fields) != len(names):
-        return f"{len(fields)} fields instead of {len(names)}"
-    bounds = ((0, speed_full), (0, 1), ANGLES[dialect], (0, 1)) if kind == DRIVE else ((1, 1),)
-    for name, value, (low, high) in zip(names, fields, bounds, strict=True):
-        if not low <= value <= high:
-            return f"{name} {value} instead of " + (f"{low}" if low == high else f"{low}..{high}")
-    return ""
+def end(dialect: Dialect) -> bytes:
+    """Write END ("Dialect ..." 255)."""
+    return write(dialect, END, [1])
+
+
+def _layout(kind: int, count: int) -> struct.Struct:
+    """Give the widths of a message in ``binary``; ``count``: of its fields ("Dialect `binary`")."""
+    layouts = {SCAN: f"<BII{count - 4}qII", INIT: "<B3f3i", DRIVE: "<5B", INFO: "<BB6hf", END: "<BB"}
+    return struct.Struct(layouts[kind])

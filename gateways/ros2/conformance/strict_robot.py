@@ -1,7 +1,7 @@
-"""A ROS 2 robot over plain Zenoh, from rmw_zenoh's sources alone, that complains about whatever is not as there.
+"""A ROS 2 robot over plain Zenoh, written from rmw_zenoh's sources alone: it records whatever differs from them.
 
-It holds the last velocity that it was told for ever, as the worst drivers do: only a command stops it. Each command
-must have a whole attachment, the gid of a publisher whose token is alive, numbers without gaps, a time that rises, and
+It keeps the last commanded velocity for ever, as the worst drivers do: only a command stops it. Each command must have
+a whole attachment, the gid of a publisher whose token is alive, numbers without gaps, a time that rises, and
 a payload of the exact size. CDR is written and read here by :mod:`struct`; the type hashes are those that ROS prints.
 """
 
@@ -18,6 +18,8 @@ from typing import Any, NamedTuple
 import xxhash
 import zenoh
 import zenoh.ext
+
+from zbridge.simulation.judge import Judge
 
 HASHES = {
     "LaserScan": "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
@@ -38,7 +40,7 @@ LATE_S = 5.0
 """Seconds by which the time of an attachment may be wrong."""
 
 
-class Told(NamedTuple):
+class Command(NamedTuple):
     """One command: when it came, from which gid, m/s forward and to the left, rad/s."""
 
     at: float
@@ -69,13 +71,13 @@ def gid_of(token: str) -> bytes:
     )
 
 
-class StrictRobot:
+class StrictRobot(Judge):
     """The robot. namespace: with ``/`` first, or empty; stamped: its base takes TwistStamped."""
 
     def __init__(self, router: str, *, namespace: str = "", stamped: bool = False, domain: int = 0) -> None:
+        super().__init__()
         self.session = zenoh.open(config(router))
-        self.told: list[Told] = []
-        self.violations: list[str] = []
+        self.told: list[Command] = []
         self.velocity = (0.0, 0.0, 0.0)
         self.x = self.y = self.heading = 0.0
         self.clock_ns = time.time_ns
@@ -144,13 +146,13 @@ class StrictRobot:
             gid = self._judge(attachment.to_bytes() if attachment is not None else b"")
             values = self._twist(payload)
         except ValueError as error:
-            self.violations.append(str(error))
+            self._violate(str(error))
             return
         forward, left, up, roll, pitch, turn = values
         if up or roll or pitch or not all(map(math.isfinite, values)):
-            self.violations.append(f"twist {values}")
+            self._violate(f"twist {values}")
         self.velocity = (forward, left, turn)
-        self.told.append(Told(at, gid, forward, left, turn))
+        self.told.append(Command(at, gid, forward, left, turn))
 
     def _judge(self, attachment: bytes) -> bytes:
         if len(attachment) != 33 or attachment[16] != 16:
@@ -165,9 +167,9 @@ class StrictRobot:
         before, before_ns = self._last.get(gid, (number - 1, 0))
         self._last[gid] = number, sent_ns
         if number != before + 1 or number < 1:
-            self.violations.append(f"number {number} after {before}")
+            self._violate(f"number {number} after {before}")
         if sent_ns < before_ns or abs(sent_ns - time.time_ns()) > LATE_S * 1e9:
-            self.violations.append(f"sent at {sent_ns}, after {before_ns}, now {time.time_ns()}")
+            self._violate(f"sent at {sent_ns}, after {before_ns}, now {time.time_ns()}")
         return gid
 
     def _is_alive(self, gid: bytes) -> bool:
@@ -182,7 +184,7 @@ class StrictRobot:
             seconds, nanoseconds, length = struct.unpack_from("<iII", payload, at)
             stamp_ns = seconds * 1_000_000_000 + nanoseconds
             if stamp_ns and abs(stamp_ns - self.clock_ns()) > LATE_S * 1e9:
-                self.violations.append(f"stamped {stamp_ns}, the robot's clock is {self.clock_ns()}")
+                self._violate(f"stamped {stamp_ns}, the robot's clock is {self.clock_ns()}")
             at += 12 + length
             at += -(at - 4) % 8
         if len(payload) != at + 48:

@@ -1,9 +1,4 @@
-"""A simulated HQ program as fragile as the deployed ones: the judge of a gateway that plays robot.
-
-It records each violation of what the protocol page ``tcpudp.md`` demands towards HQ programs, and dies of what cripples
-them. It shares no code with the gateway: not its messages, session, settings or translation. Section names in the
-docstrings are those of that page.
-"""
+"""A simulated HQ program as fragile as the deployed ones: the judge of a gateway that plays robot."""
 
 from __future__ import annotations
 
@@ -15,18 +10,17 @@ import socket
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Coroutine, Sequence
-from typing import Literal
+from collections.abc import Iterable
+from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.parser import Feature, HqTimes, Packet
-from zbridge.simulation.judge import Ended, Judge, show
-from zbridge.simulation.sockets import connected
-from zbridge.simulation.stream_reader import STAMPED, Read, StreamReader
+from gateways.tcpudp.conformance.operator import Operator
+from gateways.tcpudp.conformance.parser import Channel, Feature, HqTimes, Packet
+from zbridge.simulation.fragile import Work, log_violations
+from zbridge.simulation.hq_program import run_hq_program
+from zbridge.simulation.judge import Bounds, Ended, show
+from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 
-Channel = Literal["tcp", "udp"]
-
-_DATAGRAM_BYTES = 65536
 _SMALLEST_READ = 6
 _WAITING = 1000
 DEPLOYED_PORT = 11000
@@ -45,15 +39,18 @@ class _Phase(enum.Enum):
 _DEPLOYED = HqTimes()
 
 
-class FragileHq(Judge):
+class FragileHq(Operator):
     """An HQ program of one version, for one connection: records every violation and dies of the deadly ones.
 
     ``lidar_sim``: announce LidarSim; ``skips_map_flag``: read the map's size where the SLAMMap flag is;
     ``unasked``: a 1.1 program has handlers for 53 and 55 before it asked, unlike the first programs of 1.1;
     ``repeat_s``: seconds between repetitions of the stick, None for a viewer that sends nothing by itself;
-    ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken; ``keep``: most
-    entries of every list; ``note``: called with each violation.
+    ``udp_port``: the port to bind, 0 for any; None: the deployed one, or any if that is taken. A row of ``received``:
+    monotonic seconds, channel, id, body.
     """
+
+    OPTIONS = STAMPED
+    _phase: _Phase
 
     def __init__(
         self,
@@ -65,15 +62,13 @@ class FragileHq(Judge):
         unasked: bool = False,
         repeat_s: float | None = 0.5,
         udp_port: int | None = None,
-        keep: int = 10_000,
-        note: Callable[[str], None] | None = None,
         times: HqTimes = _DEPLOYED,
+        **bounds: Unpack[Bounds],
     ) -> None:
         if version not in wire.HQ_SENT or (lidar_sim and wire.FLAGS[version] <= Feature.LIDAR_SIM):
             raise ValueError(f"no HQ of version {version}" + " announces LidarSim" * lidar_sim)
-        super().__init__(keep=keep, note=note)
+        super().__init__(**bounds)
         self.version = version
-        self.received: list[tuple[float, Channel, int, bytes]] = []
         self.established = asyncio.Event()
         self.settings: wire.Announced | None = None
         self.position: tuple[float, float, float] | None = None
@@ -87,102 +82,56 @@ class FragileHq(Judge):
         self._repeat_s, self._udp_port, self._times = repeat_s, udp_port, times
         self._phase = _Phase.CONNECTED
         self._reads = wire.Reads(wire.HQ_LOSES_BYTES - 1)
-        self._stick = (wire.STOP, b"")
         self._inbox: asyncio.Queue[tuple[Channel, Read]] = asyncio.Queue(_WAITING)
-        self._tasks: asyncio.TaskGroup | None = None
-        self._tcp: socket.socket | None = None
         self._robot: tuple[str, int] = ("", 0)
         self._udp: socket.socket | None = None
         self._answered = False
         self._works: bool | None = None
-
-    def __repr__(self) -> str:
-        return f"<FragileHq {self.version} {self._phase.name} violations={len(self.violations)} alive={self.alive}>"
 
     @property
     def client_id(self) -> int:
         """The id the robot gave, 0 before that."""
         return self.settings.client if self.settings else 0
 
+    @property
+    def agreed(self) -> str:
+        settings = self.settings
+        if settings is None or not self.established.is_set():
+            return ""
+        features = ", ".join(feature.name.lower() for feature in sorted(settings.features)) or "none"
+        return f"established: client id {settings.client}, robot of {settings.versions}, features {features}"
+
+    def shown(self) -> str:
+        position = "no position" if self.position is None else "position {:.2f} {:.2f} {:.1f}".format(*self.position)
+        cells = f"a map of {len(self.map)} cells" if self.map else "no map"
+        return ", ".join([position, cells, *(f"text {text!r}" for text in self.texts[-1:])])
+
     async def run(self, host: str, port: int) -> None:
-        """Connect, and serve until cancelled, dead, or the robot closes (``events`` say which); once per object."""
-        loop, since = asyncio.get_running_loop(), time.time()
-        async with connected(host, port, STAMPED) as self._tcp:
-            self._tcp.setblocking(True)  # for the thread that reads
-            self._robot = self._tcp.getpeername()
-            reader = StreamReader(self._tcp, since, lambda read: loop.call_soon_threadsafe(self._arrive, "tcp", read))
-            reader.start()
-            try:
-                await self._work()
-            except asyncio.CancelledError:
-                self._event("cancelled")
-                raise
-            finally:
-                self._phase = _Phase.ENDED
-                self._close(self._tcp, reader, loop)
+        """Connect, and serve until cancelled, dead, or the robot closes; once per object."""
+        self._since = time.time()
+        await super().run(host, port)
 
-    async def _work(self) -> None:
-        try:
-            async with asyncio.TaskGroup() as self._tasks:
-                self._tasks.create_task(self._converse())
-        except* Ended:
-            self._event(f"died: {self.death}" if self.death else "ended")
+    def _work(self) -> Iterable[Work]:
+        loop, tcp = asyncio.get_running_loop(), self._tcp
+        tcp.setblocking(True)  # for the thread that reads
+        self._robot = tcp.getpeername()
 
-    def _close(self, tcp: socket.socket, reader: StreamReader, loop: asyncio.AbstractEventLoop) -> None:
-        with contextlib.suppress(OSError):
-            tcp.shutdown(socket.SHUT_RDWR)  # ends the read of the thread
-        reader.join()
+        def give(read: Read) -> None:
+            loop.call_soon_threadsafe(self._arrive, "tcp", read)
+
+        self._thread = ReadingThread(tcp, self._since, give)
+        self._thread.start()
+        return (self._converse(),)
+
+    def _before_close(self) -> None:
+        self._phase = _Phase.ENDED
+        self._shut()  # ends the read of the thread
+        self._thread.join()
         if self._udp is not None:
-            loop.remove_reader(self._udp.fileno())
+            asyncio.get_running_loop().remove_reader(self._udp.fileno())
             self._udp.close()
 
-    # What the operator does
-
-    def mode(self, value: Literal[1, 2, 3]) -> None:
-        """Send 10: 1 none, 2 joystick, 3 AI."""
-        self.send(wire.MODE, struct.pack("<i", value))
-
-    def move(self, x: float, y: float, speed: float = 1.0) -> None:
-        """Hold the stick in a direction: 11, at once and repeated."""
-        self._hold(wire.MOVE, struct.pack("<3f", x, y, speed))
-
-    def rotate(self, speed: float) -> None:
-        """Hold the turning stick: 12, + right, at once and repeated."""
-        self._hold(wire.ROTATE, struct.pack("<f", speed))
-
-    def idle(self) -> None:
-        """Let the stick go: 13, at once and repeated."""
-        self._hold(wire.STOP, b"")
-
-    stop = idle
-
-    def move_ai(self, body: bytes) -> None:
-        """Send 21."""
-        self.send(wire.MOVE_AI, body)
-
-    def ask_map(self) -> None:
-        """Send 52."""
-        self.send(wire.GET_MAP)
-
-    def ask_position(self) -> None:
-        """Send 54."""
-        self.send(wire.GET_POSITION)
-
-    def lidar(self, on: bool) -> None:
-        """Send 50."""
-        self.send(wire.LIDAR_MODE, struct.pack("<i", 1 if on else 2))
-
-    def say(self, text: str) -> None:
-        """Send 1."""
-        self.send(wire.DEBUG, wire.string(text))
-
-    def chat(self, body: bytes) -> None:
-        """Send 40."""
-        self.send(wire.CHAT, body)
-
-    def feed(self, ranges: Sequence[float]) -> None:
-        """Send 61, simulated lidar data."""
-        self.send(wire.SCAN, struct.pack(f"<i{len(ranges)}f", len(ranges), *ranges))
+    # What it sends
 
     def send(self, kind: int, body: bytes = b"") -> None:
         """Send a packet the way this version does; before the session is established and after its end it is lost.
@@ -198,12 +147,7 @@ class FragileHq(Judge):
         else:
             self._send_tcp(kind, body)
 
-    def _hold(self, kind: int, body: bytes) -> None:
-        self._stick = (kind, body)
-        self.send(kind, body)
-
     def _send_tcp(self, kind: int, body: bytes = b"") -> None:
-        assert self._tcp is not None
         data = wire.packet(kind, body, self.client_id)
         try:
             sent = self._tcp.send(data, socket.MSG_DONTWAIT)
@@ -213,8 +157,7 @@ class FragileHq(Judge):
             return self._event(f"lost: packet {kind}, the connection broke: {error!r}")
         if sent < len(data):
             self._event(f"hung up: the robot reads nothing, {sent} of {len(data)} bytes of packet {kind} were taken")
-            with contextlib.suppress(OSError):
-                self._tcp.shutdown(socket.SHUT_RDWR)
+            self._shut()
         return None
 
     def _send_datagram(self, kind: int, body: bytes = b"") -> None:
@@ -232,12 +175,12 @@ class FragileHq(Judge):
         except asyncio.QueueFull:
             self._event(f"{_WAITING} reads wait, one was dropped")
 
-    def _hear(self) -> None:
+    def _read_datagrams(self) -> None:
         """Take datagrams from the robot's own address and port, no others ("Handshake", Ports)."""
         assert self._udp is not None
         with contextlib.suppress(OSError):
             while True:
-                data, source = self._udp.recvfrom(_DATAGRAM_BYTES)
+                data, source = self._udp.recvfrom(wire.DATAGRAM_BYTES)
                 if source == self._robot:
                     self._arrive("udp", Read(time.monotonic(), data))
                 else:
@@ -250,59 +193,49 @@ class FragileHq(Judge):
                 received = wire.datagram(read.data)
                 if received is None:
                     self._die(f"a datagram whose length field is wrong: {show(read.data)}")
-                self._take(received, channel, read.at)
+                self._judge(received, channel, read.at)
             elif read.data:
-                self._read(read)
+                self._read_packet(read)
             else:
-                why = read.why or "the robot closed the connection"
-                self._event(why)
-                raise Ended(why)
+                raise Ended(read.why or "the robot closed the connection")
 
-    def _read(self, read: Read) -> None:
+    def _read_packet(self, read: Read) -> None:
         """Take one read as one packet ("The gateway as robot")."""
         if len(read.data) < _SMALLEST_READ:
             self._violate(f"a read of {len(read.data)} bytes, taken as a disconnect: {show(read.data)}")
-            why = "hung up: took a short read as a disconnect"
-            self._event(why)
-            raise Ended(why)
+            raise Ended("hung up: took a short read as a disconnect")
         received, problem = self._reads.take(read.data)
         late = f" (this process read {read.late_s * 1000:.0f} ms late)"
         if self._reads.hopeless:
             self._die(problem)
+        excuse_s = 0.8 * self._times.gap_s * (len(self._reads.joined) - 1)
         if received is not None:
-            self._take(received, "tcp", read.at)
-        elif self._reads.joined and read.late_s >= self._excuse_s(len(self._reads.joined)):
+            self._judge(received, "tcp", read.at)
+        elif self._reads.joined and read.late_s >= excuse_s:  # so late that it may have joined spaced packets itself
             self._event(f"joined by this process: {problem}{late}")
             for packet in self._reads.joined:
-                self._take(packet, "tcp", read.at)
+                self._judge(packet, "tcp", read.at)
         elif problem:
             self._violate(problem + late * (read.late_s > 0.002))
 
-    def _excuse_s(self, packets: int) -> float:
-        """Give how late the reader must have been to be at fault itself for joining so many spaced packets."""
-        return 0.8 * self._times.gap_s * (packets - 1)
-
     # Packets
 
-    def _take(self, packet: Packet, channel: Channel, at: float) -> None:
+    def _judge(self, packet: Packet, channel: Channel, at: float) -> None:
         kind, body = packet.kind, packet.body
         raw = f"{channel} packet {kind}, body {show(body)}"
         self.received.append((at, channel, kind, body))
-        del self.received[: -self._keep]
         self.counts[kind] += 1
         if kind not in wire.KNOWN_TO_HQ[self.version]:
             self._die(f"unknown packet id {kind} for an HQ {self.version}: {raw}")
-        if problem := wire.hq_body_problem(kind, body):
+        if problem := wire.body_problem(kind, body):
             self._die(f"{problem}: {raw}")
         if packet.sender != wire.SERVER_ID:
             self._violate(f"id byte {packet.sender} instead of {wire.SERVER_ID}: {raw}")
         if (due := self._channel(kind, body)) not in (channel, None):
             self._violate(f"packet {kind} by {channel.upper()} instead of {due.upper()}: {raw}")
-        if problem := self._untimely(kind):
-            return self._violate(f"{problem}: {raw}")
-        if problem := wire.hq_value_problem(kind, body, self.settings.side if self.settings else 0):
-            self._violate(f"{problem}: {raw}")
-        return self._obey(kind, body)
+        if not self._report(self._untimely(kind), raw):
+            self._report(wire.value_problem(kind, body, self.settings.side if self.settings else 0), raw)
+            self._obey(kind, body)
 
     def _channel(self, kind: int, body: bytes) -> Channel | None:
         """Tell what must carry a packet ("Packets"); None: either, as without a 6 nothing was agreed."""
@@ -355,19 +288,18 @@ class FragileHq(Judge):
     def _greet(self, body: bytes) -> None:
         """Read the robot's settings and answer 3 a little later ("Settings and version negotiation")."""
         try:
-            told = wire.announced(body, self.version, skips_map_flag=self._skips)
+            settings = wire.announced(body, self.version, skips_map_flag=self._skips)
         except ValueError as error:
             self._die(f"{error}: packet 2, body {show(body)}")
-        self.settings, self._phase = told, _Phase.GREETED
-        if problem := wire.announced_problem(told, skips_map_flag=self._skips):
-            self._violate(f"{problem}: packet 2, body {show(body)}")
-        if not told.understood:
-            self._event(f"keeps its old flags: it does not understand the versions {told.versions!r}")
-        elif (told.map_size, told.map_interval) != told.meant:
-            self._event(f"sees a wrong map size {told.map_size} with the interval {told.map_interval}")
-        self._start(self._answer(told))
+        self.settings, self._phase = settings, _Phase.GREETED
+        self._report(wire.announced_problem(settings, skips_map_flag=self._skips), f"packet 2, body {show(body)}")
+        if not settings.understood:
+            self._event(f"keeps its old flags: it does not understand the versions {settings.versions!r}")
+        elif (settings.map_size, settings.map_interval) != settings.meant:
+            self._event(f"sees a wrong map size {settings.map_size} with the interval {settings.map_interval}")
+        self._start(self._answer(settings))
 
-    async def _answer(self, told: wire.Announced) -> None:
+    async def _answer(self, settings: wire.Announced) -> None:
         await asyncio.sleep(self._times.answer_s)
         flags = bytearray(wire.FLAGS[self.version])
         flags[Feature.UDP] = self._offers_udp
@@ -375,7 +307,7 @@ class FragileHq(Judge):
             flags[Feature.LIDAR_SIM] = True
         self._send_tcp(wire.CLIENT_SETTINGS, wire.string(wire.HQ_SENT[self.version]) + flags)
         self._phase = _Phase.ANSWERED
-        if not (self._offers_udp and told.udp):
+        if not (self._offers_udp and settings.udp):
             return self._establish()
         await asyncio.sleep(self._times.probe_s)
         if self._udp is None:
@@ -384,12 +316,11 @@ class FragileHq(Judge):
 
     def _probe(self) -> None:
         """Open the UDP socket, only now, and send 5 once ("Handshake" 4)."""
-        assert self._tcp is not None
         self._phase = _Phase.PROBING
         self._udp = socket.socket(self._tcp.family, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
         self._bind(self._udp, self._tcp.getsockname()[0])
-        asyncio.get_running_loop().add_reader(self._udp.fileno(), self._hear)
+        asyncio.get_running_loop().add_reader(self._udp.fileno(), self._read_datagrams)
         self._send_datagram(wire.UDP_PROBE)
         self._start(self._wait())
 
@@ -407,7 +338,7 @@ class FragileHq(Judge):
         await asyncio.sleep(self._times.probe_s)
         if not self._answered:
             self._event(f"no 6 within {self._times.probe_s:g} s of the 5")
-        self._report()
+        self._send_status()
 
     def _conclude(self, works: bool) -> None:
         """Take 6: programs of 1.1 and 1.2 believe in UDP after any ("The gateway as robot")."""
@@ -415,9 +346,9 @@ class FragileHq(Judge):
         self._works = works or self.version != "1.3"
         if not works:
             self._violate("6(false): a listener sends 6(true) or none")
-        self._report()
+        self._send_status()
 
-    def _report(self) -> None:
+    def _send_status(self) -> None:
         """Send 7: whether a 6 came; 1.3 says true all the same ("Handshake" 6)."""
         if self._phase is _Phase.PROBING:
             connected = self._answered or self.version == "1.3"
@@ -438,6 +369,19 @@ class FragileHq(Judge):
             self.send(*self._stick)
             await asyncio.sleep(period_s)
 
-    def _start(self, work: Coroutine[None, None, None]) -> None:
-        assert self._tasks is not None
-        self._tasks.create_task(work)
+
+async def simulate_fragile_hq(
+    host: str,
+    port: int,
+    *,
+    version: str,
+    udp: bool,
+    drive: tuple[float, float] | None = None,
+    times: HqTimes = _DEPLOYED,
+) -> None:
+    """Run a fragile HQ until cancelled, dead or left; log violations, print what it does and what it died of.
+
+    drive: forward and turn, fractions of full scale; None: its stick stays centred. Raise OSError if nobody listens.
+    """
+    hq = FragileHq(version=version, udp=udp, times=times, note=log_violations())
+    await run_hq_program(hq, host, port, drive)

@@ -1,39 +1,29 @@
-"""A simulated TCP/UDP robot as fragile as the deployed ones: the judge of a gateway that plays HQ.
-
-It records each violation of what the protocol page ``tcpudp.md`` demands towards robots, and dies of what kills them.
-It shares no code with the gateway: not its messages, session, settings or translation. Section names in the docstrings
-are those of that page.
-"""
+"""A simulated TCP/UDP robot as fragile as the deployed ones: the judge of a gateway that plays HQ."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import enum
-import logging
 import math
 import random
 import socket
 import time
 from collections.abc import Callable, Collection, Iterable
-from typing import Literal
+from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.machine import Machine
-from gateways.tcpudp.conformance.parser import Feature, Loss, Packet, Times
-from zbridge.simulation.fragile import FragileServer, Work, log_violations, print_death
-from zbridge.simulation.judge import show
+from gateways.tcpudp.conformance.parser import Channel, Feature, Loss, Packet, Times
+from zbridge.simulation.fragile import FragileServer, Work, log_violations, simulate
+from zbridge.simulation.judge import Bounds, Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
-from zbridge.simulation.ticker import Ticker
-
-Channel = Literal["tcp", "udp"]
+from zbridge.simulation.timing import PollingReader, Ticker
 
 _STEP_S, _MOST_MOVE_S = 0.02, 0.1
 """Seconds between two steps of the robot, and most seconds for which it moves in one."""
-_DATAGRAM_BYTES = 65536
 _LOOK_S = 0.006
 """Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
-_log = logging.getLogger(__name__)
 
 
 class _Phase(enum.Enum):
@@ -53,24 +43,6 @@ _EXPECTED = {
 }
 
 
-class _Chances:
-    """One stream of random numbers for each thing that a robot leaves to chance: none disturbs another."""
-
-    def __init__(self, seed: int) -> None:
-        self.sleeps, self.answers = random.Random(f"{seed} sleep"), random.Random(f"{seed} answer")
-        self.pauses = random.Random(f"{seed} pause")
-        self.misreads = {kind: random.Random(f"{seed} misread {kind}") for kind in range(256)}
-        self.losses = random.Random(f"{seed} loss")
-
-
-def _announced(version: str, features: Collection[Feature] | None, *, udp: bool) -> frozenset[Feature]:
-    known = frozenset(list(Feature)[: wire.FLAGS[version]])
-    others = known if features is None else frozenset(features)
-    if not others <= known:
-        raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
-    return (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
-
-
 class FragileRobot(FragileServer):
     """A robot of one version: serves one connection, records every violation and dies of the deadly ones.
 
@@ -78,9 +50,12 @@ class FragileRobot(FragileServer):
     announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``side``: cells along a
     side of the map; ``misnamed``: the fraction of positions sent as id 53; ``misread``: the fraction of packets dropped
     after the handshake, chosen for each packet id by itself; ``again``: serve a connection after the first, which loses
-    half of all packets in both directions and gets no telemetry ("One usable connection"); ``keep``: most entries of
-    every list; ``note``: called with each violation.
+    half of all packets in both directions and gets no telemetry ("One usable connection"). A row of ``received`` and
+    of the lists like it: monotonic seconds, channel, id, body.
     """
+
+    _phase: _Phase
+    _polling: PollingReader
 
     def __init__(
         self,
@@ -98,32 +73,25 @@ class FragileRobot(FragileServer):
         misnamed: float = 0.25,
         misread: float = 0.0,
         again: bool = False,
-        keep: int = 10_000,
-        note: Callable[[str], None] | None = None,
+        **bounds: Unpack[Bounds],
     ) -> None:
-        super().__init__(keep=keep, note=note)
+        super().__init__(**bounds)
         self.version = version
-        self.features = _announced(version, features, udp=udp)
+        self.features = wire.announcement(version, features, udp=udp)
         self.client_id = client_id or random.Random(seed).randint(1, 255)
-        self.received: list[tuple[float, Channel, int, bytes]] = []
-        self.misread: list[tuple[float, Channel, int, bytes]] = []
-        self.piled: list[tuple[float, Channel, int, bytes]] = []
+        self.misread = self._rows()
+        self.piled = self._rows()
         """What was lost in a read that this process itself joined, because it was late."""
-        self.ignored: list[tuple[float, Channel, int, bytes]] = []
+        self.ignored = self._rows()
         """What robots of 1.1 and 1.2 ignored: the first packet read alone after they lost what had piled up."""
-        self.machine = Machine(random.Random(f"{seed} talk"), side)
         self._registered = wire.registered(version, self.features | frozenset(obeys))
-        self._times, self._loss, self._parts, self._misnamed = times, loss, parts, misnamed
-        self._chance = _Chances(seed)
-        self._misread, self._again, self._poor = misread, again, False
-        self._side = side
+        self._times, self._loss, self._parts, self._side = times, loss, parts, side
+        self._chance, self._misnamed, self._misread = Chances(seed), misnamed, misread
+        self._again, self._poor = again, False
+        self.machine = Machine(self._chance["talk"], side)
         self._phase = _Phase.LISTENING
-        self._conn: socket.socket | None = None
-        self._broken: ConnectionResetError | None = None
         self._udp: socket.socket | None = None
-        self._sending = asyncio.Lock()
-        self._empty_at = self._unread_s = self._wake_at = self._closed_s = 0.0
-        self._awake_s = 0.0
+        self._wake_at = self._closed_s = self._awake_s = 0.0
         """This process's own time, which stands still while the process is late: it judges what was in flight."""
         self._forget()
 
@@ -140,9 +108,6 @@ class FragileRobot(FragileServer):
         self._status: bool | None = None
         self._parts_since = math.inf
 
-    def __repr__(self) -> str:
-        return f"<FragileRobot {self.version} {self._phase.name} violations={len(self.violations)} alive={self.alive}>"
-
     def _bind(self, host: str, port: int, sockets: contextlib.ExitStack) -> socket.socket:
         """Bind TCP and UDP to the same number ("Handshake", Ports)."""
         tcp, self._udp = bind_tcp_and_udp(host, port)
@@ -151,10 +116,7 @@ class FragileRobot(FragileServer):
 
     def _work(self) -> Iterable[Work]:
         assert self._udp is not None
-        return self._hear(self._udp), self._move()
-
-    def _phase_name(self) -> str:
-        return self._phase.name.lower()
+        return self._read_datagrams(self._udp), self._move()
 
     # TCP
 
@@ -165,54 +127,43 @@ class FragileRobot(FragileServer):
     def _begin(self, conn: socket.socket) -> None:
         """Begin with an HQ; a connection after the first is a poor one."""
         if self._phase is not _Phase.LISTENING:
-            self._poor, self.client_id = True, max(2, self.client_id) % 255 + 1
+            self._poor, self.client_id, self._broken = True, max(2, self.client_id) % 255 + 1, ""
             self._forget()
-        self._phase, self._conn = _Phase.GREETED, conn
+        self._phase = _Phase.GREETED
         self._start(self._converse(conn))
 
     def cut(self) -> None:
         """Break the connection."""
-        if self._conn is not None:
-            self._conn.shutdown(socket.SHUT_RDWR)
+        self._shut()
 
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
         try:
             settings = wire.server_settings(self.version, self.client_id, self.features, self._side)
             await self._send(wire.SERVER_SETTINGS, settings)
-            self._empty_at = time.monotonic()
-            while data := await self._next(conn):
-                await self._read(data)
-                await self._nap()
-            if self._broken:  # reported to a send, and only once
-                raise self._broken
-            self._event("the HQ closed the connection")
+            self._polling = PollingReader(conn, wire.READ_BYTES)
+            while data := await self._polling.read(_LOOK_S):
+                await self._read_packet(data)
+                await asyncio.sleep(self._chance["sleep"].uniform(0, self._times.read_s))
+            self._event(f"the connection broke: {self._broken}" if self._broken else "the HQ closed the connection")
         except OSError as error:
             self._event(f"the connection broke: {error!r}")
         finally:
+            self._shut()
             self._phase, self._conn, self._closed_s = _Phase.FROZEN, None, self._awake_s
             self._awake.set()
-            with contextlib.suppress(OSError):
-                conn.shutdown(socket.SHUT_RDWR)  # closed at the end: a send may be waiting for it
 
-    async def _next(self, conn: socket.socket) -> bytes:
-        """Read as soon as there is anything; look often, to know since when there was nothing."""
-        while (data := self._waiting()) is None:
-            await readable(conn, _LOOK_S)
-        return data
-
-    async def _read(self, data: bytes) -> None:
+    async def _read_packet(self, data: bytes) -> None:
         """Take one read as one packet: what piled up while this process was stalled is lost.
 
         Joined packets are the HQ's fault if they came in less time, since a look found nothing, than correctly spaced
         packets need; the text says how long this process did not read if it may be at fault itself.
         """
         received, problem = self._reads.take(data)
-        joined = self._reads.joined
-        if joined and self._unread_s >= self._times.gap_s * (len(joined) - 1):
-            problem += f" (this process read nothing for {self._unread_s * 1000:.0f} ms)"
+        joined, unread_s = self._reads.joined, self._polling.unread_s
+        if joined and unread_s >= self._times.gap_s * (len(joined) - 1):
+            problem += f" (this process read nothing for {unread_s * 1000:.0f} ms)"
             self.piled += [(time.monotonic(), "tcp", packet.kind, packet.body) for packet in joined]
-            del self.piled[: -self._keep]
         if problem:
             self._violate(problem)
         if joined:
@@ -220,12 +171,8 @@ class FragileRobot(FragileServer):
         elif received is not None and self._ignores_next:
             self._ignores_next = False
             self.ignored.append((time.monotonic(), "tcp", received.kind, received.body))
-            del self.ignored[: -self._keep]
         elif received is not None:
-            await self._take(received, "tcp")
-
-    async def _nap(self) -> None:
-        await asyncio.sleep(self._chance.sleeps.uniform(0, self._times.read_s))
+            await self._judge(received, "tcp")
 
     async def _send(self, kind: int, body: bytes = b"") -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
@@ -234,24 +181,21 @@ class FragileRobot(FragileServer):
             return
         if kind in wire.BY_UDP and self._status:
             self._send_datagram(data)
-        elif (conn := self._conn) is not None:
+        elif self._conn is not None:
             try:
                 async with asyncio.timeout(self._times.send_s), self._sending:
-                    await asyncio.get_running_loop().sock_sendall(conn, data)
+                    await self._write(data)
             except TimeoutError:
                 self._event(f"the HQ read nothing for {self._times.send_s:g} s")
-                conn.shutdown(socket.SHUT_RDWR)
-            except ConnectionResetError as error:
-                self._broken = error
-                raise
+                self._shut()
 
     # UDP
 
-    async def _hear(self, udp: socket.socket) -> None:
+    async def _read_datagrams(self, udp: socket.socket) -> None:
         while True:
             await readable(udp)
             try:
-                data, source = udp.recvfrom(_DATAGRAM_BYTES)
+                data, source = udp.recvfrom(wire.DATAGRAM_BYTES)
             except OSError:  # taken by another read, or the report that a datagram of ours was not delivered
                 continue
             await self._datagram(data, source[:2])
@@ -279,7 +223,7 @@ class FragileRobot(FragileServer):
         elif source != self._source:
             self._violate(f"a datagram from {source}, not from where 5 came from: {show(data)}")
         else:
-            await self._take(received, "udp")
+            await self._judge(received, "udp")
 
     def _send_datagram(self, data: bytes) -> None:
         if self._udp is not None and self._source is not None:
@@ -299,17 +243,14 @@ class FragileRobot(FragileServer):
 
     # Packets
 
-    async def _take(self, received: Packet, channel: Channel) -> None:
+    async def _judge(self, received: Packet, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
-        if self._phase is _Phase.ESTABLISHED and self._chance.misreads[kind].random() < self._misread:
-            self.misread.append((time.monotonic(), channel, kind, body))
-            del self.misread[: -self._keep]
-            return
+        if self._phase is _Phase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._misread:
+            return self.misread.append((time.monotonic(), channel, kind, body))
         if self._phase is _Phase.ESTABLISHED and channel == "tcp" and self._loses():
-            return
+            return None
         self.received.append((time.monotonic(), channel, kind, body))
-        del self.received[: -self._keep]
         if kind not in self._registered:
             self._die(f"unregistered packet id {kind} for a robot {self.version} with these flags: {raw}")
         senders = {0, self.client_id} if self._phase is _Phase.GREETED else {self.client_id}
@@ -317,13 +258,9 @@ class FragileRobot(FragileServer):
             self._violate(f"id byte {received.sender} instead of {self.client_id}: {raw}")
         if kind == wire.DEBUG and body == bytes(4):
             self._die(f"a debugMessage with an empty text: {raw}")
-        problem = self._problem(kind, body, channel)
-        if problem:
-            self._violate(f"{problem}: {raw}")
-        elif kind == wire.UDP_PROBE:
-            self._probe()
-        else:
-            await self._obey(kind, body)
+        if self._report(self._problem(kind, body, channel), raw):
+            return None
+        return self._probe() if kind == wire.UDP_PROBE else await self._obey(kind, body)
 
     def _problem(self, kind: int, body: bytes, channel: Channel) -> str:
         by_udp = kind == wire.UDP_PROBE or (kind in wire.BY_UDP and bool(self._status))
@@ -351,7 +288,7 @@ class FragileRobot(FragileServer):
             self.machine.lidar_on = body[0] == 1
             await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
         elif kind == wire.GET_POSITION:
-            misnamed = self._chance.answers.random() < self._misnamed
+            misnamed = self._chance["answer"].random() < self._misnamed
             await self._send(wire.MAP if misnamed else wire.POSITION, self.machine.body(wire.POSITION))
         elif kind == wire.GET_MAP:
             await self._send_map()
@@ -369,8 +306,7 @@ class FragileRobot(FragileServer):
             self._hq_features = settings.features
         else:
             self._violate(f"versions {settings.versions!r} to a robot that understands {safe!r} only: {show(body)}")
-        if settings.problem:
-            self._violate(f"{settings.problem}: {show(body)}")
+        self._report(settings.problem, show(body))
         if Feature.UDP in self.features & self._hq_features:
             return await self._offer_udp()
         return self._establish()
@@ -386,7 +322,7 @@ class FragileRobot(FragileServer):
         late_s = time.monotonic() - self._wake_at
         self._phase = _Phase.WOKEN
         self._awake.set()
-        data = self._waiting()
+        data = self._polling.poll()
         if data == b"":
             return
         if not self._answered and self._loss is not Loss.ANSWER:
@@ -399,7 +335,7 @@ class FragileRobot(FragileServer):
                 problem = f"TCP other than one 7 within {self._times.probe_s:g} s of the 4: {show(data)}"
                 late = f" (this process slept {late_s:.2f} s too long)"
                 self._violate(problem + late * (self._times.probe_s + late_s >= self._times.silence_s))
-            await self._read(data)
+            await self._read_packet(data)
 
     async def _miss_status(self) -> None:
         await asyncio.sleep(2 * self._times.probe_s)
@@ -427,7 +363,7 @@ class FragileRobot(FragileServer):
 
     def _loses(self) -> bool:
         """True if the connection is a poor one and loses the packet."""
-        return self._poor and self._chance.losses.random() < 0.5
+        return self._poor and self._chance["loss"].random() < 0.5
 
     # Motion, maps, talk
 
@@ -449,35 +385,21 @@ class FragileRobot(FragileServer):
 
     async def _send_parts(self, conn: socket.socket | None) -> None:
         """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
-        with contextlib.suppress(OSError):
-            while True:
-                for body in self.machine.parts(self._parts):
-                    if self._conn is not conn:
-                        return
-                    await self._send(wire.MAP_PART, body)
-                    self._parts_since = min(self._parts_since, self._awake_s)
-                    await asyncio.sleep(self._times.part_s)
+        while True:
+            for body in self.machine.parts(self._parts):
+                if self._conn is not conn:
+                    return
+                await self._send(wire.MAP_PART, body)
+                self._parts_since = min(self._parts_since, self._awake_s)
+                await asyncio.sleep(self._times.part_s)
 
     async def _chatter(self, conn: socket.socket | None) -> None:
         mean = self._times.unasked_s
-        with contextlib.suppress(OSError):
-            for kind, body in self.machine.unasked(self.version, self.features, self._hq_features):
-                await asyncio.sleep(self._chance.pauses.uniform(0.5 * mean, 1.5 * mean))
-                if self._conn is not conn:
-                    return
-                await self._send(kind, body or self.machine.body(kind))
-
-    def _waiting(self) -> bytes | None:
-        """Read without waiting: None if nothing is there, empty at the end of the stream."""
-        if self._conn is None:
-            return b""
-        looked_at, data = time.monotonic(), None
-        with contextlib.suppress(BlockingIOError):
-            data = self._conn.recv(wire.READ_BYTES)
-            self._unread_s = time.monotonic() - self._empty_at
-        if data is None or len(data) < wire.READ_BYTES:
-            self._empty_at = looked_at
-        return data
+        for kind, body in self.machine.unasked(self.version, self.features, self._hq_features):
+            await asyncio.sleep(self._chance["pause"].uniform(0.5 * mean, 1.5 * mean))
+            if self._conn is not conn:
+                return
+            await self._send(kind, body or self.machine.body(kind))
 
 
 async def simulate_fragile(
@@ -491,6 +413,5 @@ async def simulate_fragile(
     times: Times = _DEPLOYED,
 ) -> None:
     """Run a fragile robot until cancelled or dead; log each violation, and print what it died of."""
-    robot = FragileRobot(version=version, udp=udp, seed=seed, times=times, note=log_violations(_log))
-    await robot.serve(host, port, ready)
-    print_death(robot)
+    robot = FragileRobot(version=version, udp=udp, seed=seed, times=times, note=log_violations())
+    await simulate(robot, host, port, ready)

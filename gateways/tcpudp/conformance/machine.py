@@ -1,7 +1,4 @@
-"""The simulated robot of the judge: it moves, sees and talks. Sans-IO: no channel, no clock.
-
-Source: "Packets" and "Translation" of the protocol page ``tcpudp.md``.
-"""
+"""The simulated robot of the judge: it moves, sees and talks ("Packets", "Translation"). Sans-IO: no clock."""
 
 from __future__ import annotations
 
@@ -12,21 +9,8 @@ from random import Random
 
 import numpy as np
 
-from gateways.tcpudp.conformance.parser import (
-    CAMERA,
-    CELL_CM,
-    CHAT,
-    DEBUG,
-    GET_SCAN,
-    LIDAR_STATUS,
-    MAP,
-    POSITION,
-    SIDE,
-    Feature,
-    maps,
-    packet,
-    string,
-)
+from gateways.tcpudp.conformance import parser as wire
+from gateways.tcpudp.conformance.parser import CELL_CM, SIDE, Feature, packet, string
 from zbridge.simulation.world import Body, Grid, cast
 
 _SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
@@ -60,7 +44,7 @@ class Machine:
     def choose(self, body: bytes) -> None:
         """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
 
-        When it ends, the motors go on as they went: only a 13 after it stops them.
+        When it ends, the motors keep running: only a 13 after it stops them.
         """
         self._on_its_own = body[0] == 3
         if self._on_its_own:
@@ -68,7 +52,7 @@ class Machine:
 
     @property
     def moving(self) -> bool:
-        """Whether the robot moves, and will go on: it never stops by itself."""
+        """Whether the robot moves: it never stops by itself."""
         return any(self._drive)
 
     def step(self, dt: float) -> None:
@@ -79,19 +63,19 @@ class Machine:
 
     def body(self, kind: int) -> bytes:
         """Give the body of a packet about the robot as it is ("Packets", "Translation")."""
-        if kind == DEBUG:
+        if kind == wire.DEBUG:
             return string(f"battery {self._random.randint(0, 100)} %")
-        if kind == CHAT:
+        if kind == wire.CHAT:
             return self._random.randbytes(self._random.randint(1, 40))
-        if kind == CAMERA:
+        if kind == wire.CAMERA:
             self.camera_on = not self.camera_on
             return struct.pack("<i", 1 if self.camera_on else 2)
-        if kind == LIDAR_STATUS:
+        if kind == wire.LIDAR_STATUS:
             return struct.pack("<i", 1 if self.lidar_on else 2)
-        if kind == POSITION:  # centimetres; heading = radians(h) + pi/2
+        if kind == wire.POSITION:  # centimetres; heading = radians(h) + pi/2
             degrees = math.degrees(self.place.heading - math.pi / 2)
             return struct.pack("<3f", self.place.x * 100, self.place.y * 100, degrees)
-        return struct.pack("<i", len(self._map)) + self._map if kind == MAP else b""
+        return struct.pack("<i", len(self._map)) + self._map if kind == wire.MAP else b""
 
     def parts(self, count: int) -> Iterator[bytes]:
         """Give the bodies of the map's parts; the last runs past the end of the map ("The gateway as HQ")."""
@@ -106,14 +90,14 @@ class Machine:
 
         An empty body: ask :meth:`body` for it when it is sent.
         """
-        told = [(DEBUG, packet(DEBUG, string("two headers")))]
-        kinds = [DEBUG] + [CAMERA] * (Feature.CAM in features) + [CHAT] * (Feature.CHAT in features)
-        kinds += [LIDAR_STATUS] * (Feature.LIDAR in features)
-        if maps(version, features):
-            kinds += [POSITION] + [MAP] * (version != "1.4")
-        kinds += [GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
+        due = [(wire.DEBUG, packet(wire.DEBUG, string("two headers")))]
+        kinds = [wire.DEBUG] + [wire.CAMERA] * (Feature.CAM in features) + [wire.CHAT] * (Feature.CHAT in features)
+        kinds += [wire.LIDAR_STATUS] * (Feature.LIDAR in features)
+        if wire.maps(version, features):
+            kinds += [wire.POSITION] + [wire.MAP] * (version != "1.4")
+        kinds += [wire.GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
         while True:
-            told += [(kind, b"") for kind in kinds]
-            self._random.shuffle(told)
-            yield from told
-            told = []
+            due += [(kind, b"") for kind in kinds]
+            self._random.shuffle(due)
+            yield from due
+            due = []

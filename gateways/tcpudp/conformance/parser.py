@@ -1,8 +1,4 @@
-"""The packets of both judges, sans-IO: reads cut into packets, packets judged and written, settings.
-
-Shares no code with the gateway's messages, so that an error there cannot hide here. Section names in the docstrings are
-those of the protocol page ``tcpudp.md``.
-"""
+"""The packets of both judges, sans-IO: reads cut into packets, packets judged and written, settings."""
 
 from __future__ import annotations
 
@@ -10,11 +6,15 @@ import enum
 import math
 import struct
 from collections.abc import Callable, Collection
+from typing import Literal
 
 import msgspec
 
 from zbridge.simulation.judge import show
 
+Channel = Literal["tcp", "udp"]
+
+DATAGRAM_BYTES = 65536
 READ_BYTES = 4096
 """Most bytes of one read, and so of one packet ("The gateway as HQ": nothing over 4096 bytes)."""
 SERVER_ID = 1
@@ -60,8 +60,6 @@ ANSWERS = {MAP: GET_MAP, POSITION: GET_POSITION}
 _TO_ALL = frozenset({DEBUG, SERVER_SETTINGS, START_UDP, UDP_ANSWER, LIDAR_STATUS, MAP, POSITION})
 KNOWN_TO_HQ = {"1.1": _TO_ALL, "1.2": _TO_ALL | {GET_SCAN}, "1.3": _TO_ALL | {GET_SCAN}}
 """The packet ids that do not cripple an HQ of a version."""
-
-
 IGNORE_ONE = frozenset({"1.1", "1.2"})
 """Versions of robots that ignore the first packet read alone after a stall ("The gateway as robot")."""
 
@@ -197,12 +195,10 @@ class Reads:
         return (packets[0], "") if len(data) <= self._most else (None, self._large(len(data), data))
 
     def _incomplete(self, data: bytes) -> str:
-        if len(data) < 4:
-            return f"a split packet, {len(data)} bytes in one read: {show(data)}"
-        size = 4 + int(struct.unpack_from("<i", data)[0])
+        size = 4 + int(struct.unpack_from("<i", data)[0]) if len(data) >= 4 else 0
         if size > self._most:
             return self._large(size, data)
-        return f"a split packet, {len(data)} of {size} bytes in one read: {show(data)}"
+        return f"a split packet, {len(data)}{f' of {size}' * bool(size)} bytes in one read: {show(data)}"
 
     def _large(self, size: int, data: bytes) -> str:
         return f"a packet of {size} bytes, over {self._most}: {show(data)}"
@@ -215,7 +211,7 @@ def datagram(data: bytes) -> Packet | None:
 
 
 def packet(kind: int, body: bytes = b"", sender: int = SERVER_ID) -> bytes:
-    """Write a packet, of the robot unless told otherwise ("Framing")."""
+    """Write a packet, of the robot by default ("Framing")."""
     return struct.pack("<iBB", 2 + len(body), sender, kind) + body
 
 
@@ -229,6 +225,15 @@ def server_settings(version: str, client: int, features: Collection[Feature], si
     flags = bytes(flag in features for flag in list(Feature)[: FLAGS[version]])
     sizes = struct.pack("<ii", side * CELL_CM, CELL_CM) if FLAGS[version] == 7 else b""
     return bytes([client]) + string(SENT[version]) + flags + sizes
+
+
+def announcement(version: str, features: Collection[Feature] | None, *, udp: bool) -> frozenset[Feature]:
+    """Give the flags that a robot announces, all of its version by default; raise ValueError for others."""
+    known = frozenset(list(Feature)[: FLAGS[version]])
+    others = known if features is None else frozenset(features)
+    if not others <= known:
+        raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
+    return (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
 
 
 def client_settings(body: bytes) -> Settings:
@@ -253,20 +258,21 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Ann
     count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
     if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
         raise ValueError("no version string")
-    told = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
-    understood = _understood(version, told.versions)
+    settings = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
+    understood = _understood(version, settings.versions)
     if not understood:
-        return told
+        return settings
     sized = understood == "1.3"
     flags = FLAGS[understood] - (sized and skips_map_flag)
     size = flags + 8 * sized
-    if len(told.block) < size:
-        raise ValueError(f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}")
-    features = frozenset(flag for flag in list(Feature)[:flags] if told.block[flag])
-    length, interval = struct.unpack_from("<ii", told.block, flags) if sized else (0, 0)
+    if len(settings.block) < size:
+        count = len(settings.block)
+        raise ValueError(f"{count} bytes of settings for the versions {settings.versions!r} instead of {size}")
+    features = frozenset(flag for flag in list(Feature)[:flags] if settings.block[flag])
+    length, interval = struct.unpack_from("<ii", settings.block, flags) if sized else (0, 0)
     if sized and not interval:
         raise ValueError("SLAMMapIntervall 0, a division by zero")
-    return Announced(told.client, told.versions, told.block, understood, features, length, interval)
+    return Announced(settings.client, settings.versions, settings.block, understood, features, length, interval)
 
 
 def _understood(version: str, versions: str) -> str:
@@ -276,13 +282,13 @@ def _understood(version: str, versions: str) -> str:
     return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
 
 
-def announced_problem(told: Announced, *, skips_map_flag: bool = False) -> str:
-    """Tell what is wrong with packet 2 though it cripples nobody ("Settings and version negotiation")."""
-    newest = max((known for known in told.versions.split(",") if known in FLAGS), default="")
-    size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(told.block)
-    if len(told.block) != size and not (skips_map_flag and len(told.block) == size - 1 == 14):
-        return f"{len(told.block)} bytes of settings for the versions {told.versions!r} instead of {size}"
-    return f"client id {told.client}" if told.client < 2 else ""
+def announced_problem(settings: Announced, *, skips_map_flag: bool = False) -> str:
+    """Tell what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
+    newest = max((known for known in settings.versions.split(",") if known in FLAGS), default="")
+    size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(settings.block)
+    if len(settings.block) != size and not (skips_map_flag and len(settings.block) == size - 1 == 14):
+        return f"{len(settings.block)} bytes of settings for the versions {settings.versions!r} instead of {size}"
+    return f"client id {settings.client}" if settings.client < 2 else ""
 
 
 def deadly(version: str, settings: Settings) -> bool:
@@ -314,7 +320,10 @@ def maps(version: str, features: Collection[Feature]) -> bool:
 
 
 def body_problem(kind: int, body: bytes) -> str:
-    """Tell what is wrong with a body from the HQ, empty if nothing ("Packets")."""
+    """Tell what is wrong with a body, empty if nothing: a robot survives it, but for an empty text; an HQ does not.
+
+    Source: "Packets", "The gateway as robot".
+    """
     size = _SIZES.get(kind, len(body))
     if len(body) != size:
         return f"a body of {len(body)} bytes instead of {size}"
@@ -322,20 +331,10 @@ def body_problem(kind: int, body: bytes) -> str:
     return check(body) if check else ""
 
 
-def hq_body_problem(kind: int, body: bytes) -> str:
-    """Tell what cripples an HQ that reads this body, empty if nothing ("Packets", "The gateway as robot")."""
-    size = _HQ_SIZES.get(kind, len(body))
-    if len(body) != size:
-        return f"a body of {len(body)} bytes instead of {size}"
-    if kind == DEBUG:
-        return _text(body) or ("" if body != bytes(4) else "an empty text")
-    return _map(body) if kind == MAP else ""
-
-
-def hq_value_problem(kind: int, body: bytes, side: int) -> str:
+def value_problem(kind: int, body: bytes, side: int) -> str:
     """Tell what values a body has that the page does not know; ``side``: announced cells, 0 if none ("Packets")."""
-    if kind == LIDAR_STATUS and body not in _ON_OFF:
-        return f"lidar status {struct.unpack('<i', body)[0]}"
+    if kind == LIDAR_STATUS:
+        return _one_of("lidar status", (1, 2))(body)
     if kind == POSITION and not all(map(math.isfinite, struct.unpack("<3f", body))):
         return "numbers that are not finite"
     if kind == MAP and len(body) > 4:
@@ -349,17 +348,17 @@ def hq_value_problem(kind: int, body: bytes, side: int) -> str:
 def _text(body: bytes) -> str:
     if len(body) < 4 or struct.unpack_from("<i", body)[0] != len(body) - 4:
         return "a wrong byte count of the string"
+    if body == bytes(4):
+        return "an empty text"
     return "" if body.isascii() else "a text that is not ASCII"
 
 
-def _mode(body: bytes) -> str:
-    (value,) = struct.unpack("<i", body)
-    return "" if value in (1, 2, 3) else f"control mode {value}"
+def _one_of(name: str, values: tuple[int, ...]) -> Callable[[bytes], str]:
+    def check(body: bytes) -> str:
+        (value,) = struct.unpack("<i", body)
+        return "" if value in values else f"{name} {value}"
 
-
-def _lidar(body: bytes) -> str:
-    (value,) = struct.unpack("<i", body)
-    return "" if value in (1, 2) else f"lidar mode {value}"
+    return check
 
 
 def _move(body: bytes) -> str:
@@ -389,24 +388,18 @@ def _map(body: bytes) -> str:
     return "" if math.isqrt(count) ** 2 == count else f"a map of {count} cells, no square"
 
 
-_ON_OFF = (b"\1\0\0\0", b"\2\0\0\0")
-_HQ_SIZES = {START_UDP: 0, UDP_ANSWER: 1, LIDAR_STATUS: 4, POSITION: 12, GET_SCAN: 0}
 _SIZES = {
-    UDP_PROBE: 0,
-    UDP_STATUS: 1,
-    MODE: 4,
-    MOVE: 12,
-    ROTATE: 4,
-    STOP: 0,
-    LIDAR_MODE: 4,
-    GET_MAP: 0,
-    GET_POSITION: 0,
+    **dict.fromkeys((START_UDP, UDP_PROBE, STOP, GET_MAP, GET_POSITION, GET_SCAN), 0),
+    **dict.fromkeys((UDP_ANSWER, UDP_STATUS), 1),
+    **dict.fromkeys((MODE, ROTATE, LIDAR_MODE, LIDAR_STATUS), 4),
+    **dict.fromkeys((MOVE, POSITION), 12),
 }
 _CHECKS: dict[int, Callable[[bytes], str]] = {
     DEBUG: _text,
-    MODE: _mode,
+    MODE: _one_of("control mode", (1, 2, 3)),
     MOVE: _move,
     ROTATE: _rotate,
-    LIDAR_MODE: _lidar,
+    LIDAR_MODE: _one_of("lidar mode", (1, 2)),
     SCAN: _scan,
+    MAP: _map,
 }

@@ -89,6 +89,8 @@ class TcpUdpRobot(Robot):
         """The mode that was commanded last."""
         self._rests_until = -math.inf
         """How long a stop or a neutral is repeated."""
+        self._was_autonomous = False
+        """Whether a gateway before this one may have sent mode 3."""
 
     @property
     def driving(self) -> HqRole | None:
@@ -102,6 +104,7 @@ class TcpUdpRobot(Robot):
             announce=self._announce,
             predecessor=self._session,
         )
+        self._session.sent_autonomous = self._session.sent_autonomous or self._was_autonomous
         self._rests_until = -math.inf
         self._telemetry.begin(self._session)
         return self._session
@@ -131,6 +134,12 @@ class TcpUdpRobot(Robot):
             self._rest(now, until=until)
             return
         self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+
+    def was_autonomous(self) -> None:
+        """Send the pair of packets from the first stop on ("Stops after mode 3")."""
+        self._was_autonomous = True
+        if self._session is not None:
+            self._session.sent_autonomous = True
 
     @property
     def idle_stop_s(self) -> float:

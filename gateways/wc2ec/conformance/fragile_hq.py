@@ -1,116 +1,33 @@
-"""A simulated external controller as fragile as the deployed ones: the judge of a gateway that plays Webots.
-
-It records each violation of what the protocol page ``wc2ec.md`` demands towards external controllers, and dies of what
-ends them. It shares no code with the gateway: not its messages, sessions or translation. Section names in the
-docstrings are those of that page.
-"""
+"""A simulated external controller as fragile as the deployed ones: the judge of a gateway that plays Webots."""
 
 from __future__ import annotations
 
 import asyncio
 import math
-import socket
 import struct
 import time
-from collections.abc import Callable
-
-import msgspec
+from collections.abc import Iterable
+from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
-from gateways.wc2ec.conformance.parser import (
-    CHANGE,
-    DISABLE,
-    ENABLE,
-    LIGHT_TYPE,
-    NO_FIELD,
-    SET,
-    SET_VALUE,
-    Dialect,
-)
-from zbridge.simulation.judge import Ended, Judge, show
-from zbridge.simulation.sockets import connected
+from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, Message
+from zbridge.simulation.fragile import Work, log_violations
+from zbridge.simulation.hq_program import HqProgram, run_hq_program
+from zbridge.simulation.judge import Bounds, Ended, show
 
-REGISTER, ERROR = 0, 127
 MOTOR_TYPES = (53, 46)
 """Rotational and linear motors; the numbers move with the Webots version."""
-
-_DATA = {"deployed": 1, "draft": 0}
-_HEADER, _MEASUREMENT = 3, struct.Struct("<BBBd")
-_FIRST_OF_EC = 128
+WHEEL_RAD_S = 10.0
+"""Velocity of a wheel at full scale: what listeners and configurations here take as such."""
 _SPLIT_S = 0.002
-_READ_BYTES = 65536
 
 
-class Told(msgspec.Struct, frozen=True):
-    """One message of a Webots controller; ``deadly``: why the external controller ends its task, empty if it does not.
+class FragileController(HqProgram):
+    """One start of an external controller: records every violation and dies of the deadly ones.
 
-    ``value``: the name of a registration, the float of a measurement.
+    ``split``: it writes a command field by field; ``flight_s``: how long after a disableSensor data may still come. A
+    row of ``received``: monotonic seconds, command, sensor type, sensor number, name or value.
     """
-
-    command: int
-    node_type: int
-    number: int
-    value: str | float | None
-    raw: bytes
-    deadly: str = ""
-
-
-class Reader:
-    """Cuts the stream of a Webots controller ("no length, the body follows from command and type")."""
-
-    def __init__(self, dialect: Dialect) -> None:
-        """Set up for a dialect."""
-        self.rest = b""
-        self._dialect: Dialect = dialect
-        self._data = _DATA[dialect]
-        self._dead = False
-
-    def take(self, data: bytes) -> list[Told]:
-        """Read the messages that end in ``data``; nothing can be read after what has no length."""
-        told: list[Told] = []
-        self.rest += data
-        while self.rest and not self._dead:
-            if lost := self._lost():
-                command, node_type, number = [*self.rest[:_HEADER], NO_FIELD, NO_FIELD][:_HEADER]
-                told.append(Told(command, node_type, number, None, self.rest, lost))
-                self._dead = True
-            elif len(self.rest) < _HEADER or len(self.rest) < self._size():
-                break
-            else:
-                size = self._size()
-                raw, self.rest = self.rest[:size], self.rest[size:]
-                command, node_type, number = raw[:_HEADER]
-                told.append(Told(command, node_type, number, self._value(raw), raw))
-        return told
-
-    def _lost(self) -> str:
-        """Tell why the framing is lost, empty if it is not ("check the range"; "Dialect ...": the commands)."""
-        command = self.rest[0]
-        if command >= _FIRST_OF_EC:
-            return f"command {command}, which is of the external controller's half"
-        if command != self._data and (self._dialect == "draft" or command not in (REGISTER, ERROR)):
-            return f"unknown command {command}"
-        if self._dialect == "draft" and len(self.rest) > 1 and self.rest[1] != LIGHT_TYPE:
-            return f"unknown sensor type {self.rest[1]}"
-        return ""
-
-    def _size(self) -> int:
-        """Give the size of the message, or as much as must be there to know it."""
-        if self.rest[0] == self._data:
-            return _MEASUREMENT.size
-        if self.rest[0] == ERROR:
-            return _HEADER
-        return _HEADER + 1 + (self.rest[_HEADER] if len(self.rest) > _HEADER else 0)
-
-    def _value(self, raw: bytes) -> str | float | None:
-        if raw[0] == self._data:
-            value: float = _MEASUREMENT.unpack(raw)[3]
-            return value
-        return None if raw[0] == ERROR else raw[_HEADER + 1 :].decode("utf-8", "backslashreplace")
-
-
-class FragileController(Judge):
-    """One start of an external controller: records every violation and dies of the deadly ones."""
 
     def __init__(
         self,
@@ -118,21 +35,12 @@ class FragileController(Judge):
         dialect: Dialect = "deployed",
         split: bool = False,
         flight_s: float = 0.5,
-        keep: int = 10_000,
-        note: Callable[[str], None] | None = None,
+        **bounds: Unpack[Bounds],
     ) -> None:
-        """Set up the controller.
-
-        ``split``: it writes a command field by field; ``flight_s``: how long after a disableSensor data may still come;
-        ``keep``: most entries of every list; ``note``: called with each violation.
-        """
-        if dialect not in _DATA:
+        if dialect not in wire.DATA:
             raise ValueError(f"no such controller: dialect {dialect!r}")
-        super().__init__(keep=keep, note=note)
+        super().__init__(**bounds)
         self.dialect: Dialect = dialect
-        self.received: list[tuple[float, int, int, int, str | float | None]] = []
-        """Monotonic seconds, command, sensor type, sensor number, name or value; good or bad."""
-        self.connected = asyncio.Event()
         self.ready = asyncio.Event()
         """Set by the first data after the connection: before that it does nothing ("The gateway as Webots ...")."""
         self.devices: dict[int, tuple[int, str]] = {}
@@ -146,43 +54,44 @@ class FragileController(Judge):
         self._names: set[str] = set()
         self._disabled: dict[int, float] = {}
         self._split, self._flight_s = split, flight_s
-        self._reader = Reader(dialect)
-        self._conn: socket.socket | None = None
-        self._sending, self._over = asyncio.Lock(), asyncio.Event()
-        self._work: asyncio.Task[None] | None = None
+        self._reader = ControllerReader(dialect)
 
-    def __repr__(self) -> str:
-        state = "over" if self._over.is_set() else "connected" if self.connected.is_set() else "connecting"
-        return f"<FragileController {self.dialect} {state} violations={len(self.violations)} alive={self.alive}>"
+    def _phase_name(self) -> str:
+        return "OVER" if self._over.is_set() else "CONNECTING" if self._conn is None else "CONNECTED"
 
     @property
     def motors(self) -> dict[str, int]:
         """Numbers of the registered motors by name."""
         return {name: number for number, (node_type, name) in self.devices.items() if node_type in MOTOR_TYPES}
 
-    async def run(self, host: str, port: int) -> None:
-        """Connect once and play until dead, until the controller closed, or until cancelled.
+    @property
+    def agreed(self) -> str:
+        ready = self.connected.is_set() and self.ready.is_set()
+        return f"connected: {len(self.devices)} devices, wheels {self._wheels or 'none'}" if ready else ""
 
-        Raise OSError if nobody listens ("it never retries").
-        """
-        async with connected(host, port) as conn:
-            self._conn = conn
-            self.connected.set()
-            if self.dialect == "draft":
-                self.ready.set()
-            try:
-                async with asyncio.TaskGroup() as tasks:
-                    self._work = tasks.create_task(self._live(conn))
-            finally:
-                self._conn = None
-                self._over.set()
-                self.ready.set()
+    @property
+    def _wheels(self) -> dict[str, str]:
+        """Names of the wheels by their side."""
+        names = {side: next((name for name in self.motors if side in name), "") for side in ("left", "right")}
+        return names if all(names.values()) else {}
+
+    def shown(self) -> str:
+        return f"{sum(self.counts.values())} values of {len(self.counts)} devices"
+
+    async def neutral(self) -> None:
+        await self.push(0.0, 0.0)
+
+    async def push(self, forward: float, turn: float) -> None:
+        """Set both wheels, those of two motors whose names say left and right, once ("Roles")."""
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            if side in self._wheels:
+                await self.set(self._wheels[side], WHEEL_RAD_S * max(-1.0, min(1.0, forward + sign * turn)))
 
     async def end(self) -> None:
         """Leave, by closing the connection: the protocol has no message for it ("Roles")."""
-        if self._work is not None and self._conn is not None:
+        if self._conn is not None:
             self._event("the external controller left")
-            self._work.cancel()
+            self._stop()
             await self._over.wait()
 
     # Commands; all raise ConnectionError without a connection
@@ -197,18 +106,18 @@ class FragileController(Judge):
             await self.ready.wait()
         names = {name: number for number, (_, name) in self.devices.items()}
         number = names[device] if isinstance(device, str) else device
-        await self._send(SET_VALUE, self.devices[number][0], number, [struct.pack("<d", value)])
+        await self._send(wire.SET_VALUE, self.devices[number][0], number, [struct.pack("<d", value)])
 
     async def enable(self, number: int) -> None:
         """Send enableSensor ("Dialect `draft`" 128)."""
         self._only("draft")
         self.enabled.add(number)
-        await self._send(ENABLE, LIGHT_TYPE, number, [])
+        await self._send(wire.ENABLE, wire.LIGHT_TYPE, number, [])
 
     async def disable(self, number: int) -> None:
         """Send disableSensor ("Dialect `draft`" 129)."""
         self._only("draft")
-        await self._send(DISABLE, LIGHT_TYPE, number, [])
+        await self._send(wire.DISABLE, wire.LIGHT_TYPE, number, [])
         if number in self.enabled:
             self._disabled[number] = time.monotonic()
         self.enabled.discard(number)
@@ -216,12 +125,12 @@ class FragileController(Judge):
     async def change(self, number: int, index: int, value: float) -> None:
         """Send changeSensor, one configuration value ("Dialect `draft`" 130)."""
         self._only("draft")
-        await self._send(CHANGE, LIGHT_TYPE, number, [bytes([index]), struct.pack("<d", value)])
+        await self._send(wire.CHANGE, wire.LIGHT_TYPE, number, [bytes([index]), struct.pack("<d", value)])
 
     async def configure(self, number: int, values: list[float]) -> None:
         """Send setSensor, all configuration values ("Dialect `draft`" 131)."""
         self._only("draft")
-        await self._send(SET, LIGHT_TYPE, number, [struct.pack("<d", value) for value in values])
+        await self._send(wire.SET, wire.LIGHT_TYPE, number, [struct.pack("<d", value) for value in values])
 
     def _only(self, dialect: Dialect) -> None:
         if self.dialect != dialect:
@@ -240,66 +149,62 @@ class FragileController(Judge):
 
     # The connection
 
-    async def _live(self, conn: socket.socket) -> None:
-        """Read and judge until the connection is over ("EOF ... ends its task silently")."""
-        try:
-            while data := await self._read(conn):
-                for told in self._reader.take(data):
-                    self._hear(told)
-            if self._reader.rest:
-                self._violate(f"the connection ended within a message: {show(self._reader.rest)}")
-        except Ended as ended:
-            self._event(str(ended))
+    def _work(self) -> Iterable[Work]:
+        if self.dialect == "draft":
+            self.ready.set()
+        return (self._live(),)
 
-    async def _read(self, conn: socket.socket) -> bytes:
-        how = "EOF"
-        try:
-            if data := await asyncio.get_running_loop().sock_recv(conn, _READ_BYTES):
-                return data
-        except OSError as error:
-            how = repr(error)
-        self._event(f"the controller closed: {how}")
-        return b""
+    def _before_close(self) -> None:
+        self.ready.set()
+
+    async def _live(self) -> None:
+        """Read and judge until the connection is over ("EOF ... ends its task silently")."""
+        while True:
+            await self._read()
+
+    def _judge_end(self, end: str) -> NoReturn:
+        if self._reader.rest:
+            self._violate(f"the connection ended within a message: {show(self._reader.rest)}")
+        raise Ended(f"the controller closed: {end}")
 
     # Messages
 
-    def _hear(self, told: Told) -> None:
-        self.received.append((time.monotonic(), told.command, told.node_type, told.number, told.value))
-        del self.received[: -self._keep]
-        raw = show(told.raw)
-        if told.deadly:
-            self._die(f"{told.deadly}: {raw}")
-        if isinstance(told.value, str):
-            self._register(told, told.value, raw)
-        elif told.value is None:
-            self._event(f"error: {raw}")  # "sent by nobody; harmless"
+    def _receive(self, message: Message) -> None:
+        value, raw = message.value, show(message.raw)
+        self.received.append((time.monotonic(), message.command, message.node_type, message.number, value))
+        self._report(message.problem, raw, deadly=message.deadly)
+        if isinstance(value, str):
+            self._register(message, value, raw)
+        elif isinstance(value, float):
+            self._measure(message, value, raw)
         else:
-            self._measure(told, told.value, raw)
+            self._event(f"error: {raw}")  # "sent by nobody; harmless"
 
-    def _register(self, told: Told, name: str, raw: str) -> None:
+    def _register(self, message: Message, name: str, raw: str) -> None:
         """Take a registration ("Register each name once (a duplicate kills the deployed EC)"; "index (0..254)")."""
+        number = message.number
         if name in self._names:
             self._die(f"{name!r} registered again: {raw}")
-        if told.number in self.devices:
-            self._violate(f"number {told.number} registered again, {self.devices[told.number][1]!r} before: {raw}")
-        if told.number > wire.MOST_NUMBER:
-            self._violate(f"number {told.number} is no device index: {raw}")
+        if number in self.devices:
+            self._violate(f"number {number} registered again, {self.devices[number][1]!r} before: {raw}")
+        if number > wire.MOST_NUMBER:
+            self._violate(f"number {number} is no device index: {raw}")
         if not name:
             self._violate(f"a device without a name: {raw}")
         if self.counts:
             self._event(f"{name!r} registered after data")
         self._names.add(name)
-        self.devices[told.number] = told.node_type, name
+        self.devices[number] = message.node_type, name
 
-    def _measure(self, told: Told, value: float, raw: str) -> None:
-        number = told.number
+    def _measure(self, message: Message, value: float, raw: str) -> None:
+        number = message.number
         if self.dialect == "draft":
             self._unasked(number, raw)
         elif number not in self.devices:
             self._violate(f"data of number {number}, which is not registered: {raw}")
-        elif self.devices[number][0] != told.node_type:
+        elif self.devices[number][0] != message.node_type:
             node_type, name = self.devices[number]
-            self._violate(f"data of type {told.node_type}: {name!r} was registered with type {node_type}: {raw}")
+            self._violate(f"data of type {message.node_type}: {name!r} was registered with type {node_type}: {raw}")
         if not math.isfinite(value):
             self._event(f"{value} measured by number {number}")
         self.ready.set()
@@ -311,3 +216,13 @@ class FragileController(Judge):
         disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
         if number not in self.enabled and disabled_s > self._flight_s:
             self._violate(f"data of sensor {number}, which is not enabled: {raw}")
+
+
+async def simulate_fragile_hq(
+    host: str, port: int, *, dialect: Dialect, split: bool = False, drive: tuple[float, float] | None = None
+) -> None:
+    """Run a fragile external controller until cancelled, dead or left; log each violation, and print what it does.
+
+    drive: forward and turn, fractions of full scale; None: it sets no motor. Raise OSError if nobody listens.
+    """
+    await run_hq_program(FragileController(dialect=dialect, split=split, note=log_violations()), host, port, drive)

@@ -1,42 +1,36 @@
-"""A simulated Webots controller as fragile as the deployed ones: the judge of a gateway that plays the external one.
-
-It records each violation of what the protocol page ``wc2ec.md`` demands towards Webots, and dies of what kills it. It
-shares no code with the gateway: not its messages, sessions or translation. Section names in the docstrings are those
-of that page.
-"""
+"""A simulated Webots controller as fragile as the deployed ones: the judge of a gateway that plays the external one."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
-import random
 import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.machine import Motor, Robot
-from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Heard, Reader, Times, Value
-from zbridge.simulation.fragile import FragileServer, log_violations, print_line
-from zbridge.simulation.judge import Ended, show
+from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Message, Reader, Times
+from zbridge.simulation.fragile import FragileServer, log_violations, simulate
+from zbridge.simulation.judge import Bounds, Chances, Ended, show
 from zbridge.simulation.sockets import drain, reset_on_close
-from zbridge.simulation.ticker import Ticker
+from zbridge.simulation.timing import Ticker
 
 _MOST_MOVE_S = 0.1
 """Longest time for which the robot moves in one step, however late it is."""
-_VALUES = 3
-_log = logging.getLogger(__name__)
-
-
 _DEPLOYED = Times()
 
 
 class FragileController(FragileServer):
     """One start of a simulation: serves one external controller, records every violation, dies of the deadly ones.
 
-    It ends when its external controller leaves ("Roles").
+    It ends when its external controller leaves ("Roles"). ``devices``: default those of ``DEFAULT``; ``values``:
+    configuration values of a sensor of the draft. A row of ``received``: monotonic seconds, command, sensor type,
+    sensor number, value; of a command that it read, valid or not.
     """
+
+    KEEP = 100_000
+    _reader: Reader
 
     def __init__(
         self,
@@ -44,37 +38,26 @@ class FragileController(FragileServer):
         *,
         devices: Sequence[Device] | None = None,
         seed: int = 1,
-        values: int = _VALUES,
+        values: int = 3,
         times: Times = _DEPLOYED,
-        keep: int = 100_000,
-        note: Callable[[str], None] | None = None,
+        **bounds: Unpack[Bounds],
     ) -> None:
-        """Set up the controller.
-
-        ``devices``: default those of ``DEFAULT``; ``values``: configuration values of a sensor of the draft; ``keep``:
-        most entries of every list; ``note``: called with each violation.
-        """
         if dialect not in DEFAULT:
             raise ValueError(f"no such controller: dialect {dialect!r}")
-        super().__init__(keep=keep, note=note)
+        super().__init__(**bounds)
         self.dialect: Dialect = dialect
         self.devices = tuple(DEFAULT[dialect] if devices is None else devices)
         wire.check(dialect, self.devices)
-        self.received: list[tuple[float, int, int, int, Value]] = []
-        """Monotonic seconds, command, sensor type, sensor number, value; good or bad, if the controller took it."""
-        self.robot = Robot(self.devices, random.Random(f"{seed} robot"), values)
+        chance = Chances(seed)
+        self.robot = Robot(self.devices, chance["robot"], values)
         self.registered = dialect == "draft"
         """Whether the last registration was sent."""
         self._reader = Reader(dialect, self.devices, values)
-        self._cuts = random.Random(f"{seed} cuts")
-        self._times = times
-        self._conn: socket.socket | None = None
-        self._broken: OSError | None = None
+        self._times, self._cuts = times, chance["cuts"]
         self._part_s, self._part_noted = 0.0, False
 
-    def __repr__(self) -> str:
-        phase = self._phase_name()
-        return f"<FragileController {self.dialect} {phase} violations={len(self.violations)} alive={self.alive}>"
+    def _phase_name(self) -> str:
+        return "OVER" if self._over.is_set() else "LISTENING" if self._conn is None else "CONNECTED"
 
     @property
     def motors(self) -> dict[str, Motor]:
@@ -98,87 +81,74 @@ class FragileController(FragileServer):
     # The connection
 
     def _begin(self, conn: socket.socket) -> None:
-        self._conn = conn
-        self._start(self._live(conn))
+        self._start(self._live())
 
-    def _phase_name(self) -> str:
-        return "over" if self._over.is_set() else "listening" if self._conn is None else "connected"
-
-    async def _live(self, conn: socket.socket) -> None:
+    async def _live(self) -> None:
         """Register, then read, judge, move and measure in steps, one thing after the other as Webots does."""
         ticker = Ticker(self._times.step_s)
-        await self._register(conn)
+        await self._register()
         while True:
-            self._listen(conn)
-            self._wait(min(ticker.passed_s, self._times.step_s))
+            self._read()
+            self._judge_delay(min(ticker.passed_s, self._times.step_s))
             self.robot.step(min(ticker.passed_s, _MOST_MOVE_S))
-            measured = self.robot.measure()
-            await self._send(conn, [wire.measurement(self.dialect, *one) for one in measured])
+            await self._send([wire.measurement(self.dialect, *one) for one in self.robot.measure()])
             await ticker.tick()
 
-    async def _register(self, conn: socket.socket) -> None:
+    async def _register(self) -> None:
         """Register all devices, the last one after ``register_s`` ("Sequence"); a command before it is too early."""
         if self.registered:
             return
         registrations = [wire.registration(device) for device in self.devices]
-        await self._send(conn, registrations[:-1])
+        await self._send(registrations[:-1])
         await asyncio.sleep(self._times.register_s)
-        self._listen(conn)
-        await self._send(conn, registrations[-1:])
+        self._read()
+        await self._send(registrations[-1:])
         self.registered = True
 
-    async def _send(self, conn: socket.socket, messages: list[bytes]) -> None:
+    async def _send(self, messages: list[bytes]) -> None:
         """Send messages, joined and split as the seed says."""
         if self._broken or not messages:
             return
         try:
             async with asyncio.timeout(self._times.send_s):
                 for piece in wire.pieces(b"".join(messages), self._cuts):
-                    await asyncio.get_running_loop().sock_sendall(conn, piece)
+                    await self._write(piece)
         except TimeoutError:
             raise Ended(f"the external controller read nothing for {self._times.send_s:g} s") from None
-        except OSError as error:
-            self._broken = error  # reported once: the next read takes what is left, and sees an end
 
     # Commands
 
-    def _listen(self, conn: socket.socket) -> None:
+    def _read(self) -> None:
         """Take all that came since the last step as one read, and the end of the connection."""
-        data, end = drain(conn)
+        data, end = drain(self._tcp)
         if data:
             self._part_s, self._part_noted = 0.0, False
-        for heard in self._reader.take(data):
-            self._hear(heard)
-        if end or self._broken:
-            self._part(repr(self._broken) if self._broken else end)
+        self._take(data, self._broken or end)
 
-    def _part(self, end: str) -> NoReturn:
+    def _judge_end(self, end: str) -> NoReturn:
         """Judge an end of the connection, and exit ("Roles": it exits when that one disconnects)."""
         if self._reader.rest:
             self._violate(f"the connection ended within a command: {show(self._reader.rest)}")
         moving = "moving" if self.robot.moving else "at rest"
         raise Ended(f"the external controller left the robot {moving}: {end}")
 
-    def _wait(self, passed_s: float) -> None:
+    def _judge_delay(self, passed_s: float) -> None:
         """Judge a part of a command that nothing follows."""
         self._part_s += passed_s
         if self._reader.rest and self._part_s > self._times.part_s and not self._part_noted:
             self._part_noted = True
             self._violate(f"part of a command, and no more for {self._part_s:.2f} s: {show(self._reader.rest)}")
 
-    def _hear(self, heard: Heard) -> None:
-        self.received.append((time.monotonic(), heard.command, heard.node_type, heard.number, heard.value))
-        del self.received[: -self._keep]
-        raw = show(heard.raw)
-        if heard.deadly:
-            self._die(f"{heard.problem}: {raw}")
-        if not self.registered:
+    def _receive(self, message: Message) -> None:
+        self.received.append((time.monotonic(), message.command, message.node_type, message.number, message.value))
+        raw = show(message.raw)
+        if not self.registered and not message.deadly:
             self._violate(f"a command before the last registration: {raw}")
-        if heard.problem:
-            self._violate(f"{heard.problem}: {raw}")
-        elif self.dialect == "deployed":
-            self.robot.set_motor(heard)
-        elif needless := self.robot.set_sensor(heard):
+        if self._report(message.problem, raw, deadly=message.deadly):
+            return
+        if self.dialect == "deployed":
+            self.robot.set_motor(message)
+        elif needless := self.robot.set_sensor(message):
             self._event(needless)
 
 
@@ -196,7 +166,5 @@ async def simulate_fragile(
 
     It prints why it ended, if it was not cancelled. ``ready`` is called with the port once it listens.
     """
-    note = log_violations(_log)
-    controller = FragileController(dialect, devices=devices, seed=seed, times=times, note=note)
-    await controller.serve(host, port, ready)
-    print_line(controller.ending)
+    controller = FragileController(dialect, devices=devices, seed=seed, times=times, note=log_violations())
+    await simulate(controller, host, port, ready)

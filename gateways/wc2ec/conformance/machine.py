@@ -1,7 +1,4 @@
-"""The simulated Webots robot of the judge: its motors turn and its sensors measure. Sans-IO: no channel, no clock.
-
-Section names in the docstrings are those of the protocol page ``wc2ec.md``.
-"""
+"""The simulated Webots robot of the judge: its motors turn and its sensors measure. Sans-IO: no channel, no clock."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from random import Random
 import numpy as np
 import numpy.typing as npt
 
-from gateways.wc2ec.conformance.parser import CHANGE, DISABLE, ENABLE, Device, Heard, Kind
+from gateways.wc2ec.conformance.parser import CHANGE, DISABLE, ENABLE, Device, Kind, Message
 from zbridge.simulation.world import Body, cast
 
 _WHEEL_M, _TRACK_M = 0.05, 0.3
@@ -24,7 +21,6 @@ class Motor:
     """A motor: rotational ones turn at once at the velocity they are set to, linear ones go to a position."""
 
     def __init__(self, device: Device) -> None:
-        """Begin at rest at 0."""
         self.device = device
         self.velocity = 0.0
         """As it is now: rad/s, or m/s of a linear one."""
@@ -32,8 +28,6 @@ class Motor:
         """As it is now: rad, or m."""
         self.target = 0.0
         """The last value that it was set to: rad/s, or m."""
-        self.commands = 0
-        """How often it was set."""
 
     def __repr__(self) -> str:
         return f"<Motor {self.device.name!r} {self.velocity:g} at {self.position:g}, set to {self.target:g}>"
@@ -41,7 +35,6 @@ class Motor:
     def set(self, value: float) -> None:
         """Take a setValue."""
         self.target = value
-        self.commands += 1
         if self.device.kind is Kind.ROTATIONAL:
             self.velocity = value
 
@@ -57,10 +50,12 @@ class Motor:
 
 
 class Robot:
-    """One robot: its wheels are the rotational motors whose names have ``left`` or ``right`` in them."""
+    """One robot, at a seeded place; ``values``: how many configuration values each light sensor has.
+
+    Its wheels are the rotational motors whose names have ``left`` or ``right`` in them.
+    """
 
     def __init__(self, devices: Sequence[Device], random: Random, values: int) -> None:
-        """Set up at a seeded place; ``values``: how many configuration values each light sensor has."""
         self.place = Body.somewhere(random)
         self.motors = {device.name: Motor(device) for device in devices if device.motor}
         lights = [device.number for device in devices if device.kind is Kind.LIGHT]
@@ -79,25 +74,25 @@ class Robot:
         """Whether any rotational motor turns."""
         return any(motor.velocity for motor in self._numbers.values() if motor.device.kind is Kind.ROTATIONAL)
 
-    def set_motor(self, heard: Heard) -> None:
+    def set_motor(self, message: Message) -> None:
         """Obey a setValue that is all right."""
-        assert isinstance(heard.value, float)
-        self._numbers[heard.number].set(heard.value)
+        assert isinstance(message.value, float)
+        self._numbers[message.number].set(message.value)
 
-    def set_sensor(self, heard: Heard) -> str:
+    def set_sensor(self, message: Message) -> str:
         """Obey a command of the draft that is all right; tell what it does without need, empty if nothing."""
-        number, had = heard.number, heard.number in self.enabled
-        if heard.command == ENABLE:
+        number, had = message.number, message.number in self.enabled
+        if message.command == ENABLE:
             self.enabled.add(number)
             return f"light sensor {number} enabled again" * had
-        if heard.command == DISABLE:
+        if message.command == DISABLE:
             self.enabled.discard(number)
             return f"light sensor {number} disabled that was not enabled" * (not had)
-        assert isinstance(heard.value, tuple)
-        if heard.command == CHANGE:
-            self.configuration[number][int(heard.value[0])] = heard.value[1]
+        assert isinstance(message.value, tuple)
+        if message.command == CHANGE:
+            self.configuration[number][int(message.value[0])] = message.value[1]
         else:
-            self.configuration[number] = list(heard.value)
+            self.configuration[number] = list(message.value)
         return ""
 
     def step(self, dt: float) -> None:
@@ -124,5 +119,5 @@ class Robot:
                 value = lamp * (1.5 + math.cos(self.place.heading + bearing)) * 10
             else:
                 continue
-            measured.append((device, value if device.reading is None else device.reading))
+            measured.append((device, value))
         return measured

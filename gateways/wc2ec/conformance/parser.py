@@ -1,8 +1,4 @@
-"""The messages of both judges, sans-IO: streams cut into commands, commands judged, messages written.
-
-Shares no code with the gateway's messages, so that an error there cannot hide here.
-Section names in the docstrings are those of the protocol page ``wc2ec.md``.
-"""
+"""The messages of both judges, sans-IO: streams cut into messages, commands judged, messages written."""
 
 from __future__ import annotations
 
@@ -15,19 +11,27 @@ from typing import Literal
 
 import msgspec
 
+from zbridge.simulation.judge import MessageReader
+
 Dialect = Literal["deployed", "draft"]
-Value = float | tuple[float, ...] | None
-"""What a command carries: ``setValue`` its float, ``changeSensor`` which and what, ``setSensor`` all."""
+Value = str | float | tuple[float, ...] | None
+"""What a message carries: the name of a registration, the float of a measurement or of ``setValue``, of
+``changeSensor`` which value and its float, of ``setSensor`` all.
+"""
 
 ENABLE, DISABLE, CHANGE, SET = 128, 129, 130, 131
 SET_VALUE = 130
 """The only command of ``deployed``; the draft has the same number for ``changeSensor``."""
+REGISTER, ERROR = 0, 127
+DATA = {"deployed": 1, "draft": 0}
+"""The command of a measurement."""
 LIGHT_TYPE = 0
 MOST_NUMBER = 254
 NO_FIELD = -1
 """Stands for a header field that was not there yet when the command was judged."""
 
-_FIRST_OF_EC, _HEADER, _NAME_BYTES = 128, 3, 255
+_FIRST_OF_EC, _NAME_BYTES = 128, 255
+_HEADER, _FLOAT = 3, struct.Struct("<BBBd")
 _COMMANDS = {"deployed": (SET_VALUE,), "draft": (ENABLE, DISABLE, CHANGE, SET)}
 
 
@@ -42,13 +46,12 @@ class Kind(enum.Enum):
 
 
 class Device(msgspec.Struct, frozen=True):
-    """One device of the robot; ``reading`` is what it always measures, None if the world is to say."""
+    """One device of the robot."""
 
     name: str
     number: int
     node_type: int
     kind: Kind
-    reading: float | None = None
 
     @property
     def motor(self) -> bool:
@@ -80,8 +83,8 @@ class Times(msgspec.Struct, frozen=True, kw_only=True):
     """Longest time one round of data may take to send."""
 
 
-class Heard(msgspec.Struct, frozen=True):
-    """One command: header and value, what is wrong with it, and whether it kills or blocks the controller."""
+class Message(msgspec.Struct, frozen=True):
+    """One message: header and value, what is wrong with it, and whether it kills or blocks the judge."""
 
     command: int
     node_type: int
@@ -106,81 +109,89 @@ def check(dialect: Dialect, devices: Collection[Device]) -> None:
         raise ValueError("two devices with one name or number")
 
 
-class Reader:
+class _Reader(MessageReader[Message]):
+    """Cuts the stream of either side ("no length, the body follows from command and type")."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        super().__init__()
+        self._dialect: Dialect = dialect
+
+    def _lost(self, data: bytes) -> str:
+        """Tell why the framing is lost, empty if it is not ("check the range"; "Dialect ...": the commands)."""
+        if problem := self._unknown(data[0]):
+            return problem
+        if self._dialect == "draft" and len(data) > 1 and data[1] != LIGHT_TYPE:
+            return f"unknown sensor type {data[1]}"
+        return ""
+
+    def _unknown(self, command: int) -> str:
+        """Tell why a command is not to be framed, empty if it is known."""
+        raise NotImplementedError
+
+    def _lose(self, problem: str, after: int) -> Message:
+        command, node_type, number = [*self.rest[:_HEADER], NO_FIELD, NO_FIELD][:_HEADER]
+        self.dead = True
+        return Message(command, node_type, number, None, self.rest, problem, deadly=True)
+
+
+class Reader(_Reader):
     """Cuts and judges the stream of an external controller, one read at a time.
 
     What it cannot frame it throws away with the rest of the read. ``blocked``: a 130 went to no motor, and "every later
-    command is stuck".
+    command is stuck". ``values``: how many configuration values a sensor of the draft has.
     """
 
     def __init__(self, dialect: Dialect, devices: Collection[Device], values: int) -> None:
-        """Set up; ``values``: how many configuration values a sensor of the draft has."""
-        self.rest = b""
-        self.blocked = self.dead = False
-        self._dialect, self._values = dialect, values
+        super().__init__(dialect)
+        self.blocked = False
+        self._values = values
         self._devices = {device.number: device for device in devices}
 
-    def take(self, data: bytes) -> list[Heard]:
+    def take(self, data: bytes) -> list[Message]:
         """Read the commands that end in ``data``, which is one read of the controller."""
-        heard: list[Heard] = []
-        self.rest += data
-        while self.rest and not self.blocked and not self.dead:
-            lost = self._lost()
-            if lost:
-                command, node_type, number = [*self.rest[:_HEADER], NO_FIELD, NO_FIELD][:_HEADER]
-                self.dead = bool(heard)
-                problem = lost + ", after a valid one in the same read: it loops for ever" * self.dead
-                heard.append(Heard(command, node_type, number, None, self.rest, problem, self.dead))
-                self.rest = b""
-            elif len(self.rest) < _HEADER or len(self.rest) < self._size():
-                break
-            else:
-                size = self._size()
-                raw, self.rest = self.rest[:size], self.rest[size:]
-                heard.append(self._judge(raw))
-                self.blocked = heard[-1].blocks
-        if self.blocked or self.dead:
+        commands = super().take(data)
+        if self.dead:
             self.rest = b""
-        return heard
+        return commands
 
-    def _lost(self) -> str:
-        """Tell why the framing is lost, empty if it is not ("check the range"; "no length")."""
-        command = self.rest[0]
+    def _unknown(self, command: int) -> str:
         if command < _FIRST_OF_EC:
             return f"command {command}, which is of the controller's half"
-        if command not in _COMMANDS[self._dialect]:
-            return f"unknown command {command}"
-        if self._dialect == "draft" and len(self.rest) > 1 and self.rest[1] != LIGHT_TYPE:
-            return f"unknown sensor type {self.rest[1]}"
-        return ""
+        return "" if command in _COMMANDS[self._dialect] else f"unknown command {command}"
 
-    def _size(self) -> int:
+    def _lose(self, problem: str, after: int) -> Message:
+        lost = super()._lose(problem, after)
+        self.dead, self.rest = after > 0, b""
+        if self.dead:
+            problem += ", after a valid one in the same read: it loops for ever"
+        return msgspec.structs.replace(lost, problem=problem, deadly=self.dead)
+
+    def _size(self, data: bytes) -> int:
         if self._dialect == "deployed":
-            return _HEADER + 8
-        return _HEADER + {ENABLE: 0, DISABLE: 0, CHANGE: 9, SET: 8 * self._values}[self.rest[0]]
+            return _FLOAT.size
+        return _HEADER + {ENABLE: 0, DISABLE: 0, CHANGE: 9, SET: 8 * self._values}[data[0]]
 
-    def _judge(self, raw: bytes) -> Heard:
-        return self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
+    def _read(self, raw: bytes) -> Message:
+        message = self._deployed(raw) if self._dialect == "deployed" else self._draft(raw)
+        self.dead = self.blocked = message.blocks
+        return message
 
-    def _deployed(self, raw: bytes) -> Heard:
+    def _deployed(self, raw: bytes) -> Message:
         """Judge a setValue ("send 130 only to registered motors"; "NaN and infinities")."""
-        command, node_type, number, value = struct.unpack("<BBBd", raw)
+        command, node_type, number, value = _FLOAT.unpack(raw)
         device = self._devices.get(number)
-        problem = ""
         if device is None:
             problem = f"130 to number {number}, which is not registered"
         elif not device.motor:
             problem = f"130 to {device.name!r}, which is no motor"
         elif device.node_type != node_type:
             problem = f"130 to type {node_type} number {number}: {device.name!r} is of type {device.node_type}"
-        if problem:
-            problem += ": every later command is stuck"
-            return Heard(command, node_type, number, value, raw, problem, blocks=True)
-        assert device is not None
-        problem = "" if math.isfinite(value) else f"{value} to motor {device.name!r}"
-        return Heard(command, node_type, number, value, raw, problem)
+        else:
+            problem = "" if math.isfinite(value) else f"{value} to motor {device.name!r}"
+            return Message(command, node_type, number, value, raw, problem)
+        return Message(command, node_type, number, value, raw, f"{problem}: every later command is stuck", blocks=True)
 
-    def _draft(self, raw: bytes) -> Heard:
+    def _draft(self, raw: bytes) -> Message:
         command, node_type, number = raw[:_HEADER]
         value: Value = None
         floats: tuple[float, ...] = ()
@@ -196,18 +207,44 @@ class Reader:
             problem = f"command {command} to light sensor {number}, which is not there"
         elif not all(map(math.isfinite, floats)):
             problem = f"a configuration value that is no number, {floats}"
-        return Heard(command, node_type, number, value, raw, problem)
+        return Message(command, node_type, number, value, raw, problem)
+
+
+class ControllerReader(_Reader):
+    """Cuts the stream of a Webots controller; nothing can be read after what has no length."""
+
+    def _unknown(self, command: int) -> str:
+        if command >= _FIRST_OF_EC:
+            return f"command {command}, which is of the external controller's half"
+        known = command == DATA[self._dialect] or (self._dialect == "deployed" and command in (REGISTER, ERROR))
+        return "" if known else f"unknown command {command}"
+
+    def _size(self, data: bytes) -> int:
+        if data[0] == DATA[self._dialect]:
+            return _FLOAT.size
+        if data[0] == ERROR:
+            return _HEADER
+        return _HEADER + 1 + (data[_HEADER] if len(data) > _HEADER else 0)
+
+    def _read(self, raw: bytes) -> Message:
+        command, node_type, number = raw[:_HEADER]
+        value: Value = None
+        if command == DATA[self._dialect]:
+            value = _FLOAT.unpack(raw)[3]
+        elif command == REGISTER:
+            value = raw[_HEADER + 1 :].decode("utf-8", "backslashreplace")
+        return Message(command, node_type, number, value, raw)
 
 
 def registration(device: Device) -> bytes:
     """Write a registration ("Dialect `deployed`" 0)."""
     name = device.name.encode()
-    return struct.pack("<BBBB", 0, device.node_type, device.number, len(name)) + name
+    return struct.pack("<BBBB", REGISTER, device.node_type, device.number, len(name)) + name
 
 
 def measurement(dialect: Dialect, device: Device, value: float) -> bytes:
     """Write sensorData ("Dialect `deployed`" 1, "Dialect `draft`" 0)."""
-    return struct.pack("<BBBd", 1 if dialect == "deployed" else 0, device.node_type, device.number, value)
+    return _FLOAT.pack(DATA[dialect], device.node_type, device.number, value)
 
 
 def pieces(data: bytes, random: Random, most: int = 3) -> list[bytes]:

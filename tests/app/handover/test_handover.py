@@ -89,7 +89,7 @@ class Scene:
         self.steps: list[str] = []
         self.successor = PlayedSuccessor(self.steps, looks_after=looks_after)
         describe = lambda parcel: Given(VERSION, {}, 0)  # noqa: E731
-        self.outgoing = Outgoing(self.successor, [PlayedPart(self.steps)], describe, self._drain)
+        self.outgoing = Outgoing(self.successor, lambda: [PlayedPart(self.steps)], describe, self._drain)
         self.drained = asyncio.Event()
         self.drained.set()
 
@@ -149,6 +149,37 @@ async def test_a_successor_that_cannot_be_told_to_go_leaves_everything_where_nob
     with pytest.raises(NotReady, match="the other side has ended"):
         await running
     assert scene.steps[-1] == "go on"
+
+
+async def test_a_gateway_that_ends_meanwhile_takes_everything_back_first(scene: Scene) -> None:
+    running = await scene.up()
+    scene.outgoing.give_up()
+    scene.drained.set()
+    with pytest.raises(NotReady, match="the gateway ends"):
+        await running
+    assert scene.steps == ["prepare", "hold", "withdraw", "go on"]
+    assert scene.successor.process.wait(SOON_S) == -signal.SIGKILL, "before it goes on"
+
+
+async def test_a_gateway_that_ends_before_its_successor_says_hello_waits_for_nothing(scene: Scene) -> None:
+    running = asyncio.ensure_future(scene.outgoing.run())
+    while not hasattr(scene.successor, "channel"):  # noqa: ASYNC110
+        await asyncio.sleep(0.001)
+    scene.outgoing.give_up()
+    with pytest.raises(NotReady, match="the gateway ends"):
+        await asyncio.wait_for(running, SOON_S)
+    with pytest.raises(HandoverError, match="the gateway ends"):  # an end without a word would let it begin
+        await scene.successor.channel.receive(Given, SOON_S)
+    assert scene.steps == []
+
+
+async def test_from_go_on_a_gateway_that_ends_leaves_everything_to_its_successor(scene: Scene) -> None:
+    running = await scene.up()
+    scene.drained.set()
+    await scene.successor.channel.receive(Go, SOON_S)
+    scene.outgoing.give_up()
+    await running
+    assert scene.steps[-1] == "release"
 
 
 @supervised

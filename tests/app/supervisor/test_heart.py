@@ -30,10 +30,8 @@ def test_a_driven_robot_can_be_stopped_within_a_second_and_a_half() -> None:
 def test_a_supervisor_that_was_held_up_waits_a_little_longer_and_not_for_ever() -> None:
     heart = Heart(0.0)
     heart.beat(1.0, driven=True)
-    heart.excuse(0.1)
-    assert heart.deadline == pytest.approx(1.1 + DRIVEN_S)
     for _ in range(5):
-        heart.excuse(10.0)
+        heart.excuse()
     assert heart.deadline == pytest.approx(1.0 + DRIVEN_S + EXCUSED_S)
     heart.beat(2.0, driven=True)
     assert heart.deadline == pytest.approx(2.0 + DRIVEN_S)

@@ -20,7 +20,7 @@ from zbridge.app.supervisor import supervisor as module
 from zbridge.app.supervisor.deposit import Deposit
 from zbridge.app.supervisor.files import Changes, RobotFile
 from zbridge.app.supervisor.forks import SIGNALS, Forks
-from zbridge.app.supervisor.heart import DRIVEN_S, Heart, HeartState
+from zbridge.app.supervisor.heart import DRIVEN_S, EXCUSED_S, Heart, HeartState
 from zbridge.app.supervisor.memory import MemoryWriter
 from zbridge.app.supervisor.messages import Beat, Kept, Opened, Shared
 from zbridge.app.supervisor.post import Post
@@ -110,10 +110,10 @@ def test_no_state_is_said_in_one_line() -> None:
 def test_a_heart_goes_on_with_what_it_knew() -> None:
     heart = Heart(100.0)
     heart.beat(101.0, driven=True)
-    heart.excuse(0.05)
+    heart.excuse()
     again = Heart.of(heart.state)
     assert (again.deadline, again.beats) == (heart.deadline, 1)
-    assert again.deadline == pytest.approx(101.0 + DRIVEN_S + 0.05)
+    assert again.deadline == pytest.approx(101.0 + DRIVEN_S + EXCUSED_S)
 
 
 # A process and its robot

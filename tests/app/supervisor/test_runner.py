@@ -353,6 +353,47 @@ async def test_a_restart_with_a_file_that_cannot_be_read_is_refused_with_the_rea
     assert len(scene.launcher.children) == 1
 
 
+def _only_kill(process: GatewayProcess, number: int) -> None:
+    """Signal a process that bears every other signal."""
+    if number == signal.SIGKILL:
+        os.kill(process.pid, number)
+
+
+async def test_a_changed_file_whose_successor_cannot_be_started_ends_the_process_and_starts_another_one(
+    scene: Scene,
+) -> None:
+    first = await scene.child(0)
+    await scene.until(lambda: scene.runner.process is not None and scene.runner.process.hands_over)
+    restarting = asyncio.ensure_future(scene.runner.restart(scene.runner.file))
+    scene.launcher.refuses = [NotReady("no fork server")]
+    near, far = socket.socketpair()
+    with near, far:
+        first.tell(WantSuccessor(), far.fileno())
+        assert (await first.answer()).reason == "no fork server"
+    await asyncio.wait_for(restarting, SOON_S)  # nothing else is waited for
+    assert (await scene.child(1)).file == scene.runner.file
+    assert (scene.runner.restarts, scene.runner.state) == (0, "offline"), "it was asked for"
+
+
+async def test_the_end_of_a_runner_ends_its_process_in_order_and_starts_no_other_one(scene: Scene) -> None:
+    first = await scene.child(0)
+    first.serves("first")
+    await asyncio.wait_for(scene.runner.end(), SOON_S)
+    await scene.until(lambda: not scene.runner.processes)
+    assert scene.runner.state == "down"
+    assert len(scene.launcher.children) == 1
+
+
+async def test_a_process_that_does_not_end_is_killed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "END_S", 0.01)
+    await scene.child(0)
+    await scene.until(lambda: scene.runner.process is not None)
+    assert scene.runner.process is not None
+    monkeypatch.setattr(GatewayProcess, "signal", _only_kill)
+    await asyncio.wait_for(scene.runner.end(), SOON_S)
+    await scene.until(lambda: scene.runner.process is None)
+
+
 async def test_a_successor_that_the_supervisor_has_no_descriptor_for_is_refused_at_once(scene: Scene) -> None:
     first = await scene.child(0)
     first.serves("first")

@@ -16,7 +16,15 @@ from zbridge.app.certs.reading import load_certificate
 from zbridge.app.roles import Member
 from zbridge.bus import Tls
 from zbridge.bus.tls.certificate import Certificate, read_certificate
-from zbridge.bus.tls.files import ends_soon, folder_tls, is_of_authority, out_of_date, unusable
+from zbridge.bus.tls.files import (
+    ends_soon,
+    folder_settings,
+    folder_tls,
+    is_of_authority,
+    out_of_date,
+    tls_beside,
+    unusable,
+)
 from zbridge.errors import ConfigError
 
 NOW = datetime(2026, 11, 22, 12, 0, 0, tzinfo=UTC)
@@ -130,3 +138,38 @@ def test_the_end_of_a_certificate_is_told_before_it_comes(
 
 def test_a_common_name_without_a_role_names_nobody() -> None:
     assert [Certificate(text, NOW, NOW).role for text in ("gateway.g1", "g1", "")] == ["gateway", "", ""]
+
+
+# A folder, and the routers that it names
+
+
+def test_a_folder_names_the_routers_unless_they_are_given(tmp_path: Path) -> None:
+    (tmp_path / "bus.toml").write_text('[bus]\nconnect = ["tls/hub:7447", "tls/hub2:7447"]\n')
+    settings = folder_settings(tmp_path)
+    assert (settings.mode, settings.multicast) == ("client", False)
+    assert settings.connect == ("tls/hub:7447", "tls/hub2:7447")
+    names = ("ca.pem", "certificate.pem", "key.pem")
+    assert settings.tls == Tls(*(str(tmp_path / name) for name in names)) == folder_tls(tmp_path)
+    assert folder_settings(tmp_path, ["tls/other:1"]).connect == ("tls/other:1",)
+
+
+def test_a_folder_that_is_not_there_or_names_no_router_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--tls .*gone: no such folder"):
+        folder_settings(tmp_path / "gone")
+    with pytest.raises(ConfigError, match=r"no bus\.toml there; give --connect tls/HOST:7447"):
+        folder_settings(tmp_path)
+    for content in ("", "[bus]\n", "bus = 1", "[bus]\nconnect = 1\n", "[bus]\nconnect = [1]\n", "["):
+        (tmp_path / "bus.toml").write_text(content)
+        with pytest.raises(ConfigError, match=r"bus\.toml: expected a \[bus\] table with connect"):
+            folder_settings(tmp_path)
+    (tmp_path / "bus.toml").unlink()
+    (tmp_path / "bus.toml").mkdir()
+    with pytest.raises(ConfigError, match=r"bus\.toml: Is a directory"):
+        folder_settings(tmp_path)
+
+
+def test_paths_of_a_configuration_are_relative_to_its_folder() -> None:
+    here = Path("/etc/zbridge")
+    assert tls_beside(Tls("ca.pem"), here) == Tls("/etc/zbridge/ca.pem")
+    whole = Tls("tls/ca.pem", "/var/c.pem", "tls/k.pem")
+    assert tls_beside(whole, here) == Tls("/etc/zbridge/tls/ca.pem", "/var/c.pem", "/etc/zbridge/tls/k.pem")

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from gateways.alf import hq as module
 from gateways.alf.conformance import parser
-from gateways.alf.conformance.fragile_hq import Reader
+from gateways.alf.conformance.parser import VehicleReader as Reader
 from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import AlfMessage, Dialect, write_text
 from tests.gateways.alf.golden import BINARY, END, INIT, TEXT

@@ -269,3 +269,95 @@ def test_our_own_commands_that_come_back_are_no_other_drivers() -> None:
     scene.written.clear()
     scene.feed(KeyedSample(SampleKind.SAMPLE, sent.key, sent.payload, sent.attachment, scene.time_ns))
     assert (scene.written, scene.session.traffic.malformed) == ([], 0)
+
+
+def test_several_other_drivers_are_named() -> None:
+    scene = RosScene()
+    scene.establish()
+    for number, node in enumerate(("d", "c", "b", "a"), 9):
+        scene.appears("cmd_vel", TWIST, "MP", number=number, node=node)
+    assert scene.session.doubts == ("/a, /b, /c publish /cmd_vel too, and is overruled",)
+
+
+# What it shows of itself, and its end
+
+
+def test_our_own_endpoints_are_no_others() -> None:
+    scene = RosScene()
+    scene.establish()
+    own = [one.key for one in scene.written if one.kind is SampleKind.ANNOUNCE]
+    assert len(own) == 4, "a node, a reader of odometry, a writer and a reader of commands"
+    for made in own:
+        scene.feed(KeyedSample(SampleKind.APPEARED, made, stamp_ns=scene.time_ns))
+    assert (scene.session.doubts, scene.session.traffic.malformed) == ((), 0)
+    assert len(scene.session.graph.publishers) == len(scene.session.graph.takers) == 1
+
+
+OWN = {"map": ("MS", ":1:,1:,:,:,,"), "scan": ("MS", "2::,5:,:,:,,"), "cmd_vel": ("MP", "::,10:,:,:,,")}
+
+
+@pytest.mark.parametrize("topic", OWN)
+def test_our_endpoints_have_the_quality_of_service_of_their_topics_and_a_number_each(topic: str) -> None:
+    scene = RosScene()
+    scene.appears("odom", number=1)
+    made = scene.appears(topic, KINDS.get(topic, TWIST), "MP" if topic in KINDS else "MS", number=2)
+    role, qos = OWN[topic]
+    tokens = [one.key.split("/") for one in scene.written if one.kind is SampleKind.ANNOUNCE]
+    (shown,) = [one for one in tokens if one[9:10] == [f"%{topic}"] and one[5] == role]
+    assert shown[12] == qos
+    assert len({one[4] for one in tokens}) == len(tokens)
+    scene.written.clear()
+    scene.gone(made)
+    scene.appears(topic, KINDS.get(topic, TWIST), "MP" if topic in KINDS else "MS", number=3)
+    assert [one for one in scene.written if one.kind is SampleKind.ANNOUNCE] == [], "shown already"
+
+
+def test_topics_that_are_published_are_shown_by_name() -> None:
+    scene = RosScene()
+    scene.appears("scan", number=5)
+    scene.establish()
+    assert scene.session.features == ("/odom", "/scan")
+    assert scene.session.state.value == "established"
+
+
+def test_the_end_of_a_session_tells_the_robot_to_stand_still() -> None:
+    scene = RosScene()
+    scene.establish()
+    scene.session.drive(Velocity(0.3), scene.now)
+    scene.write()
+    scene.session.close("restarted", scene.now)
+    assert puts(scene.write()) == [ZEROS]
+    assert not scene.session.moving
+
+
+def test_a_shared_robot_that_others_drive_is_left_alone_at_the_end() -> None:
+    scene = RosScene(shared=True)
+    scene.establish()
+    scene.session.close("restarted", scene.now)
+    assert puts(scene.write()) == []
+
+
+def test_samples_that_the_link_dropped_are_counted() -> None:
+    scene = RosScene()
+    for count in (7, 5):
+        scene.feed(KeyedSample(SampleKind.DROPPED, payload=struct.pack("<I", count), stamp_ns=scene.time_ns))
+    assert scene.session.traffic.dropped == 12
+
+
+def test_a_drive_is_repeated_as_long_as_the_robot_is_there() -> None:
+    scene = RosScene(silent_s=60.0)
+    scene.establish()
+    scene.session.drive(Velocity(0.3), scene.now)
+    scene.write()
+    assert [puts(scene.after(1.0)) for _ in range(20)] == [[twist(0.3)]] * 20
+
+
+def test_a_clock_of_the_robot_that_no_stamp_can_hold_gives_a_stamp_of_zero() -> None:
+    scene = RosScene()
+    by = scene.establish(STAMPED)
+    for stamp_ns, written in ((2**31 * 10**9 - 10**9, 2**31 - 1), (2**31 * 10**9 - 1, 0)):
+        scene.hears("odom", by, header=header(stamp_ns))
+        scene.session.drive(Velocity(0.5), scene.now)
+        scene.now += 0.1
+        payload = puts(scene.write())[-1]
+        assert struct.unpack_from("<i", payload, 4) == (written,)

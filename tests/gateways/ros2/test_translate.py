@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from tests.gateways.ros2.scene import TYPES, RosScene, header
-from zbridge.errors import ProtocolError, Unsupported
+from zbridge.errors import NotReady, ProtocolError, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Image, Mode, Motion, Pose, Scanner, Switch
+from zbridge.protocol import KeyedSample, SampleKind
 
 make = TYPES.message
 QUARTER = {"z": math.sin(math.pi / 4), "w": math.cos(math.pi / 4)}
@@ -220,3 +221,55 @@ def test_it_cannot_be_asked(scene: RosScene) -> None:
 
 def test_one_of_two_gateways_may_leave_it_since_each_is_a_session_of_a_router_that_takes_many(scene: RosScene) -> None:
     assert scene.robot.closing_harmless
+
+
+# Stops
+
+
+@pytest.mark.parametrize(("shared", "told"), [(False, True), (True, False)])
+def test_a_stop_is_told_to_a_robot_that_does_not_move_unless_others_may_drive_it(shared: bool, told: bool) -> None:
+    scene = RosScene(shared=shared)
+    scene.establish()
+    scene.robot.stop(scene.now, scene.now)
+    assert bool(scene.write()) is told
+    scene.robot.command(topics.CMD_DRIVE, Drive(0.5), scene.now)
+    scene.write()
+    scene.robot.stop(scene.now, scene.now)
+    assert len(scene.write()) == 1
+    assert not scene.session.moving
+    scene.robot.stop(scene.now, scene.now + 0.25)
+    assert scene.write(), "one that lasts is told in any case"
+
+
+def test_a_robot_that_is_away_takes_nothing() -> None:
+    scene = RosScene()
+    scene.establish()
+    scene.session.close("gone", scene.now)
+    with pytest.raises(NotReady, match=r"^offline$"):
+        scene.robot.command(topics.CMD_DRIVE, Drive(0.5), scene.now)
+
+
+def test_a_new_session_remembers_nothing_of_the_one_before(scene: RosScene) -> None:
+    heard(scene, "odom", **odometry(0.0, 1.0, 0.3))
+    heard(scene, "imu")
+    heard(scene, "scan", **SCAN)
+    assert scene.robot.known(topics.POSE) is not None
+    scene.session = scene.robot.session("router", "tcp://h:1")
+    scene.session.open(scene.now)
+    scene.feed(KeyedSample(SampleKind.OPENED, payload=b"cafe", stamp_ns=scene.time_ns))
+    assert scene.robot.known(topics.POSE) is None
+    assert scene.robot.driving is scene.session
+    assert "scanner" in heard(scene, "scan", **SCAN)
+    assert heard(scene, "imu")["motion"].speed is None
+
+
+@pytest.mark.parametrize(("status", "charging"), [(0, None), (1, True), (2, False), (3, False), (4, False)])
+def test_whether_a_battery_is_charged_is_told_where_the_robot_knows(
+    scene: RosScene, status: int, charging: bool | None
+) -> None:
+    assert heard(scene, "battery_state", percentage=1.0, power_supply_status=status)["battery"].charging is charging
+
+
+def test_a_drive_says_nothing_of_what_was_left_out_where_nothing_was(scene: RosScene) -> None:
+    assert scene.robot.command(topics.CMD_DRIVE, Drive(0.5, turn=1.0), scene.now).left_out is None
+    assert scene.robot.command(topics.CMD_DRIVE, Drive(0.5, 0.1), scene.now).left_out == "left: this robot has none"

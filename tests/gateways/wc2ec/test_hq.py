@@ -16,12 +16,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateways.wc2ec.conformance.fragile_hq import Reader
+from gateways.wc2ec.conformance.parser import ControllerReader as Reader
 from gateways.wc2ec.hq import HqOptions, Wc2EcHq, Wheels, device_table, display
 from gateways.wc2ec.settings import DeviceOption, Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import stream
-from tests.conformance.script_table import table
+from tests.conformance.scene import table
 from tests.gateways.rig import HqScene, drained
 from tests.gateways.wc2ec.golden import DISTANCE, LINEAR, ROTATIONAL, data, light, registration
 from zbridge.errors import ConfigError, ProtocolError

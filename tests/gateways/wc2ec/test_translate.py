@@ -11,7 +11,7 @@ from gateways.wc2ec import PROTOCOL
 from gateways.wc2ec.session import ExternalRole
 from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
-from tests.conformance.script_table import table
+from tests.conformance.scene import table
 from tests.gateways.rig import drained, planned
 from tests.gateways.wc2ec.golden import DISTANCE, LINEAR, ROTATIONAL, data, light, registration
 from zbridge.app import config

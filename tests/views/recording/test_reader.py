@@ -89,15 +89,15 @@ def test_a_bomb_takes_no_more_memory_than_its_chunk_may_have() -> None:
     assert "says that it has" in (reader.fault or "")
 
 
-def test_a_million_channels_end_the_file_within_its_bounds() -> None:
+def test_more_channels_than_are_kept_end_the_file_within_its_bounds() -> None:
     one = b"".join(files.channel(number, f"fleet/r1/sensor/{number}{'x' * 900}") for number in range(65_536))
     reader = Reader(files.stream(one, files.channel(1, "other")))
     assert list(reader.messages()) == []
     assert "and then" in (reader.fault or "") or "more than" in (reader.fault or "")
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    again = Reader(files.stream(*[files.channel(1, "k")] * 1_000_000, files.END))
+    again = Reader(files.stream(*[files.channel(1, "k")] * 100_000, files.END))
     assert list(again.messages()) == []
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 150_000  # kB: the file itself is in memory
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB: the file itself is in memory
 
 
 def test_random_bytes_never_raise(tmp_path: Path) -> None:

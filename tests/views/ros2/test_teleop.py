@@ -9,15 +9,19 @@ from typing import Any
 import pytest
 
 from zbridge.bus.fake import FakeBus
-from zbridge.bus.interface import Sample
+from zbridge.bus.interface import Lane, Sample
 from zbridge.client import Fleet
+from zbridge.fleet import topics
+from zbridge.fleet.messages import Control
+from zbridge.fleet.payload import encode
 from zbridge.metrics import Metrics
 from zbridge.ros2 import KEEP_LAST_10, Attachment, Endpoint, Kind, Node, types_of
 from zbridge.views.ros2.cmd_vel import TWIST
+from zbridge.views.ros2.diagnostics import OK, WARN
 from zbridge.views.ros2.driving import PUBLISHERS, Standing
 from zbridge.views.ros2.outlets import RosSide
 from zbridge.views.ros2.settings import Body
-from zbridge.views.ros2.teleop import ASK_S, SETTLE_S, Teleop
+from zbridge.views.ros2.teleop import ASK_S, RATE_HZ, SETTLE_S, STRANGERS_HZ, Teleop
 
 pytestmark = pytest.mark.jumping
 FORWARD = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0)
@@ -31,8 +35,16 @@ class Scene:
         self.side = RosSide(self.bus, 0, types_of("jazzy"), Metrics())
         robot = Fleet(FakeBus(), "fleet", None)["r1"]
         node = self.side.node("/r1", "zbridge")
-        self.teleop = Teleop(self.side, node, robot, Body(), FakeBus(), "fleet/r1/control", "ros2")
+        self.fleet = FakeBus()
+        self.teleop = Teleop(self.side, node, robot, Body(), self.fleet, "fleet/r1/control", "ros2")
         self.driving: Any = self.teleop._driving
+
+    def counted(self, what: str) -> int:
+        return self.side.metrics.total(f"ros2_cmd_vel_{what}")
+
+    def control(self, state: str) -> None:
+        """Let the robot's gateway tell who drives."""
+        self.fleet.publisher("fleet/r1/control", topics.CONTROL).put(encode(Control(state=state)))
 
     def endpoint(self, number: int = 1) -> Endpoint:
         return self.side.endpoint(
@@ -146,3 +158,96 @@ async def test_a_twist_that_waited_until_the_end_takes_no_robot() -> None:
     scene.put(stick)
     await closing
     assert scene.driving.holder is None
+
+
+# What is heard at all, and what is told
+
+
+async def test_what_a_known_publisher_sends_is_taken_at_a_bounded_rate_and_strangers_rarely() -> None:
+    scene = Scene()
+    known, stranger = scene.endpoint(), scene.endpoint()
+    scene.bus.announce(known.token())
+
+    def lanes(endpoint: Endpoint, count: int) -> int:
+        beside = Attachment(1, 1, endpoint.gid()).encode()
+        taken = [scene.teleop._sort(len(FORWARD), "key", beside, len(FORWARD), lambda: FORWARD) for _ in range(count)]
+        assert set(taken) <= {Lane.OTHER, None}
+        return sum(lane is not None for lane in taken)
+
+    assert RATE_HZ <= lanes(known, 1000) < 2 * RATE_HZ
+    assert STRANGERS_HZ <= lanes(stranger, 1000) < 2 * STRANGERS_HZ
+    assert scene.counted("strangers") == 1000
+    assert scene.counted("too_fast") > 500
+    scene.driving.holder = known.gid()
+    await asyncio.sleep(1.0)
+    beside = Attachment(1, 1, known.gid()).encode()
+    assert scene.teleop._sort(len(FORWARD), "key", beside, len(FORWARD), lambda: FORWARD) is Lane.COMMAND
+    await scene.teleop.close()
+
+
+@pytest.mark.parametrize(("beside", "size"), [(None, 52), (bytes(32), 52), (bytes(34), 52), (bytes(33), 52 + 34)])
+async def test_what_is_no_command_by_its_size_is_dropped_and_counted(beside: bytes | None, size: int) -> None:
+    scene = Scene()
+    assert scene.teleop._sort(52, "key", beside, size, lambda: b"") is None
+    assert (scene.counted("malformed"), scene.counted("strangers")) == (1, 0)
+    await scene.teleop.close()
+
+
+async def test_tokens_of_other_types_are_counted_and_shown_until_they_go() -> None:
+    scene = Scene()
+    node = Node(0, "abc", 1, "/", "nav")
+    wrong = Endpoint(node, 7, Kind.PUBLISHER, "/r1/cmd_vel", "std_msgs/msg/String", "RIHS01_0")
+    other = Endpoint(node, 8, Kind.PUBLISHER, "/r1/cmd_vel", TWIST, "RIHS01_0")
+    handles = [scene.bus.announce(each.token()) for each in (wrong, other)]
+    scene.teleop._on_token("@ros2_lv/what", True)
+    told = scene.teleop.diagnostics()
+    assert told.level == WARN
+    assert [value for name, value in told.values if name == "refused"] == [
+        "/nav publishes std_msgs/msg/String RIHS01_0",
+        f"/nav publishes {TWIST} RIHS01_0",
+    ]
+    assert (scene.counted("wrong_type"), scene.counted("tokens_unreadable")) == (2, 1)
+    for handle in handles:
+        handle.close()
+    assert scene.teleop.diagnostics().level == OK
+    assert scene.driving.publishers == {}
+    await scene.teleop.close()
+
+
+async def test_a_robot_that_somebody_stops_is_owed_a_zero_by_its_publishers() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    publisher = scene.bus.announce(scene.endpoint().token())
+    states = []
+    for state in ("free", "held", "stopped"):
+        scene.control(state)
+        states.append([each.standing for each in scene.driving.publishers.values()])
+    assert states == [[Standing.FREE], [Standing.FREE], [Standing.OWES]]
+    told = scene.teleop.diagnostics()
+    assert told.level == WARN
+    assert "the robot was stopped: send a zero, or nothing for a second, then drive" in told.message
+    publisher.close()
+    assert scene.fleet._shared.subscribers == [], "without publishers nobody looks"
+    await scene.teleop.close()
+
+
+async def test_a_robot_that_was_stopped_already_asks_nothing_of_who_comes() -> None:
+    scene = Scene()
+    await asyncio.sleep(SETTLE_S * 2)
+    scene.bus.announce(scene.endpoint().token())
+    for state in ("latched", "stopped"):
+        scene.control(state)
+    scene.fleet.publisher("fleet/r1/control", topics.CONTROL).put(b"?")
+    assert [each.standing for each in scene.driving.publishers.values()] == [Standing.FREE]
+    await scene.teleop.close()
+
+
+async def test_garbage_of_a_publisher_is_counted_and_moves_nothing() -> None:
+    scene = Scene()
+    endpoint = scene.endpoint()
+    scene.bus.announce(endpoint.token())
+    for beside, payload in ((b"?", FORWARD), (Attachment(1, 1, endpoint.gid()).encode(), FORWARD[:20])):
+        scene.teleop._take(TWIST, Sample(endpoint.key, payload, beside))
+    assert scene.counted("malformed") == 2
+    assert scene.driving.holder is None
+    await scene.teleop.close()

@@ -74,7 +74,7 @@ class Channel:
             for start in range(0, len(descriptors), _GROUP):
                 socket.send_fds(self._socket, [b"."], descriptors[start : start + _GROUP])
         except OSError as error:
-            with contextlib.suppress(EndError):
+            with contextlib.suppress(EndError, SilentError):
                 self._receive(Failed, LAST_WORD_S)  # it may have said why it ends
             if isinstance(error, ConnectionError):
                 raise EndError(_ENDED) from error
@@ -88,7 +88,7 @@ class Channel:
                 raise HandoverError(f"message of {size} bytes exceeds {MESSAGE_BYTES}")
             message = decode(self._read(size))
         except TimeoutError as error:
-            raise HandoverError(f"the other side says nothing for {timeout_s:g} s") from error
+            raise SilentError(f"the other side says nothing for {timeout_s:g} s") from error
         except OSError as error:  # reset: it ended with a message of ours unread
             raise EndError(_ENDED) from error
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
@@ -127,3 +127,7 @@ class Channel:
 
 class EndError(HandoverError):
     """The other side has ended without a word."""
+
+
+class SilentError(HandoverError):
+    """The other side says nothing in time."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import socket
 
-from zbridge.app.handover.channel import Channel, EndError
+from zbridge.app.handover.channel import EndError
 from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
+from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.errors import HandoverError
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
@@ -31,15 +31,19 @@ GO_S = 30.0
 class Incoming:
     """What comes by the channel. ``setup``: what must be the same in both configurations, by key.
 
-    ``supervised``: somebody looks after the robot if the other process dies.
+    ``supervised``: somebody looks after the robot if the other process dies. ``processes``: of this machine, or
+    simulated ones.
     """
 
-    def __init__(self, end: socket.socket, setup: Exported, *, supervised: bool = False) -> None:
+    def __init__(
+        self, end: socket.socket, setup: Exported, *, supervised: bool = False, processes: Processes = PROCESSES
+    ) -> None:
         self.given: Given
         self.parcel = Parcel()
         self.begun = asyncio.Event()
         """Set when the other process has let go."""
-        self._channel = Channel(end)
+        self._channel = processes.channel(end)
+        self._own_pid = processes.own_pid
         self._setup = setup
         self._supervised = supervised
         self._missing = 0
@@ -49,7 +53,7 @@ class Incoming:
 
     async def receive(self) -> Given:
         """Say hello, wait for the state and its descriptors; raise HandoverError."""
-        await self._channel.send(Hello(VERSION, os.getpid()))
+        await self._channel.send(Hello(VERSION, self._own_pid))
         given = await self._channel.receive(Given, GIVEN_S)
         if given.version != VERSION:
             raise HandoverError(f"a state of version {given.version}: this zbridge takes {VERSION}")

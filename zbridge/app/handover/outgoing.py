@@ -21,21 +21,21 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
-import select
-import signal
-import socket
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from zbridge.app.handover.channel import Channel
 from zbridge.app.handover.messages import VERSION, Failed, Given, Go, Hello, Up
+from zbridge.app.handover.processes import PROCESSES, OtherProcess, Processes
 from zbridge.app.handover.successor import Successor
 from zbridge.errors import BusError, HandoverError, NotReady, Refused
 from zbridge.protocol.kept import Exported
 from zbridge.transport import Parcel
+from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
+
+M = TypeVar("M")
 
 RESTARTED = "gateway restarted"
 START_S = 30.0
@@ -44,8 +44,6 @@ PREPARE_S = 4.0
 """Longest time until the stop is written and all links have taken everything: a late handshake is silent for 2.5 s."""
 TAKE_OVER_S = 5.0
 """Longest time until the successor has taken everything over; nothing is read or written meanwhile."""
-END_S = 2.0
-"""Longest wait for the end of a successor that was killed."""
 
 
 class Part(Protocol):
@@ -78,43 +76,57 @@ Describe = Callable[[Parcel], Given]
 
 
 class Outgoing:
-    """One handover. ``successor``: starts it. ``parts``: what is handed over. ``describe``: writes all of it.
+    """One handover. ``successor``: starts it. ``parts``: gives what is handed over, once the successor is there.
+
+    ``describe``: writes all of it.
 
     ``drain``: waits until what was published has left: what the successor publishes must not overtake it.
+    ``processes``, ``kernel``: of this machine, or simulated ones.
     """
 
     def __init__(
-        self, successor: Successor, parts: Sequence[Part], describe: Describe, drain: Callable[[], Awaitable[None]]
+        self,
+        successor: Successor,
+        parts: Callable[[], Sequence[Part]],
+        describe: Describe,
+        drain: Callable[[], Awaitable[None]],
+        processes: Processes = PROCESSES,
+        kernel: Kernel = KERNEL,
     ) -> None:
         self._successor = successor
-        self._parts = parts
+        self._find_parts = parts
+        self._parts: Sequence[Part] = ()
         self._describe = describe
         self._drain = drain
-        self._pid: int | None = None
-        self._process: int | None = None
+        self._processes = processes
+        self._kernel = kernel
+        self._process: OtherProcess | None = None
+        self._ends = asyncio.Event()
+        """Set when the gateway ends."""
 
     def __repr__(self) -> str:
-        return f"<Outgoing to process {self._pid}>"
+        return f"<Outgoing to {self._process}>"
 
     async def run(self) -> int:
         """Hand everything over; return the process that has it. Raise Refused and its reason: all is as before then."""
         try:
-            near, far = socket.socketpair()
+            channel, far = self._processes.pair()
         except OSError as error:
             log.error("not restarted: %s", error)
             raise NotReady(f"not restarted: {error}") from error
-        channel, changed, looked_after = Channel(near), False, False
+        changed = looked_after = False
         try:
             with far:
                 await self._successor.start_successor(far)
-            hello = await channel.receive(Hello, START_S)
+            hello = await self._hear(channel, Hello, START_S)
             self._know(hello)
-            changed = True
+            changed, self._parts = True, self._find_parts()
             await self._give(channel)
-            await channel.receive(Up, TAKE_OVER_S)
+            await self._hear(channel, Up, TAKE_OVER_S)
             for part in self._parts:
                 part.withdraw()
             await self._drain()
+            self._require_no_end()
             looked_after = self._successor.handed_over()
             if not looked_after:
                 await channel.send(Go())
@@ -134,6 +146,26 @@ class Outgoing:
         self._forget()
         return hello.pid
 
+    def give_up(self) -> None:
+        """Give the handover up, for the gateway ends: everything is taken back, unless the successor is told to go."""
+        self._ends.set()
+
+    def _require_no_end(self) -> None:
+        if self._ends.is_set():
+            raise HandoverError("the gateway ends")
+
+    async def _hear(self, channel: Channel, kind: type[M], within_s: float) -> M:
+        """Wait for a message of the successor; raise HandoverError where the gateway ends meanwhile."""
+        message = asyncio.ensure_future(channel.receive(kind, within_s))
+        ends = asyncio.ensure_future(self._ends.wait())
+        try:
+            await asyncio.wait((message, ends), return_when=asyncio.FIRST_COMPLETED)
+            self._require_no_end()
+            return await message
+        finally:
+            message.cancel()
+            ends.cancel()
+
     async def _give(self, channel: Channel) -> None:
         """Stop, hold and describe everything; send it."""
         await asyncio.gather(*(part.prepare(RESTARTED, PREPARE_S) for part in self._parts))
@@ -141,7 +173,7 @@ class Outgoing:
             await part.shut()
         for part in self._parts:
             part.hold()
-        parcel = Parcel()
+        parcel = Parcel(kernel=self._kernel)
         try:
             await channel.send(self._describe(parcel), parcel)
         finally:
@@ -151,7 +183,9 @@ class Outgoing:
         """End the successor; go on when it has ended."""
         log.error("not restarted: %s", reason)
         channel.say(Failed(reason))
-        await asyncio.to_thread(self._end_successor)
+        if self._process is not None:
+            await self._process.kill()
+            self._forget()
         channel.close()
         if changed:
             for part in self._parts:
@@ -162,19 +196,9 @@ class Outgoing:
     def _know(self, hello: Hello) -> None:
         if hello.version != VERSION:
             raise HandoverError(f"the successor takes states of version {hello.version}, this gateway has {VERSION}")
-        self._pid = hello.pid
-        with contextlib.suppress(OSError, AttributeError):  # it may have ended; not every kernel has it
-            self._process = os.pidfd_open(hello.pid)
-
-    def _end_successor(self) -> None:
-        if self._process is None:
-            return
-        with contextlib.suppress(OSError):
-            signal.pidfd_send_signal(self._process, signal.SIGKILL)
-        select.select([self._process], [], [], END_S)
-        self._forget()
+        self._process = self._processes.process(hello.pid)
 
     def _forget(self) -> None:
         if self._process is not None:
-            os.close(self._process)
+            self._process.close()
             self._process = None

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -16,6 +16,7 @@ from zbridge.app.handover.claim import ClaimPart
 from zbridge.app.handover.incoming import Incoming
 from zbridge.app.handover.messages import VERSION, Given
 from zbridge.app.handover.outgoing import Outgoing, Part
+from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.handover.successor import Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
 from zbridge.control.gate import NameGate
@@ -29,6 +30,7 @@ from zbridge.protocol.kept import Budget
 from zbridge.robot.device import Device
 from zbridge.robot.ownership import CLAIM
 from zbridge.transport import Parcel
+from zbridge.transport.kernel import KERNEL, Kernel
 
 log = logging.getLogger("zbridge.app.handover")
 
@@ -36,10 +38,23 @@ log = logging.getLogger("zbridge.app.handover")
 class Restarts:
     """The restarts of one gateway. The gateway enters its parts as it makes them.
 
-    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused.
+    incoming: where this gateway is a successor itself. successor: starts one; None: a restart is refused. clock:
+    seconds. processes, kernel: of this machine, or simulated ones.
     """
 
-    def __init__(self, plan: Plan, keys: KeySpace, incoming: Incoming | None, successor: Successor | None) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        keys: KeySpace,
+        incoming: Incoming | None,
+        successor: Successor | None,
+        clock: Callable[[], float] = time.monotonic,
+        processes: Processes = PROCESSES,
+        kernel: Kernel = KERNEL,
+    ) -> None:
+        self._clock = clock
+        self._processes = processes
+        self._kernel = kernel
         self.bus: Bus | None = None
         self.listeners: Sequence[Part] = ()
         self.device: Device | None = None
@@ -53,6 +68,11 @@ class Restarts:
         self._incoming = incoming
         self._successor = successor
         self._lock = asyncio.Lock()
+        self._outgoing: Outgoing | None = None
+        self._handed_over: Device | None = None
+        """The device that the restart under way has stopped."""
+        self._ends = False
+        """Whether the gateway ends."""
         self._tasks: set[asyncio.Task[None]] = set()
 
     def __repr__(self) -> str:
@@ -63,6 +83,17 @@ class Restarts:
         with contextlib.suppress(Refused):
             await self._restart()
             self.gone.set()
+
+    async def settle(self) -> None:
+        """Begin no restart any more, and give up one that is under way; wait until all is taken back, or handed over.
+
+        To be awaited before the parts of the gateway end: two processes must not write to one socket.
+        """
+        self._ends = True
+        if self._outgoing is not None:
+            self._outgoing.give_up()
+        async with self._lock:
+            return
 
     def keep(self, parcel: Parcel, budget: Budget) -> Given | None:
         """Describe the robot's part as it is now, for a successor of a gateway that died; None where none can go on."""
@@ -80,7 +111,7 @@ class Restarts:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(time.monotonic))
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(self._clock))
 
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:
@@ -104,19 +135,34 @@ class Restarts:
         successor_begins = self._incoming is not None and not self._incoming.begun.is_set()
         if self._lock.locked() or self.gone.is_set() or successor_begins:
             raise NotReady("a restart is under way")
+        if self._ends:
+            raise NotReady("the gateway ends")
         async with self._lock:
-            began = time.monotonic()
-            parts = [part for part in (*self.listeners, self.device, self.claim) if part is not None]
-            pid = await Outgoing(self._successor, parts, self._describe, self._drain).run()
-            log.info("handed over to process %d in %.0f ms", pid, (time.monotonic() - began) * 1000)
+            began = self._clock()
+            machine = (self._processes, self._kernel)
+            self._outgoing = Outgoing(self._successor, self._parts, self._describe, self._drain, *machine)
+            pid = await self._outgoing.run()
+            log.info("handed over to process %d in %.0f ms", pid, (self._clock() - began) * 1000)
+
+    def _parts(self) -> list[Part]:
+        """Give what there is to hand over now."""
+        self._handed_over = self.device
+        return [part for part in (*self.listeners, self.device, self.claim) if part is not None]
+
+    def _require_same_device(self) -> None:
+        """Raise Refused where the robot was taken, or left, since the parts were stopped."""
+        if self.device is not self._handed_over:
+            raise NotReady("the robot was taken, or left to another gateway, meanwhile: ask again")
 
     async def _drain(self) -> None:
+        self._require_same_device()
         if self.latches is not None:
             await self.latches.flush()  # the successor reads them
         if self.bus is not None and self.claim is not None:
             await self.bus.drain(self._keys.key(CLAIM))  # the successor answers
 
     def _describe(self, parcel: Parcel) -> Given:
+        self._require_same_device()
         given = Given(
             VERSION,
             self._plan.setup,

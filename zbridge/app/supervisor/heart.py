@@ -16,7 +16,7 @@ IDLE_S = 5.0
 FIRST_S = 30.0
 """Longest time until the first beat: thirty processes that start at once share the processors."""
 EXCUSED_S = 0.2
-"""Most that is added for a supervisor that was held up itself."""
+"""What is added for a supervisor that was held up itself."""
 
 
 class HeartState(msgspec.Struct, frozen=True):
@@ -58,9 +58,9 @@ class Heart:
         self._last, self._excused_s = now, 0.0
         self._patience_s = DRIVEN_S if driven else IDLE_S
 
-    def excuse(self, seconds: float) -> None:
-        """Wait longer for the next beat: for so long the supervisor itself did not run."""
-        self._excused_s = min(EXCUSED_S, self._excused_s + max(0.0, seconds))
+    def excuse(self) -> None:
+        """Wait longer for the next beat: the supervisor itself did not run for a while, so neither did the process."""
+        self._excused_s = EXCUSED_S
 
     @property
     def deadline(self) -> float:

@@ -285,7 +285,7 @@ class Supervisor:
             process.hear()
             process.reap()
             if late_s > LATE_S:
-                process.heart.excuse(late_s)
+                process.heart.excuse()
             if not process.over.done() and now >= process.heart.deadline:
                 process.kill(f"gave no sign of life for {process.heart.silent_s(now):.1f} s")
             elif not process.over.done():

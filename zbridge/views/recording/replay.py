@@ -15,6 +15,7 @@ from zbridge.app.config import plan as plan_configuration
 from zbridge.app.tasks import together
 from zbridge.app.toml import read_toml
 from zbridge.bus import Bus, Handle, Sample
+from zbridge.control.latch import LatchRecord
 from zbridge.errors import ConfigError, Held, PayloadError, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -301,6 +302,9 @@ class _Replayed:
     must_stay = False
 
     def heard(self, claims: Mapping[str, Claim]) -> None:
+        pass
+
+    def merge(self, record: LatchRecord) -> None:
         pass
 
     async def step_aside(self) -> None:

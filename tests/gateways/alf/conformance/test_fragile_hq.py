@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq, Reader
-from gateways.alf.conformance.hq_program import simulate_fragile_hq
+from gateways.alf.conformance.fragile_hq import FragileHq, simulate_fragile_hq
 from gateways.alf.conformance.parser import Dialect
+from gateways.alf.conformance.parser import VehicleReader as Reader
 from tests.captures import stream
 from tests.conformance.scene import LONG_S, Listening, calling, until
 from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, conversations

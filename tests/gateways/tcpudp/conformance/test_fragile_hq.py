@@ -9,12 +9,10 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes
-from gateways.tcpudp.conformance.hq_program import simulate_fragile_hq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes, simulate_fragile_hq
 from gateways.tcpudp.conformance.parser import Feature
 from tests import captures
-from tests.conformance.scene import Listening, calling, until
-from tests.conformance.script_table import table
+from tests.conformance.scene import Listening, calling, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 

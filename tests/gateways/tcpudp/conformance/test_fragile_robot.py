@@ -14,8 +14,7 @@ import pytest
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss, simulate_fragile
 from gateways.tcpudp.conformance.parser import Feature, Times
 from tests import captures
-from tests.conformance.scene import LONG_S, Peer, serving, until
-from tests.conformance.script_table import table
+from tests.conformance.scene import LONG_S, Peer, serving, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
 

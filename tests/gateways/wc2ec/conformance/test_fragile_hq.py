@@ -8,11 +8,9 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_hq import FragileController
-from gateways.wc2ec.conformance.hq_program import simulate_fragile_hq
+from gateways.wc2ec.conformance.fragile_hq import FragileController, simulate_fragile_hq
 from tests.captures import stream
-from tests.conformance.scene import LONG_S, Listening, Scene, calling, until
-from tests.conformance.script_table import table
+from tests.conformance.scene import LONG_S, Listening, Scene, calling, table, until
 
 NAMES = {
     "WHEEL1": "00 35 00 06 77 68 65 65 6c 31",

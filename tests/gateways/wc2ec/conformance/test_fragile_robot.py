@@ -15,8 +15,7 @@ import pytest
 from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
 from gateways.wc2ec.conformance.machine import Robot
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Reader, Times
-from tests.conformance.scene import LONG_S, Peer, Scene, serving, until
-from tests.conformance.script_table import table
+from tests.conformance.scene import LONG_S, Peer, Scene, serving, table, until
 
 QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""

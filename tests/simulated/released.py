@@ -1,0 +1,123 @@
+"""What must become of leases that nobody uses: of HQ programs that are idle, gone, or whose listener was frozen.
+
+Source: "HQ programs that know of no lease" in ``docs/control.md``. Programs are judged by their own notes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tests.simulated.accounts import Grant
+
+if TYPE_CHECKING:
+    from tests.simulated.checker import Checker
+
+UNUSED_S = 1.0
+"""Longest time after ``lease_s`` of neutral until an HQ program's lease is given back."""
+GONE_S = 0.8
+"""Longest time until the lease of an HQ program that disconnected is given back."""
+FROZEN_S = 0.9
+"""A listener that did not run for so long asks its programs for a neutral: it looks every 0.1 s, for 0.6 s."""
+ALONE_S = 9.0
+"""Longest time until the only gateway that runs serves the robot."""
+
+
+class Released:
+    """Follows the leases of HQ programs, and whether anybody serves the robot."""
+
+    def __init__(self, checker: Checker) -> None:
+        self._checker = checker
+        self._world = checker.world
+        self._simulation = checker.simulation
+        programs = checker.simulation.programs
+        self._only = programs[0].name if len(programs) == 1 else None
+        """The program, where there is one: then each lease of a listener is its own."""
+        self._spoke_at: dict[str, float] = {}
+        """By program, when it last gave motion or a mode."""
+        self._mode: dict[str, int] = {}
+        self._paused: dict[str, float] = {}
+        self._frozen: dict[str, float] = {}
+        """By program, when its listener ran again after a freeze in which the program pushed."""
+
+    def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        """Follow the trace."""
+        if what == "gives" and who == self._only:
+            if fields[0]:
+                self._spoke_at[who] = self._world.now
+        elif what == "gives mode":
+            self._mode[who], self._spoke_at[who] = fields[0], self._world.now
+        elif what == "lost listener" and who == self._only:
+            self._on_gone(who)
+        elif what == "connected to listener":
+            self._mode.pop(who, None)
+            self._frozen.pop(who, None)
+        elif what == "paused" and who in self._checker.gateways:
+            self._paused[who] = self._world.now
+        elif what == "resumed" and who in self._paused and self._world.now - self._paused.pop(who) > FROZEN_S:
+            host = self._checker.gateways[who].host.name
+            self._frozen |= {
+                each.name: self._world.now for each in self._simulation.programs if each.address[0] == host
+            }
+
+    def put(self, program: str, gives: list[tuple[float, float]]) -> None:
+        """Judge motion that a listener put for a program. gives: what that said, and when."""
+        since = self._frozen.get(program)
+        if since is None:
+            return
+        if any(not value and at > since - 0.5 for at, value in gives):
+            del self._frozen[program]
+        else:
+            self._checker.violate("hq-neutral", f"a listener that was frozen put motion of {program}, without neutral")
+
+    def tick(self) -> None:
+        """Look for leases that nobody uses, and for a robot that nobody serves."""
+        self._look_for_unused()
+        self._look_for_served()
+
+    def _of_program(self) -> Grant | None:
+        """The lease that the only program holds."""
+        for grant in self._checker.current.values():
+            if grant.ended_at is None and grant.who.startswith("hq."):
+                return grant
+        return None
+
+    def _on_gone(self, program: str) -> None:
+        grant, begun = self._of_program(), self._world.now
+        if grant is None:
+            return
+
+        def look() -> None:
+            if grant.ended_at is None and self._judges(grant, begun - 1.0):
+                self._checker.violate("hq-release", f"{program} disconnected, and keeps {grant}")
+
+        self._world.after(GONE_S, look)
+        self._checker.counts["an HQ program disconnected with a lease"] += 1
+
+    def _look_for_unused(self) -> None:
+        grant, now = self._of_program(), self._world.now
+        if grant is None or self._only is None or self._mode.get(self._only) == 3:
+            return
+        used_at = max(self._spoke_at.get(self._only, 0.0), grant.at)
+        if now - used_at > grant.lease_s + UNUSED_S and self._judges(grant, used_at):
+            self._checker.violate("hq-release", f"{self._only} keeps {grant}, unused for {now - used_at:.1f} s")
+            self._spoke_at[self._only] = now
+
+    def _judges(self, grant: Grant, since: float) -> bool:
+        """Whether nothing was disturbed since then that a release needs."""
+        listener, gateway = self._simulation.members[grant.asker], self._simulation.members[grant.gateway]
+        works = listener.alive and gateway.alive and self._simulation.fabric.works(listener.session, gateway.session)
+        return works and self._checker.obligations.calm_since(since)
+
+    def _look_for_served(self) -> None:
+        """A gateway that runs alone, with a bus, serves the robot."""
+        serving = [each for each in self._checker.gateways.values() if each.serves]
+        alive = [each for each in serving if each.alive]
+        if len(serving) < 2 or len(alive) != 1:
+            return
+        (gateway,), now = alive, self._world.now
+        obligations = self._checker.obligations
+        if gateway.running and gateway.session.link.whole and obligations.calm_since(now - ALONE_S):
+            self._checker.counts["a gateway was left alone"] += 1
+            if not obligations.serves(gateway.name):
+                self._checker.violate("served", f"{gateway.name} runs alone, and does not serve the robot")
+                obligations.disturb()

@@ -1,0 +1,86 @@
+"""Whether ``status`` and ``control`` say what is true, 0.2 s after the news at the latest."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tests.simulated.accounts import read
+
+if TYPE_CHECKING:
+    from tests.simulated.checker import Checker
+
+NEWS_S = 0.2
+SETTLED_S = 1.5
+"""Longest time that a handshake takes once the connection is there and the robot takes commands."""
+
+
+class Shown:
+    """Compares what gateways publish with the simulated network, and with the leases and stops on the bus."""
+
+    def __init__(self, checker: Checker) -> None:
+        self._checker = checker
+        self._world = checker.world
+        self._state: dict[str, str] = {}
+        """By gateway, the state of its last ``status``."""
+        self._apart_since: dict[str, float] = {}
+        self._works_since: tuple[str | None, float] = (None, 0.0)
+        self._latched_at = 0.0
+        """When a latched stop was last in force."""
+
+    def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        """Follow the trace."""
+        if what == "puts" and who in self._checker.gateways:
+            if fields[0].endswith("/status"):
+                self._state[who] = str(read(fields[1]).get("state"))
+            elif fields[0].endswith("/control"):
+                self._on_control(who, read(fields[1]))
+        elif what in ("killed", "ended"):
+            self._state.pop(who, None)
+
+    def tick(self) -> None:
+        """Compare ``status`` with the connections."""
+        now, checker = self._world.now, self._checker
+        self._note_latches()
+        works = checker.obligations.works()
+        if works != self._works_since[0]:
+            self._works_since = (works, now)
+        for gateway, state in self._state.items():
+            if self._connected(gateway) or state != "established":
+                self._apart_since.pop(gateway, None)
+            elif now - self._apart_since.setdefault(gateway, now) > NEWS_S + 0.1 and self._judges(gateway, NEWS_S):
+                checker.violate("status", f"{gateway} shows established, and has no connection")
+                self._apart_since.pop(gateway)
+        settled = works is not None and now - self._works_since[1] > SETTLED_S
+        if works is not None and settled and self._state.get(works) != "established" and self._judges(works, SETTLED_S):
+            checker.violate("status", f"{works} shows {self._state.get(works)}, and its robot is established")
+            self._works_since = (works, now)
+
+    def _note_latches(self) -> None:
+        if any(self._checker.latches.values()):
+            self._latched_at = self._world.now
+
+    def _connected(self, gateway: str) -> bool:
+        """Whether a gateway has a connection to the robot that has not ended."""
+        return any(
+            end.process.name == gateway and end.peer.process.name == "robot" and not end.closed and not end.finished
+            for end in self._checker.simulation.network.ends
+        )
+
+    def _on_control(self, gateway: str, control: dict[str, Any]) -> None:
+        lease, state, checker = control.get("lease"), control.get("state"), self._checker
+        for refused in control.get("refusals", ()):
+            checker.counts[f"refused {refused.get('code')}"] += 1
+        self._note_latches()
+        grant = checker.grants.get(lease or b"")
+        if lease is not None and grant is None:
+            checker.violate("control", f"{gateway} shows a lease that nobody was granted")
+        elif grant is not None and control.get("holder") != grant.who:
+            checker.violate("control", f"{gateway} shows {control.get('holder')} as the holder of {grant}")
+        elif (lease is not None) is not (state == "held"):
+            checker.violate("control", f"{gateway} shows {state}, {'with' if lease else 'without'} a lease")
+        elif state == "latched" and self._world.now - self._latched_at > NEWS_S + 0.15:
+            checker.violate("control", f"{gateway} shows latched, and nobody latched the robot")
+
+    def _judges(self, gateway: str, seconds: float) -> bool:
+        obligations = self._checker.obligations
+        return obligations.serves(gateway) and obligations.undisturbed(gateway, self._world.now - seconds - 0.2)

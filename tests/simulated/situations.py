@@ -1,0 +1,176 @@
+"""Situations that random steps seldom meet: what a rule needs to be put to the test, each with random times.
+
+A situation sets who takes part, what they do and what fails, in a scenario that is otherwise random.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+Made = dict[str, Any]
+
+
+def arrange(rng: random.Random, made: Made) -> None:
+    """Turn a scenario into one of the situations; its seed says which."""
+    made["steps"] = []
+    situation = rng.choice(SITUATIONS)
+    made["situation"] = situation.__name__.strip("_")
+    situation(rng, made)
+    for step in made["steps"]:
+        step["t"] = round(step["t"], 2)
+    made["steps"].sort(key=lambda step: step["t"])
+    made["seconds"] = round(max(step["t"] for step in made["steps"]) + 8.0, 1)
+
+
+def _drive(t: float, who: str, **more: Any) -> Made:
+    return {"t": t, "who": who, "do": "drive", "for": 4.0, "deadman_s": 0.5, "hz": 10.0, **more}
+
+
+def _fault(t: float, fault: str, **more: Any) -> Made:
+    return {"t": t, "fault": fault, **more}
+
+
+def _second_gateway(made: Made) -> None:
+    made["gateways"] = [
+        {"name": "gw1", "host": "gw1", "router": "router1"},
+        {"name": "gw2", "host": "gw2", "router": "router2"},
+    ]
+    for driver, router in zip(made["drivers"], ("router1", "router2"), strict=True):
+        driver["router"] = router
+
+
+def _stick(rng: random.Random, made: Made, *, alone: bool) -> Made:
+    """Let one HQ program take part; alone: its listener is a process of its own."""
+    protocol = rng.choice(("tcpudp", "tcpudp", "alf", "wc2ec"))
+    if made["robot"]["protocol"] == "alf":
+        protocol = rng.choice(("tcpudp", "alf"))
+    made["gateways"] = [{"name": "gw1", "host": "gw1", "router": "router1"}]
+    gateway = made["gateways"][0]
+    if alone:
+        gateway = {"name": "hq1", "host": "hq1", "router": "router1", "device": False}
+        made["gateways"].append(gateway)
+    gateway["hq"] = [protocol]
+    program = {"name": "stick1", "host": "desk1", "protocol": protocol, "gateway_host": gateway["host"]}
+    made["programs"] = [{**program, "listener": 0, "options": {}}]
+    return gateway
+
+
+def _split(rng: random.Random, made: Made, *, t: float, s: float) -> list[Made]:
+    """Cut the bus between two gateways, so that both serve the robot, and heal it."""
+    _second_gateway(made)
+    return [_fault(t, "cut", between=["router1", "router2"], both=True, **{"for": s})]
+
+
+def _silent_holder(rng: random.Random, made: Made) -> None:
+    """A program holds the lease and says nothing, and another one takes over, or stops the robot."""
+    made["drivers"][0]["options"] = {}
+    step = _drive(3.0, "op1", silent=True, neutral=False) | {"for": 14.0}
+    taken = _drive(rng.uniform(5.0, 7.0), "op2", takeover=True) | {"for": 2.0}
+    made["steps"] = [step, taken if rng.random() < 0.6 else {"t": taken["t"], "who": "op2", "do": "stop"}]
+
+
+def _stalled_link(rng: random.Random, made: Made) -> None:
+    """The link to the robot stalls while the robot is driven, and the driver drives on."""
+    t = rng.uniform(4.0, 5.0)
+    cut = _fault(t, "cut", between=["robot", "gw1"], both=rng.random() < 0.7, **{"for": rng.uniform(0.7, 3.0)})
+    made["steps"] = [_drive(3.0, "op1", hz=20.0, deadman_s=rng.choice((0.5, 1.0))) | {"for": 8.0}, cut]
+    if made["robot"]["protocol"] == "tcpudp":
+        made["robot"]["options"]["udp"] = False
+
+
+def _reconnected(rng: random.Random, made: Made) -> None:
+    """The connection to the robot is reset while the robot moves, and its driver is killed or says nothing more."""
+    t = rng.uniform(4.0, 5.0)
+    made["steps"] = [_drive(3.0, "op1", neutral=False) | {"for": t - 2.95}]
+    made["steps"].append(_fault(t, "reset", between=["robot", "gw1"]))
+    made["steps"].append(_drive(t + rng.uniform(0.6, 1.5), "op2", takeover=True))
+
+
+def _wiggled_over_a_cut(rng: random.Random, made: Made) -> None:
+    """An HQ program pushes and releases its stick while its network is cut, and all of it arrives at once."""
+    gateway, t = _stick(rng, made, alone=rng.random() < 0.5), 5.0
+    steps = [_drive(3.5, "stick1") | {"for": 1.8}]
+    cut_s = rng.uniform(2.2, 4.0)
+    steps.append(_fault(t, "cut", between=["desk1", gateway["host"]], both=True, **{"for": cut_s}))
+    t += 0.3
+    while t < 5.0 + cut_s - 0.3:
+        t += rng.uniform(0.7, 1.1)
+        steps.append(_drive(t, "stick1") | {"for": rng.uniform(0.2, 0.5)})
+    made["steps"] = steps
+
+
+def _frozen_listener(rng: random.Random, made: Made) -> None:
+    """A listener is frozen while its program pushes, for less than the program's deadman."""
+    gateway = _stick(rng, made, alone=True)
+    freeze = _fault(rng.uniform(5.0, 6.0), "pause", target=gateway["name"], **{"for": rng.uniform(0.95, 1.25)})
+    made["steps"] = [_drive(3.5, "stick1") | {"for": 6.0}, freeze]
+
+
+def _idle_or_gone(rng: random.Random, made: Made) -> None:
+    """An HQ program drives, and then says neutral for long, or disconnects."""
+    _stick(rng, made, alone=rng.random() < 0.5)
+    drive = _drive(3.5, "stick1") | {"for": rng.uniform(1.0, 3.0)}
+    made["steps"] = [drive]
+    if rng.random() < 0.5:
+        made["steps"].append({"t": drive["t"] + rng.uniform(0.5, 4.0), "who": "stick1", "do": "leave"})
+
+
+def _two_owners(rng: random.Random, made: Made) -> None:
+    """Both gateways serve the robot, one or both drive it, and they meet."""
+    steps = _split(rng, made, t=3.5, s=rng.uniform(9.0, 11.0))
+    healed_at = 3.5 + steps[0]["for"]
+    for driver in rng.sample(("op1", "op2"), rng.choice((1, 2))):
+        steps.append(_drive(healed_at - 1.5, driver) | {"for": 4.0})
+    if rng.random() < 0.5:  # the one that stays is killed, and stays away
+        steps.append(_fault(healed_at + 4.0, "kill", target="owner", **{"for": 30.0}))
+        steps.append(_drive(healed_at + 14.0, "op1"))
+    made["steps"] = steps
+
+
+def _killed_in_mode_3(rng: random.Random, made: Made) -> None:
+    """A gateway is killed while its robot drives itself; it starts again, or another one takes the robot over."""
+    if made["robot"]["protocol"] != "tcpudp":
+        options = {"version": rng.choice(("1.1", "1.3")), "lossless": bool(made["control"])}
+        made["robot"] = {"protocol": "tcpudp", "options": options, "device": {}}
+    made["drivers"][0]["options"] = {}  # the client that chooses modes
+    if rng.random() < 0.6:
+        _second_gateway(made)
+    drive = _drive(4.0, "op1", mode="autonomous", silent=True, then=None) | {"for": 9.0}
+    after = rng.choice((0.0, 0.001, 0.005, 0.02, 0.3, 1.5))
+    kill = _fault(3.9, "kill", target="owner", when=rng.choice(("mode read", "mode unwritten")), after=after)
+    made["steps"] = [drive, kill | {"for": rng.choice((0.2, 6.0))}]
+    if rng.random() < 0.3:
+        made["steps"] += [_fault(2.5, "cut", between=["router1", "router2"], both=True, **{"for": 8.0})]
+
+
+def _killed_driver(rng: random.Random, made: Made) -> None:
+    """The driver's process is killed while it drives, or its bus is lost, or it is frozen."""
+    kind = rng.choice(("kill", "pause", "unlink"))
+    fault = _fault(rng.uniform(4.0, 6.0), kind, target="op1", **{"for": rng.uniform(1.0, 4.0)})
+    made["steps"] = [_drive(3.0, "op1", priority=rng.choice((0, 0, 1))) | {"for": 6.0}, fault]
+    made["steps"].append(_drive(5.5, "op2", priority=rng.choice((0, 1, 2))))
+
+
+def _forged_and_flooded(rng: random.Random, made: Made) -> None:
+    """Somebody repeats what was overheard, while the holder's clock jumps or the bus delivers twice."""
+    made["steps"] = [_drive(3.0, "op1") | {"for": 6.0}]
+    made["steps"] += [_fault(rng.uniform(3.5, 8.0), "forge") for _ in range(3)]
+    made["steps"].append(_fault(4.0, rng.choice(("duplicate", "jump")), target="gw1", **{"for": 3.0}))
+
+
+SITUATIONS: tuple[Callable[[random.Random, Made], None], ...] = (
+    _silent_holder,
+    _stalled_link,
+    _reconnected,
+    _wiggled_over_a_cut,
+    _frozen_listener,
+    _idle_or_gone,
+    _two_owners,
+    _two_owners,
+    _killed_in_mode_3,
+    _killed_in_mode_3,
+    _killed_driver,
+    _forged_and_flooded,
+)

@@ -1,0 +1,111 @@
+"""What must come before motion in what a gateway writes to the robot: a stop, on a connection and after a stall.
+
+Each rule cites ``docs/what-happens.md``. Links are judged by the simulated network, never by what a gateway says.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import TYPE_CHECKING, Any
+
+from tests.simulated.accounts import motions
+
+if TYPE_CHECKING:
+    from tests.simulated.checker import Checker
+    from tests.simulated.net import End
+
+STALLED_S = 0.45
+"""A link that acknowledges nothing for so long is stalled for the gateway too, which looks after 0.3 s."""
+ASIDE_S = 1.3
+"""Longest time until a gateway that leaves its robot to another one has stopped it."""
+
+
+def stops(protocol: str, data: bytes) -> bool:
+    """Whether what was written to a robot stops it, or a part of it."""
+    if protocol == "tcpudp":
+        return len(data) >= 6 and (data[5] == 13 or (data[5] == 11 and data[14:18] == bytes(4)))
+    if protocol == "alf":
+        return data[:2] == b"\x03\x00" or re.search(rb"(?:^|;)3\|0\|", data) is not None
+    frames = [data[start : start + 11] for start in range(0, len(data) - 10, 11)]
+    return any(frame[0] == 130 and struct.unpack("<d", frame[3:]) == (0.0,) for frame in frames)
+
+
+class Written:
+    """Follows what each gateway writes to the robot."""
+
+    def __init__(self, checker: Checker) -> None:
+        self._checker = checker
+        self._world = checker.world
+        self._owes: dict[str, str] = {}
+        """By gateway, why a stop must come before motion."""
+        self._moves: set[str] = set()
+        """Gateways whose last frame of the kind was motion."""
+        self._aside: set[str] = set()
+
+    def watch(self, who: str, what: str, fields: tuple[Any, ...]) -> None:
+        """Follow the trace."""
+        if who == "robot" and what == "connected":
+            gateway = self._checker.by_host.get(fields[0][0])
+            if gateway is not None:
+                self._owes[gateway] = "since the robot was connected"
+                self._moves.discard(gateway)
+        elif what == "withdraws" and who in self._checker.gateways and fields[0].endswith("/@alive/gateway"):
+            self._on_aside(who)
+        elif what == "announces" and who in self._aside and fields[0].endswith("/@alive/gateway"):
+            self._aside.discard(who)
+            self._owes[who] = "since it serves the robot again"
+
+    def written(self, gateway: str, data: bytes) -> None:
+        """Take what a gateway wrote."""
+        protocol = self._checker.protocol
+        if stops(protocol, data):
+            self._owes.pop(gateway, None)
+            self._moves.discard(gateway)
+        elif any(kind != "mode" or value == 3.0 for kind, value in motions(protocol, data)):
+            self._moves.add(gateway)
+            why = self._owes.pop(gateway, None)
+            if why is not None:
+                self._checker.violate("stop-first", f"{gateway} wrote motion, and no stop {why}")
+
+    def tick(self) -> None:
+        """Note the links that are stalled."""
+        for end in self._links():
+            gateway = end.process.name
+            reachable = self._up(end)
+            waited_s = self._world.now - max(end.heard_at, end._oldest[0]) if end._oldest else 0.0
+            if not reachable and end.unacknowledged and waited_s > STALLED_S and self._ran(gateway, STALLED_S):
+                self._owes[gateway] = "since its link was stalled"
+                self._checker.counts["a link was stalled"] += 1
+
+    def _on_aside(self, gateway: str) -> None:
+        """A gateway that leaves its robot to another one stops it, over the connection that it keeps."""
+        if self._checker.simulation.members[gateway].ending or gateway not in self._moves:
+            return
+        self._aside.add(gateway)
+        begun = self._world.now
+        self._checker.counts["a gateway left a moving robot to another one"] += 1
+
+        def look() -> None:
+            kept = any(end.process.name == gateway and self._up(end) for end in self._links())
+            calm = self._ran(gateway, ASIDE_S + 1.0) and self._checker.obligations.calm_since(begun - 1.0)
+            if kept and calm and gateway in self._moves and gateway in self._aside:
+                self._checker.violate("stop-aside", f"{gateway} left the robot to another gateway, and moving")
+
+        self._world.after(ASIDE_S, look)
+
+    def _links(self) -> list[End]:
+        """The connections of gateways to the robot that are open."""
+        gateways = self._checker.gateways
+        return [
+            end
+            for end in self._checker.simulation.network.ends
+            if end.peer.process.name == "robot" and end.process.name in gateways and not end.closed and not end.broken
+        ]
+
+    def _up(self, end: End) -> bool:
+        paths, here, there = self._checker.simulation.paths, end.address[0], end.peer.address[0]
+        return paths.up(here, there) and paths.up(there, here)
+
+    def _ran(self, gateway: str, seconds: float) -> bool:
+        return self._checker.obligations.undisturbed(gateway, self._world.now - seconds)

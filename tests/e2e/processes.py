@@ -22,7 +22,7 @@ _ENDS_WITH_US = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") el
 
 def module(name: str, *arguments: object) -> list[str]:
     """Give the command that runs a module of these tests as a part of a scene."""
-    return [sys.executable, "-m", f"tests.e2e.{name}", *map(str, arguments)]
+    return [sys.executable, "-m", name if "." in name else f"tests.e2e.{name}", *map(str, arguments)]
 
 
 class Part:
@@ -145,6 +145,8 @@ class Road:
         there, number = Namespace(stack), next(_numbers)
         device, net = f"near{number}", f"10.{64 + number // 250 % 60}.{number % 250}"
         self.near, self.far, self.enter = f"{net}.1", f"{net}.6", there.enter
+        self._hole: str | None = None
+        """The route by which one direction is cut."""
         ip(
             f"link add {device} type veth peer name left netns {self._gate.keeper.pid}",
             f"address add {net}.1/30 dev {device}",
@@ -173,8 +175,16 @@ class Road:
         """Lose every packet, in both directions, from now on; nobody is told."""
         self._forward("0")
 
+    def cut_one_way(self, out: bool) -> None:
+        """Lose every packet that goes to the far end (``out``), or every one that comes from there."""
+        self._hole = f"blackhole {self.far if out else self.near}/32"
+        ip(f"route add {self._hole}", enter=self._gate.enter)
+
     def mend(self) -> None:
         """Lose no packet any more."""
+        if self._hole is not None:
+            ip(f"route delete {self._hole}", enter=self._gate.enter)
+            self._hole = None
         self._forward("1")
 
     def _forward(self, word: str) -> None:

@@ -19,7 +19,9 @@ class Bounds:
     channel: messages on their way at a time; a program whose commands find no room waits, and its questions are lost.
     delay: steps of time for which a message is on its way at most. loses, repeats: what the network does. drops:
     whether programs give the lease back, or stop asking. freezes: whether the gateway may be late with what is due.
-    beats: whether ``control`` comes unchanged, too.
+    beats: whether ``control`` comes unchanged, too. hears: whether programs hear of ``control`` before the network
+    works. overtaken: whether other input may come between the admission of a command and its record, as the gates and
+    the event loop never let it: what the authority makes of that by itself.
     """
 
     name: str
@@ -32,8 +34,11 @@ class Bounds:
     repeats: bool = False
     freezes: bool = False
     beats: bool = True
+    hears: bool = True
+    overtaken: bool = False
     faults: frozenset[str] = field(default_factory=frozenset)
-    """Of ``stop``, ``robot latch``, ``fleet latch``, ``link``, ``offline``, ``bus``, ``token``, ``gateway``."""
+    """Of ``stop``, ``robot latch``, ``fleet latch``, ``link``, ``offline``, ``bus``, ``token``, ``gateway``,
+    ``later``."""
     states: int = 200_000
     """More states than this are a fault of the bounds: the search has to be complete."""
 
@@ -56,7 +61,7 @@ def _of_programs(world: World, bounds: Bounds) -> Iterator[Move]:
             yield f"{number} wants", lambda world, number=number: world.holders[number].want()
         if bounds.drops and state not in ("free", "dropped", "returning") and (room or not holder.held):
             yield f"{number} drops", lambda world, number=number: world.holders[number].drop()
-        if room and holder.held:
+        if room and holder.held and not world.hand and bounds.programs[number].drives:
             for what in bounds.commands:
                 yield f"{number} {what}", lambda world, number=number, what=what: world.give(number, what)
         if world.news[number] is not None:
@@ -95,6 +100,10 @@ def _of_others(world: World, bounds: Bounds) -> Iterator[Move]:
         yield "robot lost", lambda world: world.hold_back(stops=False)
     if "bus" in faults:
         yield "bus lost", _lose_bus
+    if "later" in faults:
+        yield "the gateway cannot say" if world.ready else "it can say again", _toggle_ready
+    if world.hand:
+        yield "record", lambda world: world.record()
     holder = world.authority._holders.current
     if "token" in faults and holder is not None and holder.alive is not None:
         yield "token lost", lambda world: _lose_token(world)
@@ -121,6 +130,10 @@ def _repeat(world: World, index: int) -> None:
 
 def _lose_news(world: World, number: int) -> None:
     world.news[number] = None
+
+
+def _toggle_ready(world: World) -> None:
+    world.ready = not world.ready
 
 
 def _lose_bus(world: World) -> None:

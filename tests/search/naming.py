@@ -56,7 +56,10 @@ class _Namer:
             tuple(sorted(map(self._message, world.net))),
             tuple((lane.value, command.program, command.what, self._shown(command),
                    self._age(command.given_ms)) for lane, command in world.inbox),
-            (world.robot.moving, world.robot.autonomous, self._ago(world.robot.moved_at) if world.robot.moving else 0),
+            tuple((command.program, command.what, self._shown(command), self._since(sender.given_at), sender.stale)
+                  for command, sender in world.hand),
+            (tuple(sorted(world.robot.parts)), world.robot.autonomous, world.ready,
+             self._since(world.robot.moved_at) if world.robot.moving else 0),
         )  # fmt: skip
 
     # What is in use
@@ -75,7 +78,7 @@ class _Namer:
             if signer is not None:
                 yield signer.lease, "commands", signer._commands
                 yield signer.lease, "questions", signer._questions
-        for _, command in world.inbox:
+        for command in (*(each for _, each in world.inbox), *(each for each, _ in world.hand)):
             yield command.lease, "commands", command.seq
         for message in world.net:
             if isinstance(message, Command):
@@ -158,7 +161,8 @@ class _Namer:
     def _authority(self) -> Any:
         authority = self.world.authority
         return (
-            authority._state.value, authority.on_its_own, authority._autonomous, tuple(sorted(authority._moving)),
+            authority._state.value, authority.on_its_own, authority._autonomous,
+            tuple(sorted(authority._moving)), tuple(sorted(authority._moved)),
             self._ago(authority._stop_at), authority._held_back or "", tuple(map(self._lease, self._known())),
             tuple(authority.latches._in_force), tuple(sorted(authority.latches._released)),
             tuple(sorted(authority.latches._released_fleet)), _stops(tuple(authority._stops)),
@@ -170,6 +174,7 @@ class _Namer:
         return (
             self.leases[lease], holder.who, current and self._ago(holder.expires_at),
             current and self.tokens[holder.alive or ""], holder.ended or "",
+            current and not holder.numbers and self._age(holder.asked_ms),
             tuple((kind, self.numbers.rank(lease, kind, holder.numbers.get(kind, -1)))
                   for kind in ("commands", "questions")),
             round(holder.age._baseline_ms / 100) if current and holder.age._baseline_ms is not None else -1,

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from tests.search.world import DEADMAN_S, LEASE_S, MAX_AGE_S, World
+from tests.search.world import DEADMAN_S, LEASE_S, MAX_AGE_S, MOVES, World
 from zbridge.control.events import EventKind
 from zbridge.control.proof import read
 
 TOLERANCE_S = 1e-6
+_NONE: frozenset[str] = frozenset()
 
 
 class Account(NamedTuple):
@@ -27,6 +28,15 @@ class Account(NamedTuple):
     """The fastest delivery of what is dated in this lease: what is later by more than the limit is stale."""
     latched: frozenset[str] = frozenset()
     released: frozenset[str] = frozenset()
+    moving: frozenset[str] = frozenset()
+    """Parts of the robot that move, by the commands that were carried out."""
+    alive: str = ""
+    """The token that the holder's question named."""
+    asked_at: float = 0.0
+    used: bool = False
+    """Whether anything was sent with the lease."""
+    moved: frozenset[str] = frozenset()
+    """Parts that moved when neutral began to be owed, and have not rested since."""
 
     def named(self, world: World) -> Any:
         """Write what of the account the state does not say; for the name of the state."""
@@ -36,6 +46,9 @@ class Account(NamedTuple):
             round(self.baseline_s, 1),
             tuple(sorted(self.latched)),
             tuple(sorted(self.released)),
+            tuple(sorted(self.moving)),
+            tuple(sorted(self.moved)),
+            self.lease is None or self.used or round(world.now - self.asked_at, 1),
         )
 
 
@@ -73,7 +86,7 @@ def _state_holds(world: World, account: Account) -> None:
     if bool(account.latched) != (authority.state == "latched"):
         raise Violation(f"latched by {set(account.latched)}, shown as {authority.state}")
     robot = world.robot
-    if robot.in_motion and account.lease is None:
+    if robot.in_motion and account.lease is None and not world.overtaken:
         raise Violation("the robot moves, and nobody has the lease")
     if robot.in_motion and not authority.moving:
         raise Violation("the robot moves, and the authority does not know")
@@ -96,12 +109,15 @@ def _was_late(world: World) -> bool:
 
 
 def _acquire(account: Account, world: World, said: Any) -> Account:
-    program, question, reply = said
+    query, reply = said
+    program, question = query.program, query.question
     account = _expired(account, world)
     taking = "/takeover/" in question.key
     held = account.lease is not None
     outranks = held and world.programs[program].priority > world.programs[account.program].priority
-    allowed = not account.latched and (not held or taking or outranks)
+    same = (program, query.alive) == (account.program, account.alive)
+    again = held and not account.used and same and question.asked_at > account.asked_at
+    allowed = not account.latched and (not held or taking or outranks or again)
     if reply.ok != allowed:
         raise Violation(
             f"a question for the lease was {'granted' if reply.ok else 'refused'}: {account}, {reply.reason}"
@@ -109,8 +125,9 @@ def _acquire(account: Account, world: World, said: Any) -> Account:
     if not reply.ok:
         return account
     return account._replace(
-        lease=reply.lease, program=program, expires_at=world.now + LEASE_S, owes=False,
-        baseline_s=world.now - question.asked_at,
+        lease=reply.lease, program=program, expires_at=world.now + LEASE_S, owes=False, moving=_NONE,
+        moved=_NONE, baseline_s=world.now - question.asked_at, alive=query.alive,
+        asked_at=question.asked_at, used=False,
     )  # fmt: skip
 
 
@@ -121,7 +138,7 @@ def _renew(account: Account, world: World, said: Any) -> Account:
         raise Violation("a lease was renewed that is not held")
     if shown.lease != account.lease or not reply.ok:
         return account
-    account, stale = _dated(account, world.now - shown.t / 1000)
+    account, stale = _dated(account._replace(used=True), world.now - shown.t / 1000)
     return account if stale else account._replace(expires_at=world.now + LEASE_S)
 
 
@@ -140,7 +157,7 @@ def _admitted(account: Account, world: World, said: Any) -> Account:
     account = _expired(account, world)
     if read(command.attachment).lease != account.lease:
         raise Violation("a command of somebody else was admitted")
-    account, stale = _dated(account, world.now - command.given_ms / 1000)
+    account, stale = _dated(account._replace(used=True), world.now - command.given_ms / 1000)
     if stale != sender.stale:
         raise Violation(f"a command that was late is {'stale' if stale else 'fresh'}, and was not taken for it")
     return account if stale else account._replace(expires_at=world.now + LEASE_S)
@@ -151,12 +168,38 @@ def _told(account: Account, world: World, said: Any) -> Account:
     _, stale = _dated(account, world.now - command.given_ms / 1000)
     if account.latched:
         raise Violation("the robot is latched, and was told something by a program")
-    if command.what in ("motion", "autonomous"):
+    if command.what in MOVES:
         if account.owes:
             raise Violation("motion was carried out before neutral")
         if stale:
             raise Violation("stale motion was carried out")
-    return account._replace(owes=False) if command.what == "neutral" and not stale else account
+    return _carried_out(account, command.what, stale)
+
+
+def _carried_out(account: Account, what: str, stale: bool) -> Account:
+    """Note which parts move; a neutral drive pays for all parts, the neutral of a part for that one."""
+    part = "motor" if "motor" in what else "drive"
+    if what in ("motion", "motor"):
+        return account._replace(moving=account.moving | {part})
+    if what not in ("neutral", "motor neutral"):
+        return account
+    account = account._replace(moving=account.moving - {part})
+    if stale or account.moving:
+        return account
+    moved = frozenset() if what == "neutral" else account.moved - {part}
+    return account._replace(moved=moved, owes=account.owes and bool(moved))
+
+
+def _owes(account: Account) -> Account:
+    """Owe neutral from now on: the robot is at rest."""
+    held = account.lease is not None
+    return account._replace(owes=held, moved=(account.moved | account.moving) if held else _NONE, moving=frozenset())
+
+
+def _recorded(account: Account, world: World, said: Any) -> Account:
+    """Follow what was carried out though the lease may have ended since it was admitted."""
+    command, sender = said
+    return _carried_out(account, command.what, sender.stale) if command.lease == account.lease else account
 
 
 def _dated(account: Account, took_s: float) -> tuple[Account, bool]:
@@ -166,7 +209,9 @@ def _dated(account: Account, took_s: float) -> tuple[Account, bool]:
 
 
 def _ended(account: Account) -> Account:
-    return account._replace(lease=None, program=-1, owes=False, baseline_s=0.0, expires_at=math.inf)
+    return account._replace(
+        lease=None, program=-1, owes=False, baseline_s=0.0, expires_at=math.inf, moving=frozenset(), moved=frozenset()
+    )
 
 
 def _stopped(account: Account, world: World, latch: Any) -> Account:
@@ -189,12 +234,12 @@ def _unlatched(account: Account, world: World, latch: Any) -> Account:
 
 
 def _held_back(account: Account, world: World, said: Any) -> Account:
-    return account._replace(owes=account.lease is not None)
+    return _owes(account)
 
 
 def _event(account: Account, world: World, event: Any) -> Account:
     if event.what is EventKind.STOPPED and event.reason == "deadman":
-        return account._replace(owes=account.lease is not None)
+        return _owes(account)
     if event.what is EventKind.ENDED and event.reason in ("bus lost", "holder lost", "lease expired"):
         if event.reason == "lease expired" and world.now + TOLERANCE_S < account.expires_at:
             raise Violation("a lease expired before its time")
@@ -214,6 +259,7 @@ _FOLLOW = {
     "release": _release,
     "admitted": _admitted,
     "told": _told,
+    "recorded": _recorded,
     "stop": _stopped,
     "folded": _folded,
     "unlatched": _unlatched,

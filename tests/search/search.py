@@ -79,7 +79,7 @@ class _Search:
     def run(self, *, liveness: bool) -> None:
         """Visit all states, level by level."""
         found, bounds = self._found, self._bounds
-        world, account = World(bounds.programs, bounds.channel, bounds.delay), Account()
+        world, account = World(bounds.programs, bounds.channel, bounds.delay, overtaken=bounds.overtaken), Account()
         first = _named(world, account)
         self._came[first] = (None, "")
         level = [(first, world, account)]
@@ -105,6 +105,8 @@ class _Search:
             try:
                 act(after)
                 after.forget()
+                if not self._bounds.hears:
+                    after.news = [None for _ in after.news]
                 next_account = judge(world, account, after, move)
             except Violation as error:
                 raise Finding(self._told(name, move, error)) from error
@@ -128,6 +130,9 @@ class _Search:
             return 0
         world = world.copy()
         World.moves = world
+        world.ready = True
+        if world.hand:
+            world.record()
         if wanted is not None:
             for latch in tuple(world.authority.latches._in_force):
                 world.authority.unlatch(latch, "eve", fleet=latch == b"F" * 16)

@@ -25,14 +25,15 @@ from zbridge.control.lease_client import LeaseClient, Question
 from zbridge.control.lease_events import LeaseEvent
 from zbridge.control.lease_holder import LeaseHolder
 from zbridge.control.proof import read
-from zbridge.errors import Code, Refused, Stale
+from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
-from zbridge.fleet.messages import Acquire, Control, Drive, Lease, Mode, Refusal, Stop
+from zbridge.fleet.messages import Acquire, Control, Drive, Lease, Mode, Motor, Refusal, Stop
 from zbridge.fleet.topics import KeySpace
 
 KEYS = KeySpace("fleet", "r1")
 DRIVE, MODE = KEYS.key(topics.CMD_DRIVE.path), KEYS.key(topics.CMD_MODE.path)
+MOTOR = KEYS.key("@cmd/motor/arm")
 STOP, FLEET_STOP = KEYS.key(topics.CMD_STOP.path), "fleet/*/@cmd/stop"
 RENEW, RELEASE = KEYS.key(topics.RPC_RENEW.path), KEYS.key(topics.RPC_RELEASE.path)
 STEP_S, LEASE_S, DEADMAN_S, MAX_AGE_S, WAIT_S = 0.5, 1.0, 0.5, 0.4, 0.5
@@ -40,19 +41,27 @@ STEP_S, LEASE_S, DEADMAN_S, MAX_AGE_S, WAIT_S = 0.5, 1.0, 0.5, 0.4, 0.5
 PAYLOADS = {
     "motion": (DRIVE, payloads.encode(Drive(forward=1.0))),
     "neutral": (DRIVE, payloads.encode(Drive())),
+    "motor": (MOTOR, payloads.encode(Motor(value=1.0))),
+    "motor neutral": (MOTOR, payloads.encode(Motor(value=0.0))),
     "autonomous": (MODE, payloads.encode(Mode(mode="autonomous"))),
     "manual": (MODE, payloads.encode(Mode(mode="manual"))),
 }
+MOVES = ("motion", "motor", "autonomous")
+"""Commands that set the robot in motion."""
 LATCH_IDS = {"robot": b"L" * 16, "fleet": b"F" * 16}
 
 
 class Program(NamedTuple):
-    """One program of a world. waits: asks again for a while, as the Python client does; else as a listener."""
+    """One program of a world. waits: asks again for a while, as the Python client does; else as a listener.
+
+    drives: whether it gives commands.
+    """
 
     name: str
     takeover: bool = False
     priority: int = 0
     waits: bool = True
+    drives: bool = True
 
 
 class Command(NamedTuple):
@@ -132,16 +141,25 @@ class Holder(LeaseHolder):
 
 
 class Robot:
-    """What the robot was told last. by: whose motion, by the lease's id."""
+    """What the robot was told last. parts: those that were told to move."""
 
     def __init__(self) -> None:
-        self.moving = self.autonomous = False
+        self.parts: frozenset[str] = frozenset()
+        self.autonomous = False
         self.moved_at = 0.0
         """When the motion was given that the robot carries out."""
 
     @property
+    def moving(self) -> bool:
+        return bool(self.parts)
+
+    @property
     def in_motion(self) -> bool:
         return self.moving or self.autonomous
+
+    def rest(self) -> None:
+        """Take a stop."""
+        self.parts, self.autonomous = frozenset(), False
 
 
 class World:
@@ -150,7 +168,7 @@ class World:
     moves: World
     """The world in which a move is made now."""
 
-    def __init__(self, programs: tuple[Program, ...], channel: int, delay: int = 1) -> None:
+    def __init__(self, programs: tuple[Program, ...], channel: int, delay: int = 1, *, overtaken: bool = False) -> None:
         World.moves = self
         self.now = 1000.0
         self.delay_ms = delay * STEP_S * 1000
@@ -158,6 +176,12 @@ class World:
         self.channel = channel
         """Messages that may be on their way; a question that finds no room is lost."""
         self.programs = programs
+        self.ready = True
+        """Whether the gateway grants leases; else it says *ask later*."""
+        self.overtaken = overtaken
+        """Whether other input may come between the admission of a command and its record."""
+        self.hand: list[tuple[Command, Sender]] = []
+        """The command that was admitted and is not yet recorded."""
         self.net: list[Message] = []
         self.inbox: list[tuple[Lane, Command]] = []
         self.news: list[Control | None] = [None for _ in programs]
@@ -168,6 +192,8 @@ class World:
         self.authority = Authority(LEASE_S, DEADMAN_S, _random, MAX_AGE_S, Latches())
         self.gate = CommandGate(self.authority, KEYS, _clock)
         self.gates = {RENEW: QueryGate(self.authority, _clock), RELEASE: QueryGate(self.authority, _clock)}
+        for each in (self.gate, *self.gates.values()):
+            each.sieve._allowance = _Always()  # type: ignore[assignment]
         self.holders = [self._holder(number, program) for number, program in enumerate(programs)]
         self.decisions: list[tuple[str, Any]] = []
         """What the gateway decided in the last move: for the rules."""
@@ -244,11 +270,14 @@ class World:
         question, now_ms = query.question, self.now * 1000
         gate = self.gates.get(question.key)
         try:
+            if gate is None and not self.ready:
+                self._put_off(query)
+                return
             if gate is None:
                 request = payloads.decode(Acquire, question.payload)
                 take = self.authority.takeover if "/takeover/" in question.key else self.authority.acquire
                 reply = take(request, self.now, now_ms)
-                self.decisions.append(("acquire", (query.program, question, reply)))
+                self.decisions.append(("acquire", (query, reply)))
             elif gate(question.key, question.payload, len(question.payload), lambda: b"") is None:
                 return
             elif question.key == RENEW:
@@ -264,6 +293,11 @@ class World:
         self.net.append(Reply(query.program, question, answer, reply.lease, said, self.now * 1000))
         self.settle()
 
+    def _put_off(self, query: Query) -> None:
+        """Answer as a gateway that does not know the fleet's latched stops yet."""
+        answer, said = Answer("", b"", NotReady("not yet")), (False, "later", 0)
+        self.net.append(Reply(query.program, query.question, answer, None, said, self.now * 1000))
+
     def _take(self, command: Command) -> None:
         self.keep_time()
         key, payload = PAYLOADS[command.what]
@@ -271,23 +305,42 @@ class World:
         try:
             sender = self.authority.admit(command.attachment, key, payload, self.now, self.now * 1000)
             self.decisions.append(("admitted", (command, sender)))
-            self._carry_out(command, sender)
+            if self.overtaken:
+                self._require(command, sender)
+                self.hand = [(command, sender)]
+            else:
+                self._carry_out(command, sender)
         except Refused as refusal:
             self.authority.refuse(command.what, refusal, refusal.who or (sender.who if sender else None))
         self.settle()
 
+    def record(self) -> None:
+        """Carry out the command that was admitted, whatever came meanwhile."""
+        (command, sender), self.hand = self.hand[0], []
+        self.decisions.append(("recorded", (command, sender)))
+        self._tell(command, sender)
+        self.settle()
+
     def _carry_out(self, command: Command, sender: Sender) -> None:
-        what = command.what
-        if what in ("motion", "autonomous"):
+        self._require(command, sender)
+        self.decisions.append(("told", (command, sender)))
+        self._tell(command, sender)
+
+    def _require(self, command: Command, sender: Sender) -> None:
+        if command.what in MOVES:
             if sender.stale:
                 raise Stale("given too long ago")
             self.authority.require_motion()
-        self.decisions.append(("told", (command, sender)))
-        if what in ("motion", "neutral"):
-            self.robot.moving = what == "motion"
+
+    def _tell(self, command: Command, sender: Sender) -> None:
+        what = command.what
+        if what in ("motion", "neutral", "motor", "motor neutral"):
+            part, moving = PAYLOADS[what][0], what in MOVES
+            self.robot.parts = self.robot.parts | {part} if moving else self.robot.parts - {part}
             self.robot.autonomous = False if what == "neutral" else self.robot.autonomous
-            self.robot.moved_at = sender.given_at
-            self.authority.applied("@cmd/drive", sender.given_at, moving=what == "motion", stale=sender.stale)
+            self.robot.moved_at = sender.given_at if moving else self.robot.moved_at
+            whole = part == DRIVE
+            self.authority.applied(part, sender.given_at, moving=moving, stale=sender.stale, whole=whole)
         else:
             self.robot.autonomous = what == "autonomous"
             self.authority.mode_chosen(autonomous=what == "autonomous")
@@ -315,7 +368,7 @@ class World:
     def hold_back(self, *, stops: bool) -> None:
         """Let the robot's link stall, or be lost: then the robot is stopped by itself."""
         if not stops:
-            self.robot.moving = self.robot.autonomous = False
+            self.robot.rest()
         self.decisions.append(("held back", None))
         self.authority.hold_back("link", stops=stops)
         self.settle()
@@ -331,7 +384,7 @@ class World:
 
     def _carry_out_event(self, event: Event) -> None:
         if event.stops:
-            self.robot.moving = self.robot.autonomous = False
+            self.robot.rest()
         if event.what is not EventKind.REFUSED:
             self.decisions.append(("event", event))
 
@@ -361,6 +414,7 @@ class World:
         """Copy everything that a move may change."""
         new = _bare(self)
         new.net, new.inbox, new.news, new.told, new.decisions = self.net[:], self.inbox[:], self.news[:], [], []
+        new.hand = self.hand[:]
         new.robot = _bare(self.robot)
         new.authority = _authority(self.authority, self)
         new.gate = _bare(self.gate)
@@ -390,7 +444,7 @@ class World:
         """Return the ids of leases that somebody may still use."""
         used = {holder.client._signer.lease for holder in self.holders if holder.client._signer is not None}
         used |= {each.lease for each in self.net if not isinstance(each, TokenGone) and each.lease is not None}
-        used |= {command.lease for _, command in self.inbox}
+        used |= {command.lease for _, command in self.inbox} | {command.lease for command, _ in self.hand}
         return used
 
     def key(self) -> Any:
@@ -398,6 +452,13 @@ class World:
         from tests.search.naming import name
 
         return name(self)
+
+
+class _Always:
+    """Lets everything through that a gate refuses: the rates of the gates are in no world, and would couple them."""
+
+    def take(self, now: float) -> bool:
+        return True
 
 
 class _Concerns:
@@ -439,6 +500,7 @@ def _bare(old: Any) -> Any:
 def _authority(old: Authority, world: World) -> Authority:
     new: Authority = _bare(old)
     new._moving, new._stops, new._events = set(old._moving), old._stops.copy(), []
+    new._moved = set(old._moved)
     new.latches = latches = _bare(old.latches)
     latches._in_force = dict(latches._in_force)
     latches._released, latches._released_fleet = latches._released.copy(), latches._released_fleet.copy()

@@ -1,10 +1,10 @@
 """A simulated Zenoh: sessions, two routers, and what goes wrong between them.
 
-Theory of operation. Each session is linked to one router, the routers to each other. A message goes from link to link;
-a link that is *cut* keeps what it is given (commands that may be dropped: only so many bytes), and delivers it in order
-and at once when it heals. A cut of more than LEASE_S, or a *reset*, ends the link: both ends notice, what it kept is
-lost, and the session returns RETURN_S after the link works again. Order holds for one publisher and one key. What a
-session knows of others' tokens and queryables follows with a delay, and news may be late.
+Theory of operation. Each session is linked to one router, the routers to each other (:mod:`tests.simulated.bus_link`).
+A message goes from link to link. Order holds for one publisher and one key. A router knows the tokens of its sessions
+and those that the other router told it; news of tokens travel as messages, and may be late besides. What happened to a
+link is known at each of its ends at its own time. ``python -m tests.simulated.bus_validation`` compares all of this
+with real Zenoh; docs/reliability.md says what was measured.
 """
 
 from __future__ import annotations
@@ -12,102 +12,62 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from tests.simulated.bus_link import LEASE_S, ROUTERS, SESSIONS, Link
 from tests.simulated.engine import Process, World
 from tests.simulated.net import Paths
 
-LEASE_S = 10.0
-"""Seconds of silence after which a link is given up."""
-RETURN_S = 1.0
-"""Most seconds until a session finds a router again."""
 NEWS_S = 0.01
 """Most seconds until tokens and declarations are known elsewhere."""
-DROP_BYTES = 8_192
-"""Bytes that a link keeps of messages that may be dropped, while it takes nothing."""
+_TOKEN_BYTES = 64
+
+Token = tuple[str, str]
+"""The id of a session, and the key of its token."""
 
 
-class Link:
-    """One link: of a session to its router, or between the routers. ``here``, ``there``: hosts."""
+class Router:
+    """One router. tokens: those of its own sessions, and those that the other router told it."""
 
-    def __init__(self, fabric: Fabric, here: str, there: str) -> None:
-        self.fabric = fabric
-        self.here, self.there = here, there
+    def __init__(self, fabric: Fabric, name: str) -> None:
+        self.name = name
         self.up = True
-        self._kept: list[tuple[str, str, int, Callable[[], None], bool]] = []
-        self._last: dict[tuple[str, str], float] = {}
-        self._stalled_at: float | None = None
-
-    def works(self, source: str, target: str) -> bool:
-        return self.fabric.paths.up(source, target)
+        self.tokens: dict[Token, bool] = {}
+        """Of each token, whether it came from the other router."""
+        self._fabric = fabric
 
     @property
-    def whole(self) -> bool:
-        """Whether it is up and lets everything through."""
-        return self.up and self.works(self.here, self.there) and self.works(self.there, self.here)
+    def sessions(self) -> list[SimSession]:
+        """The sessions that it takes for connected."""
+        return [each for each in self._fabric.sessions if each.router == self.name and each.link.ends[1]]
 
-    def carry(self, source: str, order: str, size: int, deliver: Callable[[], None], *, droppable: bool) -> None:
-        """Carry a message from one end to the other."""
-        if not self.up:
+    def learn(self, token: Token, alive: bool, *, beyond: bool = False) -> None:
+        """Take news of a token, and pass it on. beyond: it came from the other router."""
+        if (token in self.tokens) is alive:
             return
-        target = self.there if source == self.here else self.here
-        if not self.works(source, target) or self._kept:
-            kept = sum(each[2] for each in self._kept if each[4])
-            if not droppable or kept + size <= DROP_BYTES:
-                self._kept.append((source, order, size, deliver, droppable))
-            return
-        world = self.fabric.world
-        when = max(self._last.get((source, order), 0.0), world.now + self.fabric.paths.delay(source, target))
-        self._last[source, order] = when
-        world.at(when, lambda: self._arrive(source, order, size, deliver, droppable))
+        if alive:
+            self.tokens[token] = beyond
+        else:
+            del self.tokens[token]
+        for session in self.sessions:
+            if session.zid != token[0]:
+                self._carry(session.link, 1, lambda session=session: session.learn(token, alive))
+        if not beyond:
+            other = self._fabric.other(self)
+            self._carry(self._fabric.between, self._fabric.end_of(self), lambda: other.learn(token, alive, beyond=True))
 
-    def _arrive(self, source: str, order: str, size: int, deliver: Callable[[], None], droppable: bool) -> None:
-        target = self.there if source == self.here else self.here
-        if not self.up:
-            return
-        if not self.works(source, target):
-            self._kept.append((source, order, size, deliver, droppable))
-            return
-        deliver()
+    def forget(self, wanted: Callable[[Token, bool], bool]) -> None:
+        """Forget tokens: those that a lost link brought."""
+        for token, beyond in tuple(self.tokens.items()):
+            if wanted(token, beyond):
+                self.learn(token, False, beyond=beyond)
 
-    def changed(self) -> None:
-        """Follow the paths: begin to stall, or deliver what was kept."""
-        world = self.fabric.world
-        works = self.works(self.here, self.there) and self.works(self.there, self.here)
-        if not works and self._stalled_at is None:
-            self._stalled_at = begun = world.now
+    def tell_all(self, link: Link, end: int, tell: Callable[[Token], None], *, own: bool) -> None:
+        """Tell who was linked anew of the tokens. own: only those of this router's own sessions."""
+        for token, beyond in tuple(self.tokens.items()):
+            if not (own and beyond):
+                self._carry(link, end, lambda token=token: tell(token))
 
-            def give_up() -> None:
-                if self._stalled_at == begun and self.up:
-                    self.drop()
-
-            world.after(LEASE_S, give_up)
-        elif works and self._stalled_at is not None:
-            self._stalled_at = None
-            if self.up:
-                world.after(self.fabric.rng.uniform(0.0, 0.5), self._flush)
-            else:
-                world.after(self.fabric.rng.uniform(0.1, RETURN_S), self.restore)
-
-    def _flush(self) -> None:
-        kept, self._kept = self._kept, []
-        for source, order, size, deliver, droppable in kept:
-            self.carry(source, order, size, deliver, droppable=droppable)
-
-    def drop(self) -> None:
-        """End the link: both ends notice."""
-        if self.up:
-            self.up = False
-            self._kept.clear()
-            self._last.clear()
-            self.fabric.world.note("bus", "link lost", self.here, self.there)
-            self.fabric.link_changed(self)
-
-    def restore(self) -> None:
-        """Make the link anew."""
-        works = self.works(self.here, self.there) and self.works(self.there, self.here)
-        if not self.up and works and self._stalled_at is None:
-            self.up = True
-            self.fabric.world.note("bus", "link back", self.here, self.there)
-            self.fabric.link_changed(self)
+    def _carry(self, link: Link, end: int, deliver: Callable[[], None]) -> None:
+        link.carry(end, "news", _TOKEN_BYTES, deliver, droppable=False)
 
 
 class Fabric:
@@ -119,7 +79,8 @@ class Fabric:
         self.rng = world.rng("bus")
         self.sessions: list[SimSession] = []
         self.on_put: list[Callable[[str, str, bytes], None]] = []
-        self.between = Link(self, "router1", "router2")
+        self.routers = {name: Router(self, name) for name in ("router1", "router2")}
+        self.between = Link(self, ("router1", "router2"), world.after, ROUTERS, self._between_changed)
         self.news_late_s = 0.0
         """Added to the delay of liveliness news, at most."""
         self.news_lost = 0.0
@@ -127,6 +88,8 @@ class Fabric:
         self.duplicates = 0.0
         self.reorders = False
         """Whether commands on different keys overtake each other."""
+        self.asked: list[Any] = []
+        """Queries that are under way."""
         self._number = 0
         paths.healed.append(lambda here, there: self.follow())
 
@@ -139,18 +102,57 @@ class Fabric:
         """Return an id for a new session."""
         return f"{self.rng.getrandbits(48):012x}"
 
+    def other(self, router: Router) -> Router:
+        """Return the other router."""
+        return self.routers["router2" if router.name == "router1" else "router1"]
+
+    def end_of(self, router: Router) -> int:
+        """Return which end of the link between the routers is this router's."""
+        return int(router.name == "router2")
+
     def follow(self) -> None:
         """Follow the paths after they changed."""
-        self.between.changed()
-        for session in self.sessions:
-            session.link.changed()
+        self.between.follow()
+        for session in tuple(self.sessions):
+            session.link.follow()
 
-    def link_changed(self, link: Link) -> None:
-        """Tell the session that lost or found its router, and all of the tokens that came or went."""
-        for session in self.sessions:
-            if session.link is link:
-                session.connected_changed(link.up)
-        self.spread()
+    def kill_router(self, name: str) -> None:
+        """End a router: its links end, and nobody returns before it is started again."""
+        router = self.routers[name]
+        router.up = False
+        router.tokens.clear()
+        for link in self._links_of(name):
+            link.drop()
+
+    def start_router(self, name: str) -> None:
+        """Start a router."""
+        self.routers[name].up = True
+
+    def _links_of(self, router: str) -> list[Link]:
+        return [each.link for each in self.sessions if each.router == router] + [self.between]
+
+    def _between_changed(self, end: int, up: bool) -> None:
+        """Follow what an end of the link between the routers came to know."""
+        router = self.routers[("router1", "router2")[end]]
+        if up:
+            other = self.other(router)
+            router.tell_all(self.between, end, lambda token: other.learn(token, True, beyond=True), own=True)
+        else:
+            router.forget(lambda token, beyond: beyond)
+        self.end_questions()
+
+    def end_questions(self) -> None:
+        """End the queries that wait for an answerer whose link is known to be lost."""
+        for asked in tuple(self.asked):
+            asked.give_up_lost()
+
+    def linked(self, one: SimSession, other: SimSession) -> bool:
+        """Whether, as the asker's side knows, there are links between two sessions."""
+        if one is other:
+            return True
+        if not (one.link.ends[0] and other.link.ends[1]):
+            return False
+        return one.router == other.router or self.between.ends[self.end_of(self.routers[one.router])]
 
     def reaches(self, one: SimSession, other: SimSession) -> bool:
         """Whether there are links between two sessions, working or not."""
@@ -175,21 +177,16 @@ class Fabric:
             return
 
         def last() -> None:
-            other.link.carry(other.router, order, size, deliver, droppable=droppable)
+            other.link.carry(1, order, size, deliver, droppable=droppable)
 
         def middle() -> None:
             if one.router == other.router:
                 last()
             else:
-                self.between.carry(one.router, order, size, last, droppable=droppable)
+                end = self.end_of(self.routers[one.router])
+                self.between.carry(end, order, size, last, droppable=droppable)
 
-        one.link.carry(one.host, order, size, middle, droppable=droppable)
-
-    def spread(self) -> None:
-        """Let all sessions know of tokens that came or went."""
-        for session in self.sessions:
-            if session.open:
-                session.compare_tokens()
+        one.link.carry(0, order, size, middle, droppable=droppable)
 
 
 class SimSession:
@@ -202,74 +199,101 @@ class SimSession:
         self.host = process.host.name
         self.router = router
         self.open = True
-        self.link = Link(fabric, self.host, router)
+        self.link = Link(fabric, (self.host, router), process.after, SESSIONS, self._link_changed)
         self.tokens: list[str] = []
-        self.known: dict[tuple[str, str], bool] = {}
-        """Tokens of all sessions that this one was told of, by zid and key."""
+        self.known: set[Token] = set()
+        """Tokens that this session was told of, its own included."""
         self.buses: list[Any] = []
-        self._pending: dict[tuple[str, str], float] = {}
+        self._late: dict[Token, float] = {}
         self._frozen_at: float | None = None
         fabric.sessions.append(self)
         process.on_death.append(self.died)
         process.on_pause.append(self._on_pause)
-        fabric.world.after(0.005, self.link.changed)
+        fabric.world.after(0.005, self._begin)
+
+    def _begin(self) -> None:
+        self.link.follow()
+        self._link_changed(1, self.link.ends[1])
+
+    @property
+    def at(self) -> Router:
+        """Its router."""
+        return self.fabric.routers[self.router]
 
     def _on_pause(self, paused: bool) -> None:
         """A session that is frozen for longer than the lease is given up by its router."""
         world = self.fabric.world
-        self._frozen_at = world.now if paused else None
-        begun = world.now
+        self._frozen_at = begun = world.now if paused else None
         if paused:
-            world.after(LEASE_S, lambda: self.link.drop() if self._frozen_at == begun and self.open else None)
-        elif not self.link.up:
-            world.after(self.fabric.rng.uniform(0.1, RETURN_S), self.link.restore)
+            quiet_s = self.link.silent_s()
+
+            def give_up() -> None:
+                if self._frozen_at == begun and self.open:
+                    self.link.give_up(1)
+
+            world.after(LEASE_S - quiet_s, give_up)
 
     def died(self) -> None:
-        """The process is gone: the router notices at once."""
-        self.fabric.world.after(0.002, self.close)
+        """The process is gone: the router notices at once, if its path works."""
+        self.fabric.world.after(0.002, self._gone)
 
     def close(self) -> None:
         """Leave the bus."""
+        self._gone()
+
+    def _gone(self) -> None:
         if self.open:
             self.open = False
             self.tokens.clear()
-            self.fabric.sessions.remove(self)
-            self.fabric.spread()
+            self.link.give_up(0)
+            if not self.link.ends[1]:
+                self._leave()
 
-    def connected_changed(self, up: bool) -> None:
-        delay_s = self.fabric.rng.random() * 0.005
-        self.process.after(delay_s, lambda: [bus.told_connected(self.link.up) for bus in tuple(self.buses)])
+    def _leave(self) -> None:
+        if self in self.fabric.sessions:
+            self.fabric.sessions.remove(self)
+
+    def _link_changed(self, end: int, up: bool) -> None:
+        """Follow what an end of the link came to know: 0 is the session's, 1 the router's."""
+        if end == 1:
+            if up:
+                self.at.tell_all(self.link, 1, lambda token: self.learn(token, True), own=False)
+            else:
+                self.at.forget(lambda token, _: token[0] == self.zid)
+                if not self.open:
+                    self._leave()
+        elif self.open:
+            delay_s = self.fabric.rng.random() * 0.005
+            self.process.after(delay_s, lambda: [bus.told_connected(self.link.ends[0]) for bus in tuple(self.buses)])
+            if up:
+                for key in self.tokens:
+                    self._announce(key, True)
+            else:
+                for token in [each for each in self.known if each[0] != self.zid]:
+                    self._change(token, False)
+        self.fabric.end_questions()
 
     # Tokens
 
-    def visible(self) -> dict[tuple[str, str], bool]:
-        """Return the tokens that the router would name now."""
-        return {
-            (other.zid, token): True
-            for other in self.fabric.sessions
-            if self.fabric.reaches(self, other)
-            for token in other.tokens
-        }
+    def learn(self, token: Token, alive: bool) -> None:
+        """Take news of another session's token from the router."""
+        if self.open and token[0] != self.zid:
+            self._change(token, alive)
 
-    def compare_tokens(self) -> None:
-        """Tell the watchers, after a while, of what came and went."""
-        visible, rng = self.visible(), self.fabric.rng
-        for entry in [entry for entry in visible if entry not in self.known]:
-            self.known[entry] = True
-            self._tell(entry, True, rng)
-        for entry in [entry for entry in self.known if entry not in visible]:
-            del self.known[entry]
-            self._tell(entry, False, rng)
-
-    def _tell(self, entry: tuple[str, str], alive: bool, rng: Any) -> None:
-        if rng.random() < self.fabric.news_lost:
-            self.fabric.world.note("bus", "news lost", self.process.name, entry[1], alive)
+    def _change(self, token: Token, alive: bool) -> None:
+        """Tell the watchers of a token, where that is news: of several sessions' same tokens only one counts."""
+        key = token[1]
+        before = any(known[1] == key for known in self.known)
+        (self.known.add if alive else self.known.discard)(token)
+        if any(known[1] == key for known in self.known) is before:
             return
-        world = self.fabric.world
-        late_s = rng.random() * NEWS_S + (rng.random() * self.fabric.news_late_s if self.fabric.news_late_s else 0.0)
-        when = max(world.now + late_s, self._pending.get(entry, 0.0))
-        self._pending[entry] = when
-        key = entry[1]
+        fabric, world, rng = self.fabric, self.fabric.world, self.fabric.rng
+        if rng.random() < fabric.news_lost:
+            world.note("bus", "news lost", self.process.name, key, alive)
+            return
+        late_s = rng.random() * NEWS_S + (rng.random() * fabric.news_late_s if fabric.news_late_s else 0.0)
+        when = max(world.now + late_s, self._late.get(token, 0.0))
+        self._late[token] = when
 
         def tell() -> None:
             for bus in tuple(self.buses):
@@ -277,13 +301,19 @@ class SimSession:
 
         world.at(when, lambda: self.process.after(0.0, tell))
 
+    def _announce(self, key: str, alive: bool) -> None:
+        token = (self.zid, key)
+        self.link.carry(0, "news", _TOKEN_BYTES, lambda: self.at.learn(token, alive), droppable=False)
+
     def declare_token(self, key: str) -> None:
         self.tokens.append(key)
         self.fabric.world.note(self.process.name, "announces", key)
-        self.fabric.spread()
+        self._change((self.zid, key), True)
+        self._announce(key, True)
 
     def undeclare_token(self, key: str) -> None:
         if key in self.tokens:
             self.tokens.remove(key)
             self.fabric.world.note(self.process.name, "withdraws", key)
-            self.fabric.spread()
+            self._change((self.zid, key), False)
+            self._announce(key, False)

@@ -14,9 +14,12 @@ from zbridge.bus.fake import matches, meet
 from zbridge.bus.inbox import Inbox
 from zbridge.bus.interface import Answer, Lane, Sample
 from zbridge.bus.late_join import LateJoin
-from zbridge.errors import Refused
+from zbridge.errors import BusError, Refused
 from zbridge.fleet.topics import Congestion, is_concrete
 from zbridge.metrics import Metrics
+
+WRITE_S = 1e-3
+"""Most seconds until the writer thread writes what must not be dropped: other messages may overtake it."""
 
 
 class SimBus:
@@ -33,6 +36,8 @@ class SimBus:
         self.last: dict[str, bytes] = {}
         self._watchers: list[tuple[str, Callable[[str, bool], None]]] = []
         self._connected: list[Callable[[bool], None]] = []
+        self._written_at = 0.0
+        """When the writer thread has written what it was given."""
         session.buses.append(self)
 
     def __repr__(self) -> str:
@@ -58,6 +63,16 @@ class SimBus:
 
     def put(self, key: str, payload: bytes, attachment: bytes | None, *, droppable: bool) -> None:
         """Send a sample to all that subscribe."""
+        session, fabric = self.session, self.fabric
+        if not session.open or not session.process.alive:
+            return
+        if droppable:
+            self._write(key, payload, attachment, droppable=True)
+            return
+        self._written_at = max(self._written_at, fabric.world.now + fabric.rng.random() * WRITE_S)
+        fabric.world.at(self._written_at, lambda: self._write(key, payload, attachment, droppable=False))
+
+    def _write(self, key: str, payload: bytes, attachment: bytes | None, *, droppable: bool) -> None:
         session, fabric = self.session, self.fabric
         if not session.open or not session.process.alive:
             return
@@ -150,7 +165,9 @@ class SimBus:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 await asked.done
-        asked.over = True
+        if asked.done.cancelled():
+            asked.answers.append(Answer("", b"", BusError("Timeout")))
+        asked.end()
         return asked.answers
 
     def attend(self) -> None:
@@ -164,24 +181,24 @@ class SimBus:
 
     async def alive(self, key_expr: str, *, timeout_s: float = 0.5) -> list[str]:
         session = self.session
-        if session.link.up and not session.link.whole:
+        own = set(session.tokens)
+        if session.link.ends[0] and not session.link.whole:
             await asyncio.sleep(timeout_s)
-            return []
+            return sorted(key for key in own if matches(key_expr, key))
         await asyncio.sleep(0.001 + self.fabric.rng.random() * 0.002)
-        return sorted({key for _, key in session.visible() if matches(key_expr, key)})
+        seen = {key for _, key in session.at.tokens} if session.link.up else set()
+        return sorted(key for key in own | seen if matches(key_expr, key))
 
     def watch_alive(self, key_expr: str, handler: Callable[[str, bool], None]) -> Any:
         source = self._inbox.source(lambda change: handler(*change))
         entry = (key_expr, lambda key, alive: source.put((key, alive), Lane.STOP))
         self._watchers.append(entry)
-        for _, key in tuple(self.session.known):
+        for key in sorted({key for _, key in self.session.known}):
             if matches(key_expr, key):
                 entry[1](key, True)
         return self._keep(SimHandle(lambda: self._watchers.remove(entry)))
 
     def told_alive(self, key: str, alive: bool) -> None:
-        if not alive and any(known == key for _, known in self.session.known):
-            return  # another session has the same token
         for key_expr, tell in tuple(self._watchers):
             if matches(key_expr, key):
                 self.fabric.world.note(self.session.process.name, "alive", key, alive)
@@ -190,7 +207,7 @@ class SimBus:
     # The rest
 
     async def flush(self) -> None:
-        await asyncio.sleep(1e-4)
+        await asyncio.sleep(max(1e-4, self._written_at - self.fabric.world.now))
 
     async def drain(self, key_expr: str) -> None:
         await asyncio.sleep(1e-3)
@@ -203,7 +220,7 @@ class SimBus:
 
     def watch_connected(self, handler: Callable[[bool], None]) -> Any:
         self._connected.append(handler)
-        up = self.session.link.up
+        up = self.session.link.ends[0]
         self._loop.call_soon(lambda: handler(up) if handler in self._connected else None)
         return self._keep(SimHandle(lambda: self._connected.remove(handler)))
 
@@ -281,7 +298,8 @@ class Asked:
         self.answers: list[Answer] = []
         self.done: asyncio.Future[None] = bus._loop.create_future()
         self.over = False
-        self._open = 0
+        self._open: set[SimSession] = set()
+        """Who has not answered to the end."""
         self._number = bus.fabric.number()
 
     def start(self) -> None:
@@ -290,11 +308,37 @@ class Asked:
         fabric.world.note(session.process.name, "asks", self.key_expr, self.payload)
         for other in tuple(fabric.sessions):
             if fabric.reaches(session, other) and self._answers(other):
-                self._open += 1
+                self._open.add(other)
                 order = f"{session.zid} ?{self.key_expr}"
                 fabric.carry(session, other, order, 64, lambda other=other: self._arrive(other), droppable=False)
         if not self._open:
             fabric.world.after(0.001, lambda: session.process.after(0.0, self._end))
+        fabric.asked.append(self)
+
+    def give_up_lost(self) -> None:
+        """Await nothing more of those to whom there is no link any more."""
+        session, fabric = self.bus.session, self.bus.fabric
+        for other in tuple(self._open):
+            if fabric.linked(session, other):
+                continue
+            if session.link.ends[0]:
+                session.link.carry(1, f"!{self._number}", 32, self._later(other), droppable=False)
+            else:
+                fabric.world.after(0.001, self._later(other))
+
+    def _later(self, other: SimSession) -> Callable[[], None]:
+        return lambda: self.bus.session.process.after(0.0, lambda: self._finished(other))
+
+    def _finished(self, other: SimSession) -> None:
+        self._open.discard(other)
+        if not self._open:
+            self._end()
+
+    def end(self) -> None:
+        """Take no more answers."""
+        self.over = True
+        if self in self.bus.fabric.asked:
+            self.bus.fabric.asked.remove(self)
 
     def _answers(self, other: SimSession) -> bool:
         now = self.bus.fabric.world.now
@@ -328,12 +372,7 @@ class Asked:
             self._final(other)
 
     def _final(self, other: SimSession) -> None:
-        def arrive() -> None:
-            self._open -= 1
-            if not self._open:
-                self._end()
-
-        self._carry(other, arrive)
+        self._carry(other, lambda: self._finished(other))
 
     def reply(self, other: SimSession, answer: Answer) -> None:
         """Take an answer on its way."""

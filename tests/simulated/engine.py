@@ -147,7 +147,7 @@ class Process:
         def run() -> None:
             if not self.alive:
                 return
-            if self.paused:
+            if self.paused or self._late:
                 self._late.append(work)
             else:
                 work()
@@ -168,15 +168,18 @@ class Process:
             return
         self.paused, self.resumed_at = False, self.world.now
         self.world.note(self.name, "resumed")
-        late, self._late = self._late, []
-        delay_s = 0.0
-        for work in late:
-            delay_s += self.rng.random() * 1e-4
-            self.after(delay_s, work)
+        self._catch_up()
         for tell in self.on_pause:
             tell(False)
         if self.loop is not None:
             self.loop.wake(self.world.now + self.rng.random() * 2e-3)
+
+    def _catch_up(self) -> None:
+        """Do the oldest of what came meanwhile, and soon the next; what comes now waits behind it."""
+        if self._late and self.alive and not self.paused:
+            self._late[0]()
+            del self._late[0]
+            self.world.after(self.rng.random() * 1e-4, self._catch_up)
 
     def kill(self) -> None:
         """End it at once, as SIGKILL does."""

@@ -174,16 +174,14 @@ class Faults:
         name = step["target"]
         member = self._simulation.members.get(name)
         link = member.session.link if member is not None and member.alive else fabric.between
-        link.drop()
+        link.drop(stays=True)
         self._later(step, link.restore)
 
     def _router(self, step: dict[str, Any]) -> None:
         """Restart a router: all of its links end."""
         fabric = self._simulation.fabric
-        links = [each.link for each in fabric.sessions if each.router == step["target"]] + [fabric.between]
-        for link in links:
-            link.drop()
-        self._later(step, lambda: [link.restore() for link in links])
+        fabric.kill_router(step["target"])
+        self._later(step, lambda: fabric.start_router(step["target"]))
 
     def _slow(self, step: dict[str, Any]) -> None:
         slow, pair = self._simulation.paths.slow, frozenset(step["between"])
@@ -276,6 +274,8 @@ class Faults:
         for member in simulation.members.values():
             if not member.alive:
                 member.start()
+        for router in fabric.routers:
+            fabric.start_router(router)
         fabric.follow()
         fabric.between.restore()
         for session in fabric.sessions:

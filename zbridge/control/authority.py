@@ -154,9 +154,7 @@ class Authority:
         if self._held_back is not None:
             raise NeutralFirst(f"{self._held_back}: send a neutral drive first")
 
-    def applied(
-        self, part: str, given_at: float, *, moving: bool, stale: bool = False, whole: bool = False
-    ) -> None:
+    def applied(self, part: str, given_at: float, *, moving: bool, stale: bool = False, whole: bool = False) -> None:
         """Record that the holder's command for one part of the robot was carried out.
 
         given_at: when it was given, on the time line of ``now``; the deadman counts from then. A stale neutral ends

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from tests.simulated.mutants_data import DEVICE, Mutant
 
-OUTGOING = "zbridge/app/handover/outgoing.py"
 INCOMING = "zbridge/app/handover/incoming.py"
 LISTENER = "zbridge/hq/handover.py"
 SESSION = "zbridge/protocol/session_kept.py"
@@ -64,11 +63,5 @@ HANDOVER = (
         "zbridge/app/gateway.py",
         "together(*work, first=self.restarts.settle)",
         "together(*work)",
-    ),
-    _mutant(
-        "an end during a restart is told as a crash",
-        OUTGOING,
-        "        channel.say(Failed(reason))\n",
-        "        channel.close()\n",
     ),
 )

@@ -38,6 +38,8 @@ GRACE_S = 1.0
 """Seconds by which the news of a token may be later than a command, or a command later than the end of its token."""
 LATE_S = 5.0
 """Seconds by which the time of an attachment may be wrong."""
+SKIPS = 5
+"""Numbers that may go up at once: Zenoh drops commands between ROS nodes too, where a router is late by 20 ms."""
 
 
 class Command(NamedTuple):
@@ -166,7 +168,7 @@ class StrictRobot(Judge):
             time.sleep(0.01)
         before, before_ns = self._last.get(gid, (number - 1, 0))
         self._last[gid] = number, sent_ns
-        if number != before + 1 or number < 1:
+        if number < 1 or not before < number <= before + SKIPS:
             self._violate(f"number {number} after {before}")
         if sent_ns < before_ns or abs(sent_ns - time.time_ns()) > LATE_S * 1e9:
             self._violate(f"sent at {sent_ns}, after {before_ns}, now {time.time_ns()}")

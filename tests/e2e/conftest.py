@@ -264,6 +264,8 @@ class Bench:
         self.folder = folder
         self.endpoint = f"tcp/{HOST}:{free_port()}"
         self.stack = stack
+        self.simulators: dict[int, subprocess.Popen[str]] = {}
+        """By port."""
         self._processes: list[int] = []
         self._withheld = Withheld()
         self.fleet = Fleet(self.stack.enter_context(self.router()))
@@ -304,7 +306,7 @@ class Bench:
     def simulator(self, protocol: str = "tcpudp", *more: str, port: int = 0) -> int:
         """Start a simulated robot; give its port."""
         port = port or free_port()
-        process = self.zbridge("simulate", protocol, "--listen", f"tcp://{HOST}:{port}", *more)
+        process = self.simulators[port] = self.zbridge("simulate", protocol, "--listen", f"tcp://{HOST}:{port}", *more)
         assert process.stdout is not None
         assert "listening" in process.stdout.readline()
         return port

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.protocol.device_clock import BUCKETS, DeviceClock
@@ -143,7 +143,6 @@ def test_the_stated_error_holds_for_any_delays(spread_us, drift_ppm, good, gap, 
     assert max(errors_ns(DeviceClock(), packets, SETTLED_S)) <= 2.5 * spread_us * 1000 + 10
 
 
-@settings(max_examples=2 * settings().max_examples)
 @given(
     drift_ppm=st.floats(-400, 400),
     delays_s=st.lists(st.one_of(st.floats(0, 0.05), st.floats(0, 0.9)), min_size=1, max_size=200),
@@ -161,7 +160,6 @@ def test_early_stamps_are_as_good_as_the_best_packet_so_far(drift_ppm, delays_s,
         assert error_s <= best_s + 1e-6
 
 
-@settings(max_examples=2 * settings().max_examples)
 @given(
     delays_s=st.lists(st.floats(0, 0.9), max_size=100),
     steps_ms=st.lists(st.integers(0, 3000), min_size=100, max_size=100),
@@ -311,7 +309,6 @@ absurd = st.one_of(
 )
 
 
-@settings(max_examples=3 * settings().max_examples)
 @given(
     wrap_ms=st.sampled_from([None, U32, 1000, 3]),
     calls=st.lists(st.tuples(absurd, st.one_of(absurd, st.integers(EPOCH_NS, EPOCH_NS + 400 * S))), max_size=60),

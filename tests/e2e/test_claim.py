@@ -202,7 +202,10 @@ def test_a_gateway_that_stands_aside_does_so_after_a_restart_and_after_a_crash_a
         successor = supervised.gateway("r1", not_pid=process)
         until(lambda: "handed over" in supervised.log, what="a restart")
         assert granted(bench) == 1
+        bench.simulators[port].send_signal(signal.SIGSTOP)
+        time.sleep(0.5)  # nobody can take over the connection of a process that dies while it reads
         os.kill(successor, signal.SIGKILL)
+        bench.simulators[port].send_signal(signal.SIGCONT)
         supervised.gateway("r1", not_pid=successor)
         time.sleep(2 * CLOSE_S)
         assert granted(bench) == 1

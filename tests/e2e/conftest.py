@@ -71,7 +71,7 @@ class Lease:
         self.answer: dict[str, Any] = {}
         for _ in range(15):
             self.answer = self.ask(f"{how}/{wishes['who']}", packed(wishes))
-            if self.answer.get("reason") != ASKS_OTHERS and self.answer.get("code") != "closing":
+            if self.answer and self.answer.get("reason") != ASKS_OTHERS and self.answer.get("code") != "closing":
                 break
             time.sleep(0.1)
         assert self.answer.get("ok"), self.answer

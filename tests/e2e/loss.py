@@ -30,7 +30,7 @@ from tests.e2e.robots import SCALE, STOP, Frame, Robot
 from tests.machine import Withheld, contended_s
 from tests.ports import free_port
 from tests.proofs import packed
-from zbridge.app.router_settings import PATIENCE_US
+from zbridge.bus.interface import FULL_QUEUES
 
 LATE_S = 0.05
 """Seconds after the deadman in which the stop must be at the robot."""
@@ -67,7 +67,8 @@ def commander(session: zenoh.Session, path: str, robot: str = "r1") -> zenoh.Pub
 def be_router(endpoint: str) -> None:
     """Be a router until stdin ends."""
     config = configuration("router", endpoint)
-    config.insert_json5("transport/link/tx/queue/congestion_control/drop/wait_before_drop", str(PATIENCE_US))
+    for path, waits_us in FULL_QUEUES.items():
+        config.insert_json5(path, str(waits_us))
     with zenoh.open(config):
         print("open", flush=True)
         sys.stdin.read()

@@ -29,7 +29,7 @@ KEPT_BYTES = (9_000, 20_000)
 OVERHEAD_BYTES = 30
 BURST = (100, 520)
 """Messages within a second that must not be dropped: after so many a link may stall."""
-CLOSE_S = 5.0
+CLOSE_S = 1.0
 """Seconds after which Zenoh closes a link that takes no message that must not be dropped."""
 WINDOW = (4, 10)
 """Messages that TCP sends without an acknowledgement."""

@@ -18,7 +18,7 @@ from zbridge.app.access_rules import MESSAGE_BYTES, STOPS_HZ, access_control, do
 from zbridge.app.roles import Roles, load_roles
 from zbridge.app.toml import convert, read_toml
 from zbridge.bus import Tls
-from zbridge.bus.interface import SECURE, Connection
+from zbridge.bus.interface import FULL_QUEUES, SECURE, Connection
 from zbridge.bus.tls.files import tls_beside
 from zbridge.errors import ConfigError
 from zbridge.fleet.topics import is_name
@@ -26,8 +26,6 @@ from zbridge.protocol.networks import is_loopback
 
 LISTEN = "tcp/127.0.0.1:7447"
 LISTEN_TLS = "tls/0.0.0.0:7447"
-PATIENCE_US = 20_000
-"""Microseconds a stream message waits for room in a full queue before it is dropped, as in every session of the bus."""
 _HEADROOM_BYTES = 65_536
 """What a message is larger than its payload and attachment."""
 
@@ -106,7 +104,7 @@ def zenoh_values(plan: RouterPlan) -> dict[str, Any]:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": settings.tls is None,  # it tells members where others listen
         "transport/shared_memory/enabled": False,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
+        **FULL_QUEUES,
         "transport/link/rx/max_message_size": limits.message_bytes + _HEADROOM_BYTES,
         "transport/unicast/max_sessions": limits.sessions,
         "transport/unicast/accept_pending": limits.pending,

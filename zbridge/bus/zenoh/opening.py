@@ -11,13 +11,11 @@ from typing import Any
 
 import zenoh
 
-from zbridge.bus.interface import SECURE, BusSettings, Tls
+from zbridge.bus.interface import FULL_QUEUES, SECURE, BusSettings, Tls
 from zbridge.bus.tls.refusal import why_not
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet.topics import SizeBounds
 
-PATIENCE_US = 20_000
-"""Microseconds a stream message waits for room in a full transmission queue before it is dropped."""
 RETRY_FIRST_MS, RETRY_MOST_MS, RETRY_FACTOR = (500, 1500), (2000, 4000), 1.5
 """Milliseconds between attempts to connect to a router that was lost: first, at most, and by what they grow."""
 _INGRESS = ("ingress",)
@@ -45,8 +43,7 @@ def zenoh_config(
         "open/return_conditions/connect_scouted": wait_for_peers,
         # A pool of 28 MB in every process, for payloads larger than a robot has.
         "transport/shared_memory/enabled": False,
-        # Drop streams when the bus stalls, not when one of its threads is a millisecond late.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": PATIENCE_US,
+        **FULL_QUEUES,
     }
     if timestamps:
         values["timestamping/enabled"] = True

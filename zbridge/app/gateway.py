@@ -201,6 +201,7 @@ class Gateway:
                 each,
                 self._runtime.raw_ms,
                 self._runtime.kernel,
+                self._runtime.suspended_s,
             )
             for plan, name, each in zip(plans, names, given, strict=True)
         ]

@@ -124,7 +124,7 @@ class Checker:
                 known.pop(request.get("id", b""), None)
         elif answer.get("ok") and verb in ("acquire", "takeover"):
             grant, last = Grant(gateway, asker, answer, request, self.world.now), self.current.get(gateway)
-            stands = last is not None and last.ended_at is None and last.shown
+            stands = last is not None and last.ended_at is None and last.shown and not last.expires_by(self.world.now)
             again = last is not None and last.asks_again(asker, request)
             if verb == "acquire" and stands and not again and not request.get("priority"):
                 self.violate("held", f"{grant} granted while {last} stands")

@@ -15,7 +15,7 @@ FROZEN = "the gateway was frozen"
 class FreezeWatch:
     """Watches the beats of an event loop. ``frozen`` is called with the seconds that a freeze lasted, once for each.
 
-    suspended_s: seconds for which the machine was suspended since some moment, which the time of the loop does not count.
+    suspended_s: seconds for which the machine was suspended so far, which the time of the loop does not count.
     """
 
     def __init__(

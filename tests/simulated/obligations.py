@@ -173,7 +173,8 @@ class Obligations:
             if self._granted_to.get(asker, -1.0) < grant.at:
                 return  # its grant was lost on the way
             if self._ended_for.get(asker, -1.0) < grant.at and not any(
-                other.asker == asker and other.at > grant.at for other in self.checker.grants.values()
+                other.asker == asker and other.at >= grant.at and other is not grant
+                for other in self.checker.grants.values()
             ):
                 self.checker.violate("silent-loss", f"{asker} was not told that {grant} ended: {grant.why}")
 

@@ -128,7 +128,7 @@ class Checker:
             again = last is not None and last.asks_again(asker, request)
             if verb == "acquire" and stands and not again and not request.get("priority"):
                 self.violate("held", f"{grant} granted while {last} stands")
-            self._grant(grant, request)
+            self._grant(grant, request, again=again)
         elif verb == "release" and gateway in self.current:
             if request.get("lease") == self.current[gateway].lease:
                 self._released(self.current[gateway], answer, asker)
@@ -144,12 +144,12 @@ class Checker:
         if answer.get("ok"):
             self.end(grant.gateway, "released")
 
-    def _grant(self, grant: Grant, request: dict[str, Any]) -> None:
+    def _grant(self, grant: Grant, request: dict[str, Any], *, again: bool) -> None:
         now = self.world.now
         most_s = self.simulation.scenario.get("control", {}).get("deadman_s", 2.0)
         grant.deadman_s = min(request.get("deadman_s") or most_s, most_s)
         grant.base_s = now - request.get("asked at", now)
-        self.end(grant.gateway, "superseded")
+        self.end(grant.gateway, "granted again" if again else "superseded")
         self._neutral_between(self._taken_at.pop(grant.who, None), grant)
         self.grants[grant.lease] = self.current[grant.gateway] = grant
         if any(now - at > SLACK_S for at in self.latches[grant.gateway].values()):

@@ -1,8 +1,8 @@
 """The refusals that ``control`` shows."""
 
 from zbridge.control.refusal_counts import REFUSALS, RefusalCounts
-from zbridge.control.wishes import NAMED
 from zbridge.errors import Code, NotReady
+from zbridge.lease.lease_events import NAMED
 
 
 def test_equal_refusals_are_counted_what_differs_in_anything_is_counted_apart_and_the_newest_is_last() -> None:

@@ -4,9 +4,10 @@ import math
 
 import pytest
 
-from zbridge.control.wishes import LEAST_S, NAMED, capped, name_of
+from zbridge.control.wishes import LEAST_S, capped, name_of
 from zbridge.errors import Malformed
 from zbridge.fleet.messages import Acquire
+from zbridge.lease.lease_events import NAMED
 
 
 @pytest.mark.parametrize(("wish_s", "granted_s"), [(None, 3.0), (LEAST_S, LEAST_S), (1.0, 1.0), (math.inf, 3.0)])

@@ -12,12 +12,12 @@ import msgspec
 from tests.search.bounds import LISTENER
 from tests.search.moves import Bounds
 from tests.search.search import Finding, search
-from zbridge.control import gate, proof
+from zbridge.control import gate
 from zbridge.control.authority import Authority
-from zbridge.control.command_age import CommandAge
 from zbridge.control.events import State
-from zbridge.control.lease_client import LeaseClient
-from zbridge.control.lease_events import LeaseEvent
+from zbridge.control.holders import CommandAge, Holders
+from zbridge.lease.lease_client import LeaseClient
+from zbridge.lease.lease_events import LeaseEvent
 
 Broken = tuple[str, Callable[[], Any]]
 """What is broken, and a patch that breaks it."""
@@ -85,7 +85,7 @@ def _ended_leases_count(self: Any, lease: bytes) -> Any:
     return _KNOWN(self, lease)
 
 
-_END, _KNOWN = Authority._end, proof.Holders._known
+_END, _KNOWN = Authority._end, Holders._known
 
 
 def _stop_folded_at_once(self: gate.CommandGate, payload: bytes) -> Any:
@@ -101,7 +101,7 @@ MUTANTS: tuple[Broken, ...] = (
     ("stale motion is obeyed", _method(CommandAge, "is_stale", _never_stale)),
     ("an expiry is not noticed", _without_table_entry(Authority, "held", "lease expired")),
     ("a stop in motion ends no lease", _without_table_entry(Authority, "moving", "stop")),
-    ("commands of ended leases are obeyed", _method(proof.Holders, "_known", _ended_leases_count)),
+    ("commands of ended leases are obeyed", _method(Holders, "_known", _ended_leases_count)),
     ("a client learns nothing of news", _without_table_entry(LeaseClient, "held", "doubt")),
     ("a client keeps a lease that ended", _with_action(LeaseClient, _tell)),
     ("a returned lease is never asked for again", _without_table_entry(LeaseClient, "wanted", "returned")),

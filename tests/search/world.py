@@ -21,15 +21,15 @@ from zbridge.control.authority import Authority
 from zbridge.control.events import Event, EventKind, Sender
 from zbridge.control.gate import CommandGate, QueryGate
 from zbridge.control.latch import Latches, read_stop
-from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent
-from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.proof import read
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, Lease, Mode, Motor, Refusal, Stop
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent
+from zbridge.lease.lease_holder import LeaseHolder
+from zbridge.lease.proof import read
 
 KEYS = KeySpace("fleet", "r1")
 DRIVE, MODE = KEYS.key(topics.CMD_DRIVE.path), KEYS.key(topics.CMD_MODE.path)

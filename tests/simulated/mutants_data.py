@@ -16,8 +16,7 @@ class Mutant(NamedTuple):
 
 
 AUTHORITY = "zbridge/control/authority.py"
-PROOF = "zbridge/control/proof.py"
-AGE = "zbridge/control/command_age.py"
+HOLDERS = "zbridge/control/holders.py"
 ENFORCER = "zbridge/control/enforcer.py"
 LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
@@ -50,8 +49,8 @@ MUTANTS = (
         "deadman sends no stop",
         None,
         AUTHORITY,
-        "reason, stops=stops))\n        self._still()\n        self._held_back = reason",
-        "reason, stops=False))\n        self._still()\n        self._held_back = reason",
+        "reason, stops=stops))\n        self._moved |= self._moving",
+        "reason, stops=False))\n        self._moved |= self._moving",
     ),
     Mutant(
         "timer not armed",
@@ -95,18 +94,18 @@ MUTANTS = (
         "Input.ACQUIRE: (_deny, None),",
         "Input.ACQUIRE: (_grant, State.HELD),",
     ),
-    Mutant("ended leases still drive", None, PROOF, "    if holder.ended is not None:", "    if False:"),
+    Mutant("ended leases still drive", None, HOLDERS, "    if holder.ended is not None:", "    if False:"),
     Mutant(
         "right proofs are wrong",
         None,
-        PROOF,
+        HOLDERS,
         "        if not holder.verifier.proves(shown, key, payload):",
         "        if holder.verifier.proves(shown, key, payload):",
     ),
     Mutant(
         "proofs are not checked",
         "bus",
-        PROOF,
+        HOLDERS,
         "        if not holder.verifier.proves(shown, key, payload):",
         "        if False:",
     ),
@@ -120,7 +119,7 @@ MUTANTS = (
     Mutant(
         "numbers may be used twice",
         "bus",
-        PROOF,
+        HOLDERS,
         "    if not fresh:\n        raise Malformed",
         "    if False:\n        raise Malformed",
     ),
@@ -139,18 +138,18 @@ MUTANTS = (
         "            pass\n        return Sender",
     ),
     # the age of commands
-    Mutant("nothing is stale", "bus", AGE, "        return late_s > self.limit_s", "        return False"),
+    Mutant("nothing is stale", "bus", HOLDERS, "        return late_s > self.limit_s", "        return False"),
     Mutant(
         "stale after four seconds",
         "bus",
-        AGE,
+        HOLDERS,
         "        return late_s > self.limit_s",
         "        return late_s > 10 * self.limit_s",
     ),
     Mutant(
         "baseline follows every sample",
         "bus",
-        AGE,
+        HOLDERS,
         "            self._baseline_ms = min(apart_ms, risen_ms)",
         "            self._baseline_ms = apart_ms",
     ),

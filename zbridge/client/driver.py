@@ -11,17 +11,15 @@ from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
 from zbridge.bus.tls.membership import Right, lacking
-from zbridge.control.clocks import raw_ms
-from zbridge.control.lease_client import RETRY_S, LeaseClient
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
-from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.lease.lease_client import RETRY_S, LeaseClient
+from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_holder import LeaseHolder, raw_ms
 
 __all__ = ["RETRY_S", "Driver", "default_who", "holding"]
 

@@ -14,7 +14,6 @@ from zbridge.client.driver import Driver, default_who, holding
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
-from zbridge.control.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -41,6 +40,7 @@ from zbridge.fleet.messages import (
     Text,
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
+from zbridge.lease.lease_holder import raw_ms
 
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""

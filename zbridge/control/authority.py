@@ -19,7 +19,7 @@ bus's threads; all else is for the event loop's thread.
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is
 decided by its proof first and its number second: knowing a lease's public id allows nothing. What was given too long
-ago (:mod:`zbridge.control.command_age`) extends no lease and no motion, and allows no motion either.
+ago (:class:`zbridge.control.holders.CommandAge`) extends no lease and no motion, and allows no motion either.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ from typing import ClassVar, TypeAlias
 
 from msgspec import UNSET
 
-from zbridge.control.command_age import MAX_AGE_S, CommandAge
 from zbridge.control.events import Event, EventKind, Input, Sender, State
+from zbridge.control.holders import MAX_AGE_S, CommandAge, Holder, Holders
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of
-from zbridge.control.proof import Holder, Holders, Verifier
 from zbridge.control.refusal_counts import RefusalCounts
 from zbridge.control.wishes import capped, name_of
 from zbridge.errors import Held, Latched, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, FleetLatches, Latch, Lease, Stop
+from zbridge.lease.proof import Verifier
 from zbridge.protocol.kept import Exported
 
 Row: TypeAlias = dict[Input, tuple[Callable[..., Lease | None], State | None]]

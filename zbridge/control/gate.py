@@ -24,11 +24,11 @@ from msgspec import UNSET
 from zbridge.bus import Lane, Look
 from zbridge.control.authority import Authority
 from zbridge.control.latch import read_stop
-from zbridge.control.proof import read
 from zbridge.errors import Code, LeaseLost, Malformed, Refused, TooFast
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.proof import read
 from zbridge.protocol.rate_limit import RateLimit
 
 OF_THE_HOLDER = (Drive, Motor, Mode, Raw)

@@ -12,12 +12,12 @@ from zbridge.bus import Handle, IncomingQuery
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.gate import NameGate, QueryGate
-from zbridge.control.proof import read
 from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals, Unlatch
+from zbridge.lease.proof import read
 from zbridge.protocol.rate_limit import RateLimit
 
 TELLINGS_HZ = 20.0

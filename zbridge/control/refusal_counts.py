@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from zbridge.control.wishes import NAMED
 from zbridge.errors import Code, Refused
 from zbridge.fleet.messages import Refusal
+from zbridge.lease.lease_events import EXPLAINED, NAMED
 
 REFUSALS = 16
 """Different refusals that ``control`` shows; a new one replaces the one that was counted least recently."""
-EXPLAINED = 200
-"""Characters of a reason that are kept."""
 
 
 class RefusalCounts:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from zbridge.errors import Malformed
 from zbridge.fleet.messages import Acquire
+from zbridge.lease.lease_events import NAMED
 
 LEAST_S = 0.01
 """The shortest lease or deadman that can be asked for, seconds."""
-NAMED = 64
-"""Characters of a name that are kept."""
 
 
 def name_of(request: Acquire) -> str:

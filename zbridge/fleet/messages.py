@@ -352,7 +352,7 @@ class Lease(FleetMessage, frozen=True):
 
 
 class Authorization(FleetMessage, frozen=True):
-    """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.control.proof`.
+    """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.lease.proof`.
 
     Attachment of a command; payload of ``renew`` and ``release``. seq: rises with each command (query) of the lease.
     t: the sender's CLOCK_MONOTONIC_RAW when the command was given, ms; absent where the sender does not date it.

@@ -12,12 +12,12 @@ from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.events import Sender
 from zbridge.control.gate import OF_THE_HOLDER, is_stop
-from zbridge.control.proof import Verifier
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, Topic
+from zbridge.lease.proof import Verifier
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 

@@ -17,11 +17,10 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Handle
-from zbridge.control import clocks
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext
+from zbridge.control.context import RobotContext, suspended_s
 from zbridge.control.enforcer import Enforcer, Keep
 from zbridge.control.faults import Faults
 from zbridge.control.latch import Latches, LatchRecord
@@ -30,6 +29,7 @@ from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
@@ -93,8 +93,8 @@ class Device:
         observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
-        raw_ms: Callable[[], float] = clocks.raw_ms,
-        suspended_s: Callable[[], float] = clocks.suspended_s,
+        raw_ms: Callable[[], float] = raw_ms,
+        suspended_s: Callable[[], float] = suspended_s,
         keep_latches: Keep = lambda latches: None,
         chance: Callable[[], float] = random.random,
         take_over: TakeOver = take_over,
@@ -102,7 +102,7 @@ class Device:
         """Begin. share: of the processor, where the process serves other robots too.
 
         shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
-        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.clocks`. keep_latches: writes
+        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.context`. keep_latches: writes
         the latched stops down. chance: 0 to 1. take_over: attaches a connection that another process handed over.
         """
         loop = asyncio.get_running_loop()

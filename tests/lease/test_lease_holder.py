@@ -7,18 +7,18 @@ from collections.abc import Coroutine
 from typing import Any
 
 from tests.clock import jumping
-from tests.control import decide
+from tests.lease import decide
 from tests.proofs import numbered
 from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import LeaseClient
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
-from zbridge.control.lease_holder import LeaseHolder
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Acquire
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import LeaseClient
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_holder import LeaseHolder
 
 KEYS = KeySpace("fleet", "r1")
 TOKEN = "operator.ann.1"

@@ -10,17 +10,17 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from tests.control import decide
+from tests.lease import decide
 from tests.proofs import numbered
 from tests.tables import documented, executed
 from zbridge.bus import Answer
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import ASK_S, LEASE_S, LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.errors import BusError, Code, NotReady
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import ASK_S, LEASE_S, LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
 
 KEYS = KeySpace("fleet", "r1")
 NOW = 100.0

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 from msgspec import structs
 
 from zbridge.bus import Bus, Handle
-from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
+from zbridge.lease.lease_client import LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent
+
+_RAW = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)
+
+
+def raw_ms() -> float:
+    """Return milliseconds of CLOCK_MONOTONIC_RAW, which no time service slews; from any thread."""
+    return time.clock_gettime_ns(_RAW) / 1e6
 
 
 class LeaseHolder:

@@ -10,7 +10,7 @@ RECALLED: as DROPPED, but the program wants the lease again. HELD: the lease is 
 ``release`` awaits its answer. WANTED: as RETURNING, and the program wants the lease again. Commands may be sent in
 HELD, CHECKING and DOUBTED.
 
-Who calls what. The caller (:class:`zbridge.control.lease_holder.LeaseHolder` on a bus) calls :meth:`want` and
+Who calls what. The caller (:class:`zbridge.lease.lease_holder.LeaseHolder` on a bus) calls :meth:`want` and
 :meth:`drop` for the program, :meth:`look` for news from ``control``, :meth:`gateway_lost`, and :meth:`expire` at
 :meth:`deadline`. After each call it must ask :meth:`question` and handle :meth:`events`, and must pass the replies to
 :meth:`answered`.
@@ -28,14 +28,23 @@ from typing import ClassVar, TypeAlias
 import msgspec
 
 from zbridge.bus import Answer
-from zbridge.control.lease_events import Input, LeaseEvent, LeaseEventKind, Reply, State, code_of, passes, read
-from zbridge.control.proof import Signer
-from zbridge.control.refusal_news import RefusalNews
 from zbridge.errors import BusError, Code, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_events import (
+    Input,
+    LeaseEvent,
+    LeaseEventKind,
+    RefusalNews,
+    Reply,
+    State,
+    code_of,
+    passes,
+    read,
+)
+from zbridge.lease.proof import Signer
 
 ASK_S = 1.0
 """The longest time that one question waits for its answer, seconds."""

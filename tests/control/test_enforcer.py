@@ -12,11 +12,9 @@ from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
 from zbridge.control.events import Sender
-from zbridge.control.faults import Faults
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast

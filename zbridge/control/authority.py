@@ -34,8 +34,7 @@ from msgspec import UNSET
 from zbridge.control.events import Event, EventKind, Input, Sender, State
 from zbridge.control.holders import MAX_AGE_S, CommandAge, Holder, Holders
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of
-from zbridge.control.refusal_counts import RefusalCounts
-from zbridge.control.wishes import capped, name_of
+from zbridge.control.requests import RefusalCounts, capped, name_of
 from zbridge.errors import Held, Latched, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, FleetLatches, Latch, Lease, Stop
 from zbridge.lease.proof import Verifier

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace

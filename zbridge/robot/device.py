@@ -19,10 +19,8 @@ import msgspec
 from zbridge.bus import Bus, Handle
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext, suspended_s
+from zbridge.control.context import Conditions, Faults, RobotContext, suspended_s
 from zbridge.control.enforcer import Enforcer, Keep
-from zbridge.control.faults import Faults
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits

@@ -120,7 +120,7 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_i
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
     assert rig.metrics.count("control", what="stopped").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]
-    assert rig.enforcer.gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
+    assert rig.enforcer.admission("fleet/r1/@cmd/stop", None, 0, bytes) is None
 
 
 @pytest.mark.parametrize(

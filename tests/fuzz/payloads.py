@@ -12,7 +12,7 @@ from tests.fleet.test_payload import PAYLOADS
 from tests.fuzz.target import Target, comparable, require_same
 from zbridge.app.handover import messages as handover
 from zbridge.app.supervisor import messages as supervisor
-from zbridge.control.gate import is_stop
+from zbridge.control.admission import is_stop
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of, read_stop
 from zbridge.errors import LinkError, Malformed, PayloadError, ProtocolError, Unsupported
 from zbridge.fleet import messages, payload, topics

@@ -12,7 +12,7 @@ import msgspec
 from tests.search.bounds import LISTENER
 from tests.search.moves import Bounds
 from tests.search.search import Finding, search
-from zbridge.control import gate
+from zbridge.control.admission import SAME_STOP_S, CommandFilter
 from zbridge.control.authority import Authority
 from zbridge.control.events import State
 from zbridge.control.holders import CommandAge, Holders
@@ -88,11 +88,11 @@ def _ended_leases_count(self: Any, lease: bytes) -> Any:
 _END, _KNOWN = Authority._end, Holders._known
 
 
-def _stop_folded_at_once(self: gate.CommandGate, payload: bytes) -> Any:
-    return None if self._clock() - self._stopped_at < gate.SAME_STOP_S else _STOP(self, payload)
+def _stop_folded_at_once(self: CommandFilter, payload: bytes) -> Any:
+    return None if self._clock() - self._stopped_at < SAME_STOP_S else _STOP(self, payload)
 
 
-_STOP = gate.CommandGate._stop
+_STOP = CommandFilter._stop
 MUTANTS: tuple[Broken, ...] = (
     ("a latched robot is given away", _with_action(Authority, _refuse_latched)),
     ("no deadman", _with_action(Authority, _move)),
@@ -106,7 +106,10 @@ MUTANTS: tuple[Broken, ...] = (
     ("a client keeps a lease that ended", _with_action(LeaseClient, _tell)),
     ("a returned lease is never asked for again", _without_table_entry(LeaseClient, "wanted", "returned")),
     ("a question without an answer is never over", _without_table_entry(LeaseClient, "asking", "denied")),
-    ("a stop is folded though somebody moves the robot", _method(gate.CommandGate, "_stop", _stop_folded_at_once)),
+    (
+        "a stop is folded though somebody moves the robot",
+        _method(CommandFilter, "_stop", _stop_folded_at_once),
+    ),
 )
 
 

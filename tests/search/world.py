@@ -5,9 +5,9 @@ of one name behave alike from then on: times count from now; the ids of leases, 
 refusals and the names of tokens only by their order, for the machines only compare them. What no machine can notice any
 more is left out: ended leases of which nothing is on its way, refusals on which no program acts, the drift of a clock.
 
-Real are the authority with its latches and proofs, the gates of commands and questions, and the lease clients with
-:class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the enforcer, the
-lease server and ``Commands`` do it.
+Real are the authority with its latches and proofs, the admission filters of commands and questions, and the lease
+clients with :class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the
+enforcer, the lease server and ``Commands`` do it.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import msgspec
 
 from zbridge.bus import Answer, Lane
+from zbridge.control.admission import CommandFilter, QueryFilter
 from zbridge.control.authority import Authority
 from zbridge.control.events import Event, EventKind, Sender
-from zbridge.control.gate import CommandGate, QueryGate
 from zbridge.control.latch import Latches, read_stop
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
@@ -190,10 +190,10 @@ class World:
         self.robot = Robot()
         self._ids = 0
         self.authority = Authority(LEASE_S, DEADMAN_S, _random, MAX_AGE_S, Latches())
-        self.gate = CommandGate(self.authority, KEYS, _clock)
-        self.gates = {RENEW: QueryGate(self.authority, _clock), RELEASE: QueryGate(self.authority, _clock)}
-        for each in (self.gate, *self.gates.values()):
-            each.sieve._allowance = _Always()  # type: ignore[assignment]
+        self.admission = CommandFilter(self.authority, KEYS, _clock)
+        self.filters = {RENEW: QueryFilter(self.authority, _clock), RELEASE: QueryFilter(self.authority, _clock)}
+        for each in (self.admission, *self.filters.values()):
+            each.refusals._allowance = _Always()  # type: ignore[assignment]
         self.holders = [self._holder(number, program) for number, program in enumerate(programs)]
         self.decisions: list[tuple[str, Any]] = []
         """What the gateway decided in the last move: for the rules."""
@@ -239,9 +239,9 @@ class World:
             self.attend()
 
     def arrive(self, command: Command) -> None:
-        """Let a command pass its gate, on the bus's thread, into the inbox."""
+        """Let a command pass its admission filter, on the bus's thread, into the inbox."""
         key, payload = PAYLOADS[command.what]
-        lane = self.gate(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
+        lane = self.admission(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
         if lane is not None:
             self.inbox.append((lane, command))
 
@@ -268,17 +268,17 @@ class World:
     def _serve(self, query: Query) -> None:
         self.keep_time()
         question, now_ms = query.question, self.now * 1000
-        gate = self.gates.get(question.key)
+        admission = self.filters.get(question.key)
         try:
-            if gate is None and not self.ready:
+            if admission is None and not self.ready:
                 self._put_off(query)
                 return
-            if gate is None:
+            if admission is None:
                 request = payloads.decode(Acquire, question.payload)
                 take = self.authority.takeover if "/takeover/" in question.key else self.authority.acquire
                 reply = take(request, self.now, now_ms)
                 self.decisions.append(("acquire", (query, reply)))
-            elif gate(question.key, question.payload, len(question.payload), lambda: b"") is None:
+            elif admission(question.key, question.payload, len(question.payload), lambda: b"") is None:
                 return
             elif question.key == RENEW:
                 reply = self.authority.renew(read(question.payload), question.key, self.now, now_ms)
@@ -349,13 +349,13 @@ class World:
         """Let somebody stop the robot, or latch it."""
         stop = Stop(id=LATCH_IDS[latch], latch=True, who="eve", reason="cable") if latch else Stop()
         payload = payloads.encode(stop) if latch else b""
-        if self.gate(STOP, None, len(payload), lambda: payload) is None:
+        if self.admission(STOP, None, len(payload), lambda: payload) is None:
             self.decisions.append(("folded", None))
             return
         self.decisions.append(("stop", latch))
         self.authority.take_stop(read_stop(payload), fleet=latch == "fleet")
         self.settle()
-        self.gate.stopped()
+        self.admission.stopped()
 
     def unlatch(self, latch: str) -> None:
         try:
@@ -417,15 +417,14 @@ class World:
         new.hand = self.hand[:]
         new.robot = _bare(self.robot)
         new.authority = _authority(self.authority, self)
-        new.gate = _bare(self.gate)
-        new.gate._authority = new.authority
-        new.gate._prover = _bare(self.gate._prover)
-        new.gate._prover._authority = new.authority
-        new.gates = {}
-        for key, gate in self.gates.items():
-            new.gates[key] = other = _bare(gate)
-            other._prover = _bare(gate._prover)
-            other._prover._authority = new.authority
+        new.admission = _bare(self.admission)
+        new.admission._authority = new.authority
+        new.admission._prover = _bare(self.admission._prover)
+        new.admission._prover._authority = new.authority
+        new.filters = {}
+        for key, admission in self.filters.items():
+            new.filters[key] = other = _bare(admission)
+            other._authority = new.authority
         new.holders = [_holder_copy(holder) for holder in self.holders]
         return new
 
@@ -455,7 +454,7 @@ class World:
 
 
 class _Always:
-    """Lets everything through that a gate refuses: the rates of the gates are in no world, and would couple them."""
+    """Lets everything through that a filter refuses: rates of filters are in no world, and would couple them."""
 
     def take(self, now: float) -> bool:
         return True

@@ -110,10 +110,10 @@ MUTANTS = (
         "        if False:",
     ),
     Mutant(
-        "the gate checks no proof",
+        "the admission filter checks no proof",
         "bus",
-        "zbridge/control/gate.py",
-        "        if not verifier.proves(said, key, payload):",
+        "zbridge/control/admission.py",
+        "        if not verifier.proves(authorization, key, payload):",
         "        if False:",
     ),
     Mutant(

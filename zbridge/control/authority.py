@@ -13,8 +13,8 @@ Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
 :meth:`require_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
 :meth:`hold_back`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each down,
-and sends the robot its stop at once for one that ``stops``. The gate reads :attr:`verifier` and :attr:`moving` from the
-bus's threads; all else is for the event loop's thread.
+and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
+:attr:`moving` from the bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is

@@ -17,11 +17,11 @@ import math
 from collections.abc import Callable, Iterable
 
 from zbridge.bus import Sample
+from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
 from zbridge.control.events import Event, EventKind, Sender
-from zbridge.control.gate import CommandGate, Sieve
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -59,7 +59,7 @@ class Enforcer:
         self._keep = keep
         self._keeping = 0
         """Writings of latched stops that have not ended."""
-        self.gate = CommandGate(authority, context.keys, context.clock)
+        self.admission = CommandFilter(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
         self._context = context
         self._clock = context.clock
@@ -71,7 +71,7 @@ class Enforcer:
         """Called after :meth:`settle`: whether the robot is driven, or (``at_once``) how it is stopped, may be new."""
         self._stops_anew = False
         """Whether a command has just changed how the robot is stopped."""
-        self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
+        self._refusal_limits: dict[str, RefusalLimit] = {"commands": self.admission.refusals}
         self._fleet_stop = KeySpace(context.keys.realm, "*").key(topics.CMD_STOP.path)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -150,10 +150,10 @@ class Enforcer:
         self.settle()
 
     def stop_commanded(self, sample: Sample) -> None:
-        """Obey a stop from the bus, which anybody may send; the gate folds those that follow at once."""
+        """Obey a stop from the bus, which anybody may send; the admission filter folds those that follow at once."""
         self.authority.take_stop(read_stop(sample.payload), fleet=sample.key == self._fleet_stop)
         self.settle()
-        self.gate.stopped()
+        self.admission.stopped()
 
     def adopt(self, answers: Iterable[FleetLatches]) -> None:
         """Take over the fleet's latched stops that other gateways know."""
@@ -212,13 +212,13 @@ class Enforcer:
         if self._clock() >= self._timer_at:
             self._on_time()
 
-    def watch_sieve(self, command: str, sieve: Sieve) -> None:
-        """Show with every :meth:`beat` what a gate refused by itself."""
-        self._sieves[command] = sieve
+    def watch_refusals(self, command: str, limit: RefusalLimit) -> None:
+        """Show with every :meth:`beat` what an admission filter dropped."""
+        self._refusal_limits[command] = limit
 
     def beat(self) -> None:
         """Publish ``control``, and write down what was folded. To be called once a second."""
-        self._count_kept_back()
+        self._count_dropped()
         self._keep_latches()
         self.report()
         self._audit.flush()
@@ -292,13 +292,13 @@ class Enforcer:
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
 
-    def _count_kept_back(self) -> None:
-        """Show what the gates refused by themselves since the last time: an entry for each code, with its count."""
-        for command, sieve in self._sieves.items():
-            for refusal, count in sieve.kept_back():
+    def _count_dropped(self) -> None:
+        """Show what the admission filters dropped since the last time: an entry for each code, with its count."""
+        for command, limit in self._refusal_limits.items():
+            for refusal, count in limit.dropped():
                 self.authority.refuse(command, refusal, count=count)
                 self._refused.value += count - 1  # settling counts one
-        self._same_stops.value = self.gate.same_stops
+        self._same_stops.value = self.admission.same_stops
         self.settle()
 
     def _arm(self, deadline: float) -> None:

@@ -1,6 +1,6 @@
 """Answers queries about the lease of one robot: acquire, takeover, renew, release, unlatch, what listeners refused.
 
-Every kind of query has a gate on the bus's threads; the authority decides, the enforcer carries out.
+Every kind of query has an admission filter on the bus's threads; the authority decides, the enforcer carries out.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from collections.abc import Callable
 from functools import partial
 
 from zbridge.bus import Handle, IncomingQuery
+from zbridge.control.admission import NameFilter, QueryFilter
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.gate import NameGate, QueryGate
 from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
@@ -45,17 +45,17 @@ class LeaseServer:
         self._enforcer = enforcer
         self._authority = authority
         self._clock = clock
-        self._gates: dict[str, QueryGate | NameGate] = {
-            "acquire": NameGate(clock),
-            "takeover": NameGate(clock),
-            "renew": QueryGate(authority, clock),
-            "release": QueryGate(authority, clock),
-            "unlatch": NameGate(clock),
-            "unlatch_fleet": NameGate(clock),
-            "refused": NameGate(clock),
+        self._filters: dict[str, QueryFilter | NameFilter] = {
+            "acquire": NameFilter(clock),
+            "takeover": NameFilter(clock),
+            "renew": QueryFilter(authority, clock),
+            "release": QueryFilter(authority, clock),
+            "unlatch": NameFilter(clock),
+            "unlatch_fleet": NameFilter(clock),
+            "refused": NameFilter(clock),
         }
-        for command, gate in self._gates.items():
-            enforcer.watch_sieve(command, gate.sieve)
+        for command, admission in self._filters.items():
+            enforcer.watch_refusals(command, admission.refusals)
         self._closing: str | None = None
         self._waits: str | None = None
         """Why no lease is granted yet."""
@@ -107,7 +107,7 @@ class LeaseServer:
             self._enforcer.settle()
 
         key = self._context.keys.key(f"@rpc/control/{name}")
-        return self._context.bus.answer(key, answer, lane=self._gates[command])
+        return self._context.bus.answer(key, answer, lane=self._filters[command])
 
     def _on_alive(self, key: str, alive: bool) -> None:
         if not alive:

@@ -8,10 +8,10 @@ from __future__ import annotations
 import msgspec
 
 from zbridge.bus import Sample
+from zbridge.control.admission import OF_THE_HOLDER, is_stop
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
 from zbridge.control.events import Sender
-from zbridge.control.gate import OF_THE_HOLDER, is_stop
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics

@@ -10,12 +10,12 @@ import pytest
 from tests.clock import jumping
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
-from zbridge.client.health import Health, Level, health, judge, same_addresses
+from zbridge.client.health import Health, HealthLevel, health, judge, same_addresses
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import LinkStatus, Status
 
-OK, WARNING, CRITICAL = Level
+OK, WARNING, CRITICAL = HealthLevel
 SILENT = "its gateway has said nothing for 3 s"
 
 

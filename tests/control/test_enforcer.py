@@ -14,7 +14,7 @@ from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
-from zbridge.control.events import Sender
+from zbridge.control.events import CommandSender
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
@@ -55,7 +55,7 @@ class Rig:
     def drive(self) -> Drive | Motor:
         """Drive at full speed; return what the robot was told."""
         permitted = self.enforcer.permit(FORWARD, self.now)
-        self.enforcer.moved(PATH, permitted, self.now, Sender("a", self.now), moving=permitted.moving)
+        self.enforcer.moved(PATH, permitted, self.now, CommandSender("a", self.now), moving=permitted.moving)
         self.enforcer.settle()
         return permitted
 
@@ -91,7 +91,7 @@ async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_mo
     rig = Rig()
     rig.enforcer.hold_back("the robot's link took nothing", stops=True)
     with pytest.raises(NeutralFirst):
-        rig.enforcer.moved(PATH, FORWARD, rig.now, Sender("a", rig.now), moving=True)
+        rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
     assert not rig.authority.moving
 
 

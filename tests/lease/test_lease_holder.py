@@ -82,7 +82,7 @@ async def test_a_lease_that_control_shows_and_nobody_knows_of_loses_its_token() 
     scene = Scene()
     scene.holder.announce()
     scene.authority.acquire(Acquire(who="ann"), scene.loop.time())
-    scene.holder.look(scene.authority.report(scene.loop.time()))
+    scene.holder.read_control(scene.authority.report(scene.loop.time()))
     assert await scene.tokens() == []
     scene.authority.stop("its token is lost")
     scene.holder.want()

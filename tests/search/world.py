@@ -19,7 +19,7 @@ import msgspec
 from zbridge.bus import Answer, Lane
 from zbridge.control.admission import CommandFilter, QueryFilter
 from zbridge.control.authority import Authority
-from zbridge.control.events import Event, EventKind, Sender
+from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
 from zbridge.control.latch import Latches, read_stop
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
@@ -180,7 +180,7 @@ class World:
         """Whether the gateway grants leases; else it says *ask later*."""
         self.overtaken = overtaken
         """Whether other input may come between the admission of a command and its record."""
-        self.hand: list[tuple[Command, Sender]] = []
+        self.hand: list[tuple[Command, CommandSender]] = []
         """The command that was admitted and is not yet recorded."""
         self.net: list[Message] = []
         self.inbox: list[tuple[Lane, Command]] = []
@@ -255,7 +255,7 @@ class World:
         """Deliver the news of ``control`` to a program."""
         control, self.news[number] = self.news[number], None
         if control is not None:
-            self.holders[number].look(control)
+            self.holders[number].read_control(control)
 
     # The gateway, as the enforcer, the lease server and Commands
 
@@ -321,18 +321,18 @@ class World:
         self._tell(command, sender)
         self.settle()
 
-    def _carry_out(self, command: Command, sender: Sender) -> None:
+    def _carry_out(self, command: Command, sender: CommandSender) -> None:
         self._require(command, sender)
         self.decisions.append(("told", (command, sender)))
         self._tell(command, sender)
 
-    def _require(self, command: Command, sender: Sender) -> None:
+    def _require(self, command: Command, sender: CommandSender) -> None:
         if command.what in MOVES:
             if sender.stale:
                 raise Stale("given too long ago")
             self.authority.require_motion()
 
-    def _tell(self, command: Command, sender: Sender) -> None:
+    def _tell(self, command: Command, sender: CommandSender) -> None:
         what = command.what
         if what in ("motion", "neutral", "motor", "motor neutral"):
             part, moving = PAYLOADS[what][0], what in MOVES
@@ -382,7 +382,7 @@ class World:
         if changed:
             self.beat()
 
-    def _carry_out_event(self, event: Event) -> None:
+    def _carry_out_event(self, event: AuthorityEvent) -> None:
         if event.stops:
             self.robot.rest()
         if event.what is not EventKind.REFUSED:

@@ -30,7 +30,7 @@ PRESENCE = "zbridge/robot/presence.py"
 MUTANTS = (
     # the deadman
     Mutant("deadman never fires", None, AUTHORITY, "        elif now >= self._stop_at:", "        elif False:"),
-    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = given_at + self._deadman_s\n\n", "pass\n\n"),
+    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = cause.at + self._deadman_s\n\n", "pass\n\n"),
     Mutant(
         "repeated motion extends by three deadmen",
         None,
@@ -49,8 +49,8 @@ MUTANTS = (
         "deadman sends no stop",
         None,
         AUTHORITY,
-        "reason, stops=stops))\n        self._moved |= self._moving",
-        "reason, stops=False))\n        self._moved |= self._moving",
+        "cause.reason, stops=cause.stops))\n        self._moved |= self._moving",
+        "cause.reason, stops=False))\n        self._moved |= self._moving",
     ),
     Mutant(
         "timer not armed",
@@ -70,16 +70,38 @@ MUTANTS = (
         "hold-back ends with motion",
         None,
         AUTHORITY,
-        "        self._still()\n        self._held_back = reason\n",
+        "        self._still()\n        self._held_back = cause.reason\n",
         "        self._still()\n        self._held_back = None\n",
     ),
     # the lease: expiry, token, proof
     Mutant(
-        "lease never expires", "bus", AUTHORITY, 'self._handle(Input.EXPIRED, "lease expired", EventKind.ENDED)', "pass"
+        "lease never expires",
+        "bus",
+        AUTHORITY,
+        'self._handle(Input.EXPIRED, Cause(reason="lease expired"))',
+        "pass",
     ),
-    Mutant("expiry leaves the robot moving", "bus", AUTHORITY, "        Input.EXPIRED: (_end, State.STOPPED),\n", ""),
-    Mutant("loss of the holder ignored", "bus", AUTHORITY, "        Input.HOLDER_LOST: (_end, State.STOPPED),\n", ""),
-    Mutant("loss of the bus ignored", "bus", AUTHORITY, "        Input.BUS_LOST: (_end, State.STOPPED),\n", ""),
+    Mutant(
+        "expiry leaves the robot moving",
+        "bus",
+        AUTHORITY,
+        "        Input.EXPIRED: (_end, State.STOPPED),\n",
+        "",
+    ),
+    Mutant(
+        "loss of the holder ignored",
+        "bus",
+        AUTHORITY,
+        "        Input.HOLDER_LOST: (_end, State.STOPPED),\n",
+        "",
+    ),
+    Mutant(
+        "loss of the bus ignored",
+        "bus",
+        AUTHORITY,
+        "        Input.BUS_LOST: (_end, State.STOPPED),\n",
+        "",
+    ),
     Mutant(
         "stop does not end the lease",
         "mixed",
@@ -127,7 +149,7 @@ MUTANTS = (
         "release does not stop the robot",
         None,
         AUTHORITY,
-        "stops = kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
+        "stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
         "stops = kind in (EventKind.STOPPED, EventKind.LATCHED)",
     ),
     Mutant(
@@ -268,8 +290,9 @@ MUTANTS = (
         "a yielded gateway never returns",
         "situations",
         OWNERSHIP,
-        "            Input.BEST: (_show, State.OWNING),\n            Input.OUTBID: (_withdraw, State.LOOKING),",
-        "            Input.OUTBID: (_withdraw, State.LOOKING),",
+        "            OwnershipInput.BEST: (_show, OwnershipState.OWNING),\n"
+        "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
+        "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
     ),
     Mutant("robot not stopped by who yields", "situations", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
     Mutant(
@@ -306,8 +329,8 @@ MUTANTS = (
         "any unlatch frees the robot",
         "latch",
         AUTHORITY,
-        "        if not self.latches:\n            self._handle(Input.UNLATCH)",
-        "        self._handle(Input.UNLATCH)",
+        "        if not self.latches:\n            self._handle(Input.UNLATCH, Cause())",
+        "        self._handle(Input.UNLATCH, Cause())",
     ),
     Mutant(
         "latched robots forget at their start",
@@ -321,7 +344,7 @@ MUTANTS = (
         "mode 3 is not written down",
         "situations",
         ENFORCER,
-        "        self.authority.latches.autonomous = True\n        return self._keep",
+        "        self.authority.latches.autonomous = True\n        return self._save",
         "        return self._keep",
     ),
     Mutant(

@@ -201,13 +201,13 @@ class Driver:
                 raise BusRefused(f"{self.robot}: {lacks}") from None
             raise
 
-    def look(self, sample: Sample) -> None:
+    def read_control(self, sample: Sample) -> None:
         """Take news from ``control``: the holder of the lease, and refusals of this program's commands."""
         try:
             control = payloads.decode(Control, sample.payload)
         except PayloadError:
             return
-        for refusal in self._holder.look(control):
+        for refusal in self._holder.read_control(control):
             text = f"{self.robot}: {refusal.command}: {refusal.reason}"
             self._refusal = refused(refusal.code, text)
 
@@ -276,7 +276,7 @@ async def holding(
     driver = Driver(bus, keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
     try:
         await driver.acquire()
-        with contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), driver.look)):
+        with contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), driver.read_control)):
             yield driver
     finally:
         await asyncio.shield(driver.release())

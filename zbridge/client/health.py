@@ -25,7 +25,7 @@ _PEER = 80
 """Characters of an address that a reason shows."""
 
 
-class Level(IntEnum):
+class HealthLevel(IntEnum):
     """The exit code that monitoring expects."""
 
     OK = 0
@@ -36,7 +36,7 @@ class Level(IntEnum):
 class Health(msgspec.Struct, frozen=True):
     """How one robot is. reason: what is wrong, or was noticed."""
 
-    level: Level
+    level: HealthLevel
     state: str | None = None
     reason: str | None = None
     host: str | None = None
@@ -45,12 +45,12 @@ class Health(msgspec.Struct, frozen=True):
 def judge(status: Status | None, *, heard: bool) -> Health:
     """Judge a robot by its last status, None if there is none. heard: its gateway published a status just now."""
     if status is None:
-        return Health(Level.CRITICAL, reason="no gateway serves it")
-    level, reason = _LEVELS.get(status.state, Level.CRITICAL), status.reason
+        return Health(HealthLevel.CRITICAL, reason="no gateway serves it")
+    level, reason = _LEVELS.get(status.state, HealthLevel.CRITICAL), status.reason
     if not heard:
-        level, reason = Level.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
-    elif level is Level.OK and reason:
-        level = Level.WARNING
+        level, reason = HealthLevel.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
+    elif level is HealthLevel.OK and reason:
+        level = HealthLevel.WARNING
     return Health(level, status.state, reason, status.host)
 
 
@@ -106,14 +106,14 @@ async def health(fleet: Fleet, robot: str | None = None) -> dict[str, Health]:
     for name, text in same_addresses(statuses).items():
         if (each := judged.get(name)) is not None:
             reason = "; ".join(filter(None, (each.reason, text)))
-            judged[name] = msgspec.structs.replace(each, level=max(each.level, Level.WARNING), reason=reason)
+            judged[name] = msgspec.structs.replace(each, level=max(each.level, HealthLevel.WARNING), reason=reason)
     return judged
 
 
-_LEVELS: dict[str, Level] = {
-    "established": Level.OK,
-    "handshaking": Level.WARNING,
-    "connecting": Level.WARNING,
-    "closing": Level.WARNING,
-    "offline": Level.CRITICAL,
+_LEVELS: dict[str, HealthLevel] = {
+    "established": HealthLevel.OK,
+    "handshaking": HealthLevel.WARNING,
+    "connecting": HealthLevel.WARNING,
+    "closing": HealthLevel.WARNING,
+    "offline": HealthLevel.CRITICAL,
 }

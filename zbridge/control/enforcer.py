@@ -21,7 +21,7 @@ from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import Event, EventKind, Sender
+from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -31,7 +31,7 @@ from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Moto
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
-Keep = Callable[[Latches], "asyncio.Future[None] | None"]
+Save = Callable[[Latches], "asyncio.Future[None] | None"]
 
 SUSPENDED_S = 0.1
 """A machine that was suspended for longer stops its robots, and ends their leases."""
@@ -42,7 +42,7 @@ _CONTROL_S = 0.05
 class Enforcer:
     """Carries out the decisions of one robot's authority.
 
-    limits: None where drives are not limited. keep: writes the latched stops down, so that they survive this process;
+    limits: None where drives are not limited. save: writes the latched stops down, so that they survive this process;
     returns what ends when that is done, None where it is.
     """
 
@@ -53,11 +53,11 @@ class Enforcer:
         standstill: Standstill,
         audit: Audit,
         limits: MotionLimits | None = None,
-        keep: Keep = lambda latches: None,
+        save: Save = lambda latches: None,
     ) -> None:
         self.authority = authority
-        self._keep = keep
-        self._keeping = 0
+        self._save = save
+        self._saving = 0
         """Writings of latched stops that have not ended."""
         self.admission = CommandFilter(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
@@ -88,14 +88,14 @@ class Enforcer:
 
     # A command of the holder's
 
-    def admit(self, sample: Sample, now: float) -> Sender:
+    def admit(self, sample: Sample, now: float) -> CommandSender:
         """Return who of the holders sent a command, and renew the lease; raise Refused for other senders."""
         sender = self.authority.admit(sample.attachment, sample.key, sample.payload, now, self._context.raw_ms())
         if self.authority.eventful:
             self.settle()
         return sender
 
-    def require_fresh(self, sender: Sender) -> None:
+    def require_fresh(self, sender: CommandSender) -> None:
         """Raise Refused for a command that is too old to set the robot in motion."""
         if sender.stale:
             self._stale.value += 1
@@ -114,7 +114,7 @@ class Enforcer:
         self._slowed.value += limited is not command and limited != command
         return limited
 
-    def moved(self, path: str, command: Drive | Motor, now: float, sender: Sender, *, moving: bool) -> None:
+    def moved(self, path: str, command: Drive | Motor, now: float, sender: CommandSender, *, moving: bool) -> None:
         """Record that the robot was sent motion, or neutral.
 
         Raises Refused where the link had just begun to take again: then a stop went instead of the motion.
@@ -167,7 +167,7 @@ class Enforcer:
         self.settle()
         if self.authority.latches.autonomous and not known:
             self._remind()
-            self._keep_latches()
+            self._save_latches()
             if not self.authority.driven:
                 self._send_stop()
 
@@ -179,7 +179,7 @@ class Enforcer:
     def write_autonomous(self) -> asyncio.Future[None] | None:
         """Write down that the robot is told to move by itself; return what ends when that is done, None where it is."""
         self.authority.latches.autonomous = True
-        return self._keep(self.authority.latches)
+        return self._save(self.authority.latches)
 
     def hold_back(self, reason: str, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
@@ -219,7 +219,7 @@ class Enforcer:
     def beat(self) -> None:
         """Publish ``control``, and write down what was folded. To be called once a second."""
         self._count_dropped()
-        self._keep_latches()
+        self._save_latches()
         self.report()
         self._audit.flush()
 
@@ -247,32 +247,32 @@ class Enforcer:
         if changed:
             self.report()
 
-    def _carry_out(self, event: Event) -> None:
+    def _carry_out(self, event: AuthorityEvent) -> None:
         if event.what is EventKind.REFUSED:
             self._refused.value += 1
         else:
             if event.what is not EventKind.ACQUIRED and self._limits is not None:
-                self._limits.at_rest()
+                self._limits.stopped()
             self._context.metrics.count("control", what=event.what.value).value += 1
         if event.stops:
             self._send_stop()
         if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-            self._keep_latches()
+            self._save_latches()
         self._audit.write(event)
 
-    def _keep_latches(self) -> None:
+    def _save_latches(self) -> None:
         """Write the latched stops down; ``control`` confirms a new one when that has ended."""
-        writing = self._keep(self.authority.latches)
+        writing = self._save(self.authority.latches)
         if writing is not None:
-            self._keeping += 1
-            writing.add_done_callback(self._on_kept)
-        elif not self._keeping:
-            self.authority.latches_kept()
+            self._saving += 1
+            writing.add_done_callback(self._on_saved)
+        elif not self._saving:
+            self.authority.latches_saved()
 
-    def _on_kept(self, _: object) -> None:
-        self._keeping -= 1
-        if not self._keeping:
-            self.authority.latches_kept()
+    def _on_saved(self, _: object) -> None:
+        self._saving -= 1
+        if not self._saving:
+            self.authority.latches_saved()
             self.report()
 
     def _remind(self) -> None:

@@ -79,14 +79,14 @@ class Standstill:
 
     def _send(self, now: float, until: float) -> None:
         try:
-            self._tell(now, until)
+            self._write(now, until)
         except Refused as refusal:
             self._conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
             raise
         self._conditions.set(_CONDITION, None)
         self._pump()
 
-    def _tell(self, now: float, until: float) -> None:
+    def _write(self, now: float, until: float) -> None:
         try:
             self._robot.stop(now, until)
         except Refused:

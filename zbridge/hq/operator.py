@@ -153,7 +153,7 @@ class Operator:
     def look(self, control: Control) -> None:
         """Take news from ``control``: whether the lease is still held, and what was refused."""
         now = self._clock()
-        for refusal in self._lease.look(control):
+        for refusal in self._lease.read_control(control):
             lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
             if refusal.command != "acquire" and (refusal.who is not None or lately):
                 if refusal.code == Code.NEUTRAL_FIRST:

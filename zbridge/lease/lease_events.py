@@ -25,7 +25,7 @@ _PASSING: tuple[str, ...] = (*NotReady.codes, *TooFast.codes)
 """Codes that do not decide whose the lease is."""
 
 
-class State(StrEnum):
+class LeaseState(StrEnum):
     """What a program has, and what it waits for."""
 
     FREE = "free"
@@ -40,8 +40,8 @@ class State(StrEnum):
     WANTED = "wanted"
 
 
-class Input(StrEnum):
-    """What the program wants, what was replied, and what is heard."""
+class LeaseInput(StrEnum):
+    """What the program wants, what was replied, and other news."""
 
     WANT = "want"
     DROP = "drop"
@@ -66,7 +66,7 @@ class LeaseEventKind(StrEnum):
 
 
 class LeaseEvent(msgspec.Struct, frozen=True):
-    """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if told.
+    """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if known.
 
     unanswered: whether no gateway said so. expires_in_s: how long the holder's lease lasts at least. expired: whether a
     lost lease was not renewed in time.
@@ -81,7 +81,7 @@ class LeaseEvent(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, kind: LeaseEventKind, reply: Reply, *, expired: bool = False) -> LeaseEvent:
-        """Tell what was replied instead of a lease."""
+        """Make the event of a reply that is no lease."""
         if reply is None:
             return cls(kind, BusError(NO_ANSWER), unanswered=True, expired=expired)
         if isinstance(reply, Lease):

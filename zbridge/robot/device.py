@@ -20,7 +20,7 @@ from zbridge.bus import Bus, Handle
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import Conditions, Faults, RobotContext, suspended_s
-from zbridge.control.enforcer import Enforcer, Keep
+from zbridge.control.enforcer import Enforcer, Save
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
@@ -93,7 +93,7 @@ class Device:
         clock_ns: Callable[[], int] = time.time_ns,
         raw_ms: Callable[[], float] = raw_ms,
         suspended_s: Callable[[], float] = suspended_s,
-        keep_latches: Keep = lambda latches: None,
+        keep_latches: Save = lambda latches: None,
         chance: Callable[[], float] = random.random,
         take_over: TakeOver = take_over,
     ) -> None:

@@ -33,7 +33,7 @@ SILENT = "its gateway has said nothing for 3 s"
     ],
 )
 def test_a_status_is_judged(status: Status | None, heard: bool, expected: Health) -> None:
-    assert judge(status, heard=heard) == expected
+    assert judge(status, fresh=heard) == expected
 
 
 def at(peer: str, *, shared: bool = False) -> Status:

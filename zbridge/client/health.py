@@ -1,7 +1,7 @@
 """How robots are, as monitoring asks: ok, warning or critical, with the reason.
 
 A status that is answered by the bus's last value may be old: a gateway publishes its own once a second, and one that
-was heard while somebody listened shows that the gateway's event loop turns.
+arrived while somebody subscribed shows that the gateway's event loop turns.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ class Health(msgspec.Struct, frozen=True):
     host: str | None = None
 
 
-def judge(status: Status | None, *, heard: bool) -> Health:
-    """Judge a robot by its last status, None if there is none. heard: its gateway published a status just now."""
+def judge(status: Status | None, *, fresh: bool) -> Health:
+    """Judge a robot by its last status, None if there is none. fresh: its gateway published a status just now."""
     if status is None:
         return Health(HealthLevel.CRITICAL, reason="no gateway serves it")
     level, reason = _LEVELS.get(status.state, HealthLevel.CRITICAL), status.reason
-    if not heard:
+    if not fresh:
         level, reason = HealthLevel.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
     elif level is HealthLevel.OK and reason:
         level = HealthLevel.WARNING
@@ -80,29 +80,29 @@ def _is_of_the_network(link: LinkStatus) -> bool:
 
 async def health(fleet: Fleet, robot: str | None = None) -> dict[str, Health]:
     """Judge one robot, or all that have a gateway or a status, by name. Takes 1 s, up to LISTEN_S if one is silent."""
-    heard: dict[str, Status] = {}
+    received: dict[str, Status] = {}
     came = asyncio.Event()
 
-    async def hear() -> None:
+    async def receive() -> None:
         async for name, status in fleet.statuses(robot):
-            heard[name] = status
+            received[name] = status
             came.set()
 
-    hearing = asyncio.ensure_future(hear())
+    receiving = asyncio.ensure_future(receive())
     try:
         known = await fleet.robots()
         wanted = {robot} if robot is not None else set(known)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LISTEN_S):
-                while not wanted or not wanted <= set(heard):
+                while not wanted or not wanted <= set(received):
                     came.clear()
                     await came.wait()
     finally:
-        hearing.cancel()
-        await asyncio.gather(hearing, return_exceptions=True)
-    names = wanted if robot is not None else wanted | set(heard)
-    statuses = {name: status for name, status in {**known, **heard}.items() if status is not None}
-    judged = {name: judge(statuses.get(name), heard=name in heard) for name in sorted(names)}
+        receiving.cancel()
+        await asyncio.gather(receiving, return_exceptions=True)
+    names = wanted if robot is not None else wanted | set(received)
+    statuses = {name: status for name, status in {**known, **received}.items() if status is not None}
+    judged = {name: judge(statuses.get(name), fresh=name in received) for name in sorted(names)}
     for name, text in same_addresses(statuses).items():
         if (each := judged.get(name)) is not None:
             reason = "; ".join(filter(None, (each.reason, text)))

@@ -101,12 +101,12 @@ class Authority:
 
     @property
     def moving(self) -> bool:
-        """Whether the robot was told to move, or to move by itself, and has not been stopped since."""
+        """Whether the robot was sent motion, or ordered to move by itself, and has not been stopped since."""
         return bool(self._moving) or self.on_its_own
 
     @property
     def driven(self) -> bool:
-        """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be at rest."""
+        """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be stopped."""
         return bool(self._moving) or self._autonomous
 
     # Questions about the lease. received_ms: the gateway's raw clock, for the age of what is dated.
@@ -176,15 +176,15 @@ class Authority:
             return
         if not moving and not stale and self._moved:
             self._moved = set() if whole else self._moved - {part}
-            if self._moved:  # a part that moved has not rested yet: its stick may still be pushed
+            if self._moved:  # a part that moved had no neutral yet: its stick may still be deflected
                 return
         (parts.add if moving else parts.discard)(part)
-        if stale and parts:  # motion of another part goes on, and with it its deadman
+        if stale and parts:  # motion of another part continues, and with it its deadman
             return
         self._handle(_MOTION if parts else _STALE_NEUTRAL if stale else _NEUTRAL, Cause(given_at))
 
     def mode_chosen(self, *, autonomous: bool) -> None:
-        """Record that the robot was told the holder's choice of its mode."""
+        """Record that the robot was sent the holder's choice of its mode."""
         self._autonomous = autonomous
         self.on_its_own = self.on_its_own or autonomous
 
@@ -249,7 +249,7 @@ class Authority:
         return frozenset(self._stops)
 
     def hold_back(self, reason: str, *, stops: bool = True) -> None:
-        """Stop the robot, or (``stops=False``) record that it is at rest; motion needs a neutral first."""
+        """Stop the robot, or (``stops=False``) record that it is stopped; motion needs a neutral first."""
         self._handle(Input.HOLD_BACK, Cause(reason=reason, stops=stops))
 
     def vanished(self, alive: str) -> None:

@@ -1,8 +1,8 @@
 """Enforces what the authority of one robot decides: stops in time, ``control``, the audit log, counters.
 
 Theory of operation. The authority decides and has no clock; the enforcer carries out. A command of the holder's passes
-three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is told,
-:meth:`Enforcer.moved` after it was told. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
+three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is sent it,
+:meth:`Enforcer.moved` afterwards. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
 sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms the timer
 for the authority's deadline. The timer is re-armed only for an earlier deadline: commands mostly postpone it, and an
 early wake-up is harmless. Before anything is written to the robot, or read from it or from the bus,
@@ -106,7 +106,7 @@ class Enforcer:
         self.authority.require_motion()
 
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
-        """Return what the robot may be told of a motion, within the limits; raise Refused where it may not move."""
+        """Return the motion that the robot may be sent, within the limits; raise Refused where it may not move."""
         self.authority.require_motion()
         if self._limits is None or not isinstance(command, Drive):
             return command
@@ -117,7 +117,7 @@ class Enforcer:
     def moved(self, path: str, command: Drive | Motor, now: float, sender: CommandSender, *, moving: bool) -> None:
         """Record that the robot was sent motion, or neutral.
 
-        Raises Refused where the link had just begun to take again: then a stop went instead of the motion.
+        Raises Refused where the link has just recovered from a stall: then a stop went instead of the motion.
         """
         authority = self.authority
         if moving:
@@ -131,7 +131,7 @@ class Enforcer:
                 self._standstill.neutral(now)
 
     def commanded(self, command: FleetMessage) -> None:
-        """Note that the robot was told something that may move it: a mode, or a raw message."""
+        """Record that the robot was sent something that may move it: a mode, or a raw message."""
         self._stops_anew = isinstance(command, Mode | Raw)
         if isinstance(command, Mode):
             self.authority.mode_chosen(autonomous=command.mode == "autonomous")
@@ -177,7 +177,7 @@ class Enforcer:
         self._remind()
 
     def write_autonomous(self) -> asyncio.Future[None] | None:
-        """Write down that the robot is told to move by itself; return what ends when that is done, None where it is."""
+        """Store that the robot was ordered to move by itself; return what ends when that is done, None where it is."""
         self.authority.latches.autonomous = True
         return self._save(self.authority.latches)
 
@@ -187,7 +187,7 @@ class Enforcer:
         self.settle()
 
     def bus_lost(self) -> None:
-        """End the lease: its holder cannot be heard any more."""
+        """End the lease: its holder cannot reach the gateway any more."""
         self.authority.bus_lost()
         self.settle()
 

@@ -49,7 +49,7 @@ class RefusalCounts:
         return Refusal(who=who, command=command, code=refused.code, reason=reason, count=total, by=by)
 
     def shown(self) -> tuple[Refusal, ...]:
-        """Return all refusals that are kept, the newest last."""
+        """Return all refusals that are shown, the newest last."""
         return tuple(
             Refusal(who=who, command=command, code=code, reason=reason, count=count, by=by)
             for (who, command, code, reason, by), count in self._counts.items()

@@ -24,7 +24,7 @@ _CONDITION = "stop"
 class Standstill:
     """Sends stops to one robot.
 
-    authority: tells whether somebody drives the robot now, or told it to move by itself.
+    authority: knows whether somebody drives the robot now, or ordered it to move by itself.
     idle_stop_s: seconds between two stops while nobody drives, fewer where the protocol says so; 0: only when motion
     ends, and while a latched stop is in force.
     """

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import getpass
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
@@ -21,7 +21,7 @@ from zbridge.lease.lease_client import RETRY_S, LeaseClient
 from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
 from zbridge.lease.lease_holder import LeaseHolder, raw_ms
 
-__all__ = ["RETRY_S", "Driver", "default_who", "holding"]
+__all__ = ["RETRY_S", "Driver", "default_who"]
 
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
@@ -259,24 +259,3 @@ class Driver:
         self.loss = LeaseLost(text, holder=holder)
         self.loss.expired = event is not None and event.expired
         self.lost.set()
-
-
-@contextlib.asynccontextmanager
-async def holding(
-    bus: Bus,
-    keys: KeySpace,
-    request: Acquire,
-    name: str,
-    *,
-    takeover: bool,
-    wait_s: float,
-    clock_ms: Callable[[], float] = raw_ms,
-) -> AsyncIterator[Driver]:
-    """Hold the lease while the context lasts. name: what it is asked for as; ``request.who`` begins with it."""
-    driver = Driver(bus, keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
-    try:
-        await driver.acquire()
-        with contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), driver.read_control)):
-            yield driver
-    finally:
-        await asyncio.shield(driver.release())

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from zbridge.bus import Bus, Sample
 from zbridge.client import stops
-from zbridge.client.driver import Driver, default_who, holding
+from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
 from zbridge.client.stops import Outcome
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
@@ -218,10 +218,13 @@ class ControlFeed(StateFeed[Control]):
             alive=f"operator.{escape(name)}.{self._bus.zid}.{next(self._attempts)}",
         )
         clock_ms = self._clock_ms
-        async with holding(
-            self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms
-        ) as driver:
-            yield driver
+        driver = Driver(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
+        try:
+            await driver.acquire()
+            with contextlib.closing(self._bus.subscribe(self.key_expr, driver.read_control)):
+                yield driver
+        finally:
+            await asyncio.shield(driver.release())
 
 
 def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str]:
@@ -305,15 +308,15 @@ class Robot:
 
         Raises BusError if no gateway does within 3 s, Refused if the robot cannot be stopped or reached.
         """
-        await stops.stop_robot(
-            self._bus, self._keys, stops.new_stop(self._own, reason, latch=False, secret=self._secret)
-        )
+        await self._stop(reason, latch=False)
 
     async def latch(self, reason: str | None = None) -> None:
         """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
-        await stops.stop_robot(
-            self._bus, self._keys, stops.new_stop(self._own, reason, latch=True, secret=self._secret)
-        )
+        await self._stop(reason, latch=True)
+
+    async def _stop(self, reason: str | None, *, latch: bool) -> None:
+        stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
+        await stops.stop_robot(self._bus, self._keys, stop)
 
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.

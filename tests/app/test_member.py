@@ -18,7 +18,7 @@ from zbridge.app.member import check_member
 from zbridge.app.roles import Member
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.tls.certificate import Certificate
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.errors import BusError, BusRefused, ConfigError
 
 NOW = datetime.now(UTC)

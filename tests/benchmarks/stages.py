@@ -18,8 +18,8 @@ from gateways.tcpudp.translate import TcpUdpRobot
 from tests.benchmarks.drives import number
 from zbridge.bus.inbox import Inbox
 from zbridge.cli import main as zbridge
+from zbridge.control.admission import CommandFilter
 from zbridge.control.authority import Authority
-from zbridge.control.gate import CommandGate
 from zbridge.robot.commands import Commands
 from zbridge.transport.tcp import TcpLink
 
@@ -75,7 +75,7 @@ def main() -> None:
     out = Path(sys.argv[1])
     sys.argv = ["zbridge", *sys.argv[2:]]
     stages = Stages()
-    stages.wrap(CommandGate, "__call__", before="callback", after="proven")
+    stages.wrap(CommandFilter, "__call__", before="callback", after="proven")
     stages.wrap(Inbox, "_drain", before="woken")
     stages.wrap(Commands, "take", before="taken", after="done")
     stages.wrap(Authority, "admit", after="admitted")

@@ -17,7 +17,7 @@ from zbridge.camera.demand import LINGER_S
 from zbridge.camera.mjpeg import MjpegReader, Part
 from zbridge.camera.settings import Source
 from zbridge.camera.upstream import Took
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.errors import LinkError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Image

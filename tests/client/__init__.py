@@ -12,10 +12,8 @@ from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.faults import Faults
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NotReady, Refused, Unsupported

@@ -10,12 +10,12 @@ import pytest
 from tests.clock import jumping
 from zbridge.bus.fake import FakeBus
 from zbridge.client import Fleet
-from zbridge.client.health import Health, Level, health, judge, same_addresses
+from zbridge.client.health import Health, HealthLevel, health, judge, same_addresses
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import LinkStatus, Status
 
-OK, WARNING, CRITICAL = Level
+OK, WARNING, CRITICAL = HealthLevel
 SILENT = "its gateway has said nothing for 3 s"
 
 
@@ -33,7 +33,7 @@ SILENT = "its gateway has said nothing for 3 s"
     ],
 )
 def test_a_status_is_judged(status: Status | None, heard: bool, expected: Health) -> None:
-    assert judge(status, heard=heard) == expected
+    assert judge(status, fresh=heard) == expected
 
 
 def at(peer: str, *, shared: bool = False) -> Status:

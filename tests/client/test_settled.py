@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from zbridge.client.settled import LOOK_AFTER_S, SETTLE_S, settled
+from zbridge.client.fleet import QUERY_AFTER_S, SETTLE_S, settled
 
 pytestmark = pytest.mark.jumping
 
@@ -23,7 +23,7 @@ class Looks:
 async def test_what_is_the_same_twice_is_believed_after_the_second_look() -> None:
     looks = Looks({"r1"})
     assert await settled(looks, lambda seen: seen) == {"r1"}
-    assert looks.looked_at[1] - looks.looked_at[0] == pytest.approx(LOOK_AFTER_S[0])
+    assert looks.looked_at[1] - looks.looked_at[0] == pytest.approx(QUERY_AFTER_S[0])
     assert len(looks.looked_at) == 2
 
 
@@ -43,4 +43,4 @@ async def test_what_never_settles_ends_with_what_was_seen_last() -> None:
     looks = Looks(*({f"r{number}"} for number in range(100)))
     before = asyncio.get_running_loop().time()
     await settled(looks, lambda seen: seen)
-    assert SETTLE_S - LOOK_AFTER_S[-1] <= asyncio.get_running_loop().time() - before <= SETTLE_S
+    assert SETTLE_S - QUERY_AFTER_S[-1] <= asyncio.get_running_loop().time() - before <= SETTLE_S

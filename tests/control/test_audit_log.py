@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from zbridge.control.audit_log import COUNTS, COUNTS_HZ, KINDS, MOST, WAITING, Audit, AuditFile
-from zbridge.control.events import Event, EventKind
+from zbridge.control.events import AuthorityEvent, EventKind
 from zbridge.errors import ConfigError
 from zbridge.metrics import Metrics
 
@@ -36,7 +36,7 @@ class Log(list[str]):
         self.now_ns = EPOCH_NS
         self.audit = Audit("r1", self.append, lambda: self.now_ns)
 
-    def write(self, events: Iterable[Event]) -> None:
+    def write(self, events: Iterable[AuthorityEvent]) -> None:
         for event in events:
             self.audit.write(event)
 
@@ -51,8 +51,8 @@ def log() -> Log:
     return Log()
 
 
-def refused(who: str | None = "ann", command: str = "drive", reason: str = "offline") -> Event:
-    return Event(EventKind.REFUSED, who, reason, command=command)
+def refused(who: str | None = "ann", command: str = "drive", reason: str = "offline") -> AuthorityEvent:
+    return AuthorityEvent(EventKind.REFUSED, who, reason, command=command)
 
 
 LINES: dict[str, dict[str, Any]] = {
@@ -71,9 +71,9 @@ LINES: dict[str, dict[str, Any]] = {
 """What the line of an event says, by a letter."""
 
 
-def event(letter: str) -> Event:
+def event(letter: str) -> AuthorityEvent:
     fields = dict(LINES[letter])
-    return Event(EventKind(fields.pop("event")), **fields)
+    return AuthorityEvent(EventKind(fields.pop("event")), **fields)
 
 
 COURSES = {
@@ -133,7 +133,7 @@ def test_the_gateways_log_has_the_same_but_for_refusals(log: Log, caplog: pytest
 
 
 events = st.builds(
-    Event,
+    AuthorityEvent,
     st.sampled_from(EventKind),
     st.sampled_from(["ann", "bob", None]),
     st.sampled_from(["offline", "stop"]),
@@ -142,7 +142,7 @@ events = st.builds(
 
 
 @given(st.lists(events | st.none(), max_size=60))
-def test_nothing_is_lost_or_counted_twice(course: list[Event | None]) -> None:
+def test_nothing_is_lost_or_counted_twice(course: list[AuthorityEvent | None]) -> None:
     log = Log()
     for event in course:
         if event is None:
@@ -168,7 +168,7 @@ def names(count: int = PER_S) -> list[str]:
     return [os.urandom(8).hex() for _ in range(count)]
 
 
-def takeovers(names: Iterable[str]) -> list[Event]:
+def takeovers(names: Iterable[str]) -> list[AuthorityEvent]:
     """What is told when one after the other takes the robot from the one before."""
     return [msgspec.structs.replace(each, who=who) for who in names for each in map(event, "ET")]
 
@@ -190,7 +190,7 @@ def test_a_flood_neither_pushes_out_what_was_there_before_nor_hides_what_happens
     for second in range(12):
         if second in (0, 10):
             for what in ANN:
-                audit.write(Event(what, "ann", f"second {second}"))
+                audit.write(AuthorityEvent(what, "ann", f"second {second}"))
         for event in flood():
             audit.write(event)
         audit.flush()

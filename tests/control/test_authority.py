@@ -12,7 +12,7 @@ import pytest
 from tests.proofs import numbered, proof, shown
 from tests.tables import documented, executed
 from zbridge.control.authority import Authority
-from zbridge.control.proof import ENDED
+from zbridge.control.holders import ENDED
 from zbridge.errors import Code, Held, LeaseLost, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, Lease, Refusal
 

@@ -15,7 +15,7 @@ from msgspec import UNSET
 
 from tests.proofs import numbered, proof, shown
 from zbridge.control.authority import Authority
-from zbridge.control.command_age import CommandAge
+from zbridge.control.holders import CommandAge
 from zbridge.errors import Code, Malformed, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Lease
 

@@ -13,11 +13,9 @@ from zbridge.bus import Sample
 from zbridge.bus.fake import FakeBus
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext
+from zbridge.control.context import Conditions, Faults, RobotContext
 from zbridge.control.enforcer import SUSPENDED_S, Enforcer
-from zbridge.control.events import Sender
-from zbridge.control.faults import Faults
+from zbridge.control.events import CommandSender
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
 from zbridge.errors import NeutralFirst, TooFast
@@ -58,7 +56,7 @@ class Rig:
     def drive(self) -> Drive | Motor:
         """Drive at full speed; return what the robot was told."""
         permitted = self.enforcer.permit(FORWARD, self.now)
-        self.enforcer.moved(PATH, permitted, self.now, Sender("a", self.now), moving=permitted.moving)
+        self.enforcer.moved(PATH, permitted, self.now, CommandSender("a", self.now), moving=permitted.moving)
         self.enforcer.settle()
         return permitted
 
@@ -94,7 +92,7 @@ async def test_motion_that_was_stopped_while_it_was_written_is_not_counted_as_mo
     rig = Rig()
     rig.enforcer.hold_back("the robot's link took nothing", stops=True)
     with pytest.raises(NeutralFirst):
-        rig.enforcer.moved(PATH, FORWARD, rig.now, Sender("a", rig.now), moving=True)
+        rig.enforcer.moved(PATH, FORWARD, rig.now, CommandSender("a", rig.now), moving=True)
     assert not rig.authority.moving
 
 
@@ -123,7 +121,7 @@ async def test_a_stop_ends_the_lease_and_is_counted_and_shown_and_the_next_one_i
     assert (rig.machine.stops, rig.authority.state) == (1, "stopped")
     assert rig.metrics.count("control", what="stopped").value == 1
     assert rig.shown[-1].state == "stopped"  # type: ignore[attr-defined]
-    assert rig.enforcer.gate("fleet/r1/@cmd/stop", None, 0, bytes) is None
+    assert rig.enforcer.admission("fleet/r1/@cmd/stop", None, 0, bytes) is None
 
 
 @pytest.mark.parametrize(

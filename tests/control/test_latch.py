@@ -196,7 +196,7 @@ def test_control_shows_the_latches_and_the_last_four_stops() -> None:
     assert shown.state == "latched"
     assert shown.latches == (latch(8, fleet=True),)
     assert shown.stops == tuple(stop_id(number) for number in (4, 5, 6)), "it is not written down yet"
-    authority.latches_kept()
+    authority.latches_saved()
     shown = authority.report(0.0)
     assert shown.stops == tuple(stop_id(number) for number in (4, 5, 6, 8))
     assert len(shown.stops) == STOPS

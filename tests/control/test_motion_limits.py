@@ -79,5 +79,5 @@ def test_a_drive_that_was_refused_or_not_sent_counts_for_no_growth_and_a_stop_en
     assert passed(limits, FORWARD, 0.0625) == Drive(forward=0.0625)
     assert passed(limits, FORWARD, 0.125) is None
     assert passed(limits, FORWARD, 0.1875) == Drive(forward=0.1875)
-    limits.at_rest()
+    limits.stopped()
     assert passed(limits, FORWARD, 0.3125) == Drive(forward=0.125), "a robot that was stopped begins from standing"

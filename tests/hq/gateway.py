@@ -8,13 +8,13 @@ from tests.proofs import numbered
 from zbridge.bus.fake import FakeBus
 from zbridge.bus.interface import IncomingQuery, Sample
 from zbridge.control.authority import Authority
-from zbridge.control.proof import read
 from zbridge.errors import Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.intent import LEASE_S
+from zbridge.lease.proof import read
 
 KEYS = KeySpace("fleet", "r1")
 

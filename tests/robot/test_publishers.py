@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from zbridge.bus.fake import FakeBus
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Reading, Switch
 from zbridge.fleet.topics import KeySpace

@@ -1,4 +1,4 @@
-"""Exhaustive search: every state of a bounded world of the real authority, gates, proofs, latches and lease clients.
+"""Exhaustive search: every state of a bounded world of the real authority, filters, proofs, latches and lease clients.
 
 ``python -m tests.search`` prints what was reached; ``docs/reliability.md`` says what is in a world and what is not.
 """

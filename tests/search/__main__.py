@@ -10,8 +10,8 @@ from tests.search.intent import search_intent
 from tests.search.mutants import MUTANTS, caught_by
 from tests.search.search import Found, search
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import LeaseClient
 from zbridge.hq.intent import Intent
+from zbridge.lease.lease_client import LeaseClient
 
 
 def main() -> int:

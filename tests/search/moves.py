@@ -20,7 +20,7 @@ class Bounds:
     delay: steps of time for which a message is on its way at most. loses, repeats: what the network does. drops:
     whether programs give the lease back, or stop asking. freezes: whether the gateway may be late with what is due.
     beats: whether ``control`` comes unchanged, too. hears: whether programs hear of ``control`` before the network
-    works. overtaken: whether other input may come between the admission of a command and its record, as the gates and
+    works. overtaken: whether other input may come between the admission of a command and its record, as the filters and
     the event loop never let it: what the authority makes of that by itself.
     """
 

@@ -12,12 +12,11 @@ import msgspec
 from tests.search.bounds import LISTENER
 from tests.search.moves import Bounds
 from tests.search.search import Finding, search
-from zbridge.control import gate, proof
+from zbridge.control.admission import SAME_STOP_S, CommandFilter
 from zbridge.control.authority import Authority
-from zbridge.control.command_age import CommandAge
-from zbridge.control.events import State
-from zbridge.control.lease_client import LeaseClient
-from zbridge.control.lease_events import LeaseEvent
+from zbridge.control.events import AuthorityState
+from zbridge.control.holders import CommandAge, Holders
+from zbridge.lease.lease_client import LeaseClient
 
 Broken = tuple[str, Callable[[], Any]]
 """What is broken, and a patch that breaks it."""
@@ -38,13 +37,13 @@ def _without_table_entry(owner: Any, state: str, said: str) -> Callable[[], Any]
     return make
 
 
-def _with_action(owner: Any, broken: Callable[..., Any]) -> Callable[[], Any]:
-    """Replace the action of this name wherever the table has it."""
+def _with_action(owner: Any, broken: Callable[..., Any], state_after: Any = None) -> Callable[[], Any]:
+    """Replace the action of this name wherever the table has it, and if given, the state after it."""
 
     def make() -> Any:
         table = {
             state: {
-                key: (broken if action.__name__ == broken.__name__ else action, after)
+                key: (broken, state_after or after) if action.__name__ == broken.__name__ else (action, after)
                 for key, (action, after) in row.items()
             }
             for state, row in owner.TABLE.items()
@@ -54,23 +53,21 @@ def _with_action(owner: Any, broken: Callable[..., Any]) -> Callable[[], Any]:
     return make
 
 
-def _move(self: Authority, given_at: float) -> None:
+def _move(self: Authority, cause: Any) -> None:
     self._stop_at = math.inf
 
 
-def _end(self: Authority, reason: str, kind: Any, who: str | None = None) -> None:
-    _END(self, reason, kind, who)  # and what it says of stops is left out:
+def _end(self: Authority, cause: Any) -> None:
+    _END(self, cause)  # and what it says of stops is left out:
     self._events = [msgspec.structs.replace(each, stops=False) for each in self._events]
 
 
-def _refuse_latched(self: Authority, *arguments: Any) -> Any:
-    lease = Authority._grant(self, *arguments)
-    self._state = State.HELD
-    return lease
+def _refuse_latched(self: Authority, cause: Any) -> Any:
+    return Authority._grant(self, cause)
 
 
-def _tell(self: LeaseClient, now: float, event: LeaseEvent) -> None:
-    self._events.append(event)
+def _notify(self: LeaseClient, cause: Any) -> None:
+    self._events.append(cause.event)
 
 
 def _never_stale(self: CommandAge, late_s: float) -> bool:
@@ -85,28 +82,31 @@ def _ended_leases_count(self: Any, lease: bytes) -> Any:
     return _KNOWN(self, lease)
 
 
-_END, _KNOWN = Authority._end, proof.Holders._known
+_END, _KNOWN = Authority._end, Holders._known
 
 
-def _stop_folded_at_once(self: gate.CommandGate, payload: bytes) -> Any:
-    return None if self._clock() - self._stopped_at < gate.SAME_STOP_S else _STOP(self, payload)
+def _stop_folded_at_once(self: CommandFilter, payload: bytes) -> Any:
+    return None if self._clock() - self._stopped_at < SAME_STOP_S else _STOP(self, payload)
 
 
-_STOP = gate.CommandGate._stop
+_STOP = CommandFilter._stop
 MUTANTS: tuple[Broken, ...] = (
-    ("a latched robot is given away", _with_action(Authority, _refuse_latched)),
+    ("a latched robot is given away", _with_action(Authority, _refuse_latched, AuthorityState.HELD)),
     ("no deadman", _with_action(Authority, _move)),
     ("neutral is not required", _method(Authority, "require_motion", lambda self: None)),
     ("an ended lease stops nothing", _with_action(Authority, _end)),
     ("stale motion is obeyed", _method(CommandAge, "is_stale", _never_stale)),
     ("an expiry is not noticed", _without_table_entry(Authority, "held", "lease expired")),
     ("a stop in motion ends no lease", _without_table_entry(Authority, "moving", "stop")),
-    ("commands of ended leases are obeyed", _method(proof.Holders, "_known", _ended_leases_count)),
+    ("commands of ended leases are obeyed", _method(Holders, "_known", _ended_leases_count)),
     ("a client learns nothing of news", _without_table_entry(LeaseClient, "held", "doubt")),
-    ("a client keeps a lease that ended", _with_action(LeaseClient, _tell)),
+    ("a client keeps a lease that ended", _with_action(LeaseClient, _notify)),
     ("a returned lease is never asked for again", _without_table_entry(LeaseClient, "wanted", "returned")),
     ("a question without an answer is never over", _without_table_entry(LeaseClient, "asking", "denied")),
-    ("a stop is folded though somebody moves the robot", _method(gate.CommandGate, "_stop", _stop_folded_at_once)),
+    (
+        "a stop is folded though somebody moves the robot",
+        _method(CommandFilter, "_stop", _stop_folded_at_once),
+    ),
 )
 
 

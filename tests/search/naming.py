@@ -51,7 +51,7 @@ class _Namer:
         world = self.world
         return (
             self._authority(),
-            self._gates(),
+            self._filters(),
             tuple(self._program(number) for number in range(len(world.holders))),
             tuple(sorted(map(self._message, world.net))),
             tuple((lane.value, command.program, command.what, self._shown(command),
@@ -97,7 +97,10 @@ class _Namer:
 
     def _provers(self) -> list[tuple[str, Any]]:
         world = self.world
-        return [("commands", world.gate._prover), *(("questions", gate._prover) for gate in world.gates.values())]
+        return [
+            ("commands", world.admission._prover),
+            *(("questions", each) for each in world.filters.values()),
+        ]
 
     def _refusals(self, number: int) -> tuple[Any, ...]:
         """Name what a program is told of its ended leases, and what it knows of that."""
@@ -180,14 +183,14 @@ class _Namer:
             round(holder.age._baseline_ms / 100) if current and holder.age._baseline_ms is not None else -1,
         )  # fmt: skip
 
-    def _gates(self) -> Any:
+    def _filters(self) -> Any:
         current = self.world.authority.verifier
         named = []
         for kind, prover in self._provers():
             lease, number = prover._newest
             mine = current is not None and lease == current.lease
             named.append(self.numbers.rank(lease, kind, number) if mine else -1)
-        fold = self.world.now - self.world.gate._stopped_at < 0.05
+        fold = self.world.now - self.world.admission._stopped_at < 0.05
         return (*named, fold)
 
     def _program(self, number: int) -> Any:

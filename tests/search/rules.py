@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tests.search.world import DEADMAN_S, LEASE_S, MAX_AGE_S, MOVES, World
 from zbridge.control.events import EventKind
-from zbridge.control.proof import read
+from zbridge.lease.proof import read
 
 TOLERANCE_S = 1e-6
 _NONE: frozenset[str] = frozenset()

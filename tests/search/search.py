@@ -12,7 +12,7 @@ from tests.search.moves import Bounds, moves
 from tests.search.rules import Account, Violation, judge
 from tests.search.world import World
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import LeaseClient
+from zbridge.lease.lease_client import LeaseClient
 
 STEPS = 12
 """Steps of time within which a program that wants the lease has it, and one that lost it knows."""

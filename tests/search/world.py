@@ -5,9 +5,9 @@ of one name behave alike from then on: times count from now; the ids of leases, 
 refusals and the names of tokens only by their order, for the machines only compare them. What no machine can notice any
 more is left out: ended leases of which nothing is on its way, refusals on which no program acts, the drift of a clock.
 
-Real are the authority with its latches and proofs, the gates of commands and questions, and the lease clients with
-:class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the enforcer, the
-lease server and ``Commands`` do it.
+Real are the authority with its latches and proofs, the admission filters of commands and questions, and the lease
+clients with :class:`LeaseHolder` around them. :class:`World` plays what asyncio and Zenoh do between them, as the
+enforcer, the lease server and ``Commands`` do it.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import Any, NamedTuple
 import msgspec
 
 from zbridge.bus import Answer, Lane
+from zbridge.control.admission import CommandFilter, QueryFilter
 from zbridge.control.authority import Authority
-from zbridge.control.events import Event, EventKind, Sender
-from zbridge.control.gate import CommandGate, QueryGate
+from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
 from zbridge.control.latch import Latches, read_stop
-from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent
-from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.proof import read
 from zbridge.errors import Code, NotReady, Refused, Stale
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, Lease, Mode, Motor, Refusal, Stop
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent
+from zbridge.lease.lease_holder import LeaseHolder
+from zbridge.lease.proof import read
 
 KEYS = KeySpace("fleet", "r1")
 DRIVE, MODE = KEYS.key(topics.CMD_DRIVE.path), KEYS.key(topics.CMD_MODE.path)
@@ -180,7 +180,7 @@ class World:
         """Whether the gateway grants leases; else it says *ask later*."""
         self.overtaken = overtaken
         """Whether other input may come between the admission of a command and its record."""
-        self.hand: list[tuple[Command, Sender]] = []
+        self.hand: list[tuple[Command, CommandSender]] = []
         """The command that was admitted and is not yet recorded."""
         self.net: list[Message] = []
         self.inbox: list[tuple[Lane, Command]] = []
@@ -190,10 +190,10 @@ class World:
         self.robot = Robot()
         self._ids = 0
         self.authority = Authority(LEASE_S, DEADMAN_S, _random, MAX_AGE_S, Latches())
-        self.gate = CommandGate(self.authority, KEYS, _clock)
-        self.gates = {RENEW: QueryGate(self.authority, _clock), RELEASE: QueryGate(self.authority, _clock)}
-        for each in (self.gate, *self.gates.values()):
-            each.sieve._allowance = _Always()  # type: ignore[assignment]
+        self.admission = CommandFilter(self.authority, KEYS, _clock)
+        self.filters = {RENEW: QueryFilter(self.authority, _clock), RELEASE: QueryFilter(self.authority, _clock)}
+        for each in (self.admission, *self.filters.values()):
+            each.refusals._allowance = _Always()  # type: ignore[assignment]
         self.holders = [self._holder(number, program) for number, program in enumerate(programs)]
         self.decisions: list[tuple[str, Any]] = []
         """What the gateway decided in the last move: for the rules."""
@@ -239,9 +239,9 @@ class World:
             self.attend()
 
     def arrive(self, command: Command) -> None:
-        """Let a command pass its gate, on the bus's thread, into the inbox."""
+        """Let a command pass its admission filter, on the bus's thread, into the inbox."""
         key, payload = PAYLOADS[command.what]
-        lane = self.gate(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
+        lane = self.admission(key, command.attachment, len(payload) + len(command.attachment), lambda: payload)
         if lane is not None:
             self.inbox.append((lane, command))
 
@@ -255,7 +255,7 @@ class World:
         """Deliver the news of ``control`` to a program."""
         control, self.news[number] = self.news[number], None
         if control is not None:
-            self.holders[number].look(control)
+            self.holders[number].read_control(control)
 
     # The gateway, as the enforcer, the lease server and Commands
 
@@ -268,17 +268,17 @@ class World:
     def _serve(self, query: Query) -> None:
         self.keep_time()
         question, now_ms = query.question, self.now * 1000
-        gate = self.gates.get(question.key)
+        admission = self.filters.get(question.key)
         try:
-            if gate is None and not self.ready:
+            if admission is None and not self.ready:
                 self._put_off(query)
                 return
-            if gate is None:
+            if admission is None:
                 request = payloads.decode(Acquire, question.payload)
                 take = self.authority.takeover if "/takeover/" in question.key else self.authority.acquire
                 reply = take(request, self.now, now_ms)
                 self.decisions.append(("acquire", (query, reply)))
-            elif gate(question.key, question.payload, len(question.payload), lambda: b"") is None:
+            elif admission(question.key, question.payload, len(question.payload), lambda: b"") is None:
                 return
             elif question.key == RENEW:
                 reply = self.authority.renew(read(question.payload), question.key, self.now, now_ms)
@@ -321,18 +321,18 @@ class World:
         self._tell(command, sender)
         self.settle()
 
-    def _carry_out(self, command: Command, sender: Sender) -> None:
+    def _carry_out(self, command: Command, sender: CommandSender) -> None:
         self._require(command, sender)
         self.decisions.append(("told", (command, sender)))
         self._tell(command, sender)
 
-    def _require(self, command: Command, sender: Sender) -> None:
+    def _require(self, command: Command, sender: CommandSender) -> None:
         if command.what in MOVES:
             if sender.stale:
                 raise Stale("given too long ago")
             self.authority.require_motion()
 
-    def _tell(self, command: Command, sender: Sender) -> None:
+    def _tell(self, command: Command, sender: CommandSender) -> None:
         what = command.what
         if what in ("motion", "neutral", "motor", "motor neutral"):
             part, moving = PAYLOADS[what][0], what in MOVES
@@ -349,13 +349,13 @@ class World:
         """Let somebody stop the robot, or latch it."""
         stop = Stop(id=LATCH_IDS[latch], latch=True, who="eve", reason="cable") if latch else Stop()
         payload = payloads.encode(stop) if latch else b""
-        if self.gate(STOP, None, len(payload), lambda: payload) is None:
+        if self.admission(STOP, None, len(payload), lambda: payload) is None:
             self.decisions.append(("folded", None))
             return
         self.decisions.append(("stop", latch))
         self.authority.take_stop(read_stop(payload), fleet=latch == "fleet")
         self.settle()
-        self.gate.stopped()
+        self.admission.stopped()
 
     def unlatch(self, latch: str) -> None:
         try:
@@ -382,7 +382,7 @@ class World:
         if changed:
             self.beat()
 
-    def _carry_out_event(self, event: Event) -> None:
+    def _carry_out_event(self, event: AuthorityEvent) -> None:
         if event.stops:
             self.robot.rest()
         if event.what is not EventKind.REFUSED:
@@ -417,15 +417,14 @@ class World:
         new.hand = self.hand[:]
         new.robot = _bare(self.robot)
         new.authority = _authority(self.authority, self)
-        new.gate = _bare(self.gate)
-        new.gate._authority = new.authority
-        new.gate._prover = _bare(self.gate._prover)
-        new.gate._prover._authority = new.authority
-        new.gates = {}
-        for key, gate in self.gates.items():
-            new.gates[key] = other = _bare(gate)
-            other._prover = _bare(gate._prover)
-            other._prover._authority = new.authority
+        new.admission = _bare(self.admission)
+        new.admission._authority = new.authority
+        new.admission._prover = _bare(self.admission._prover)
+        new.admission._prover._authority = new.authority
+        new.filters = {}
+        for key, admission in self.filters.items():
+            new.filters[key] = other = _bare(admission)
+            other._authority = new.authority
         new.holders = [_holder_copy(holder) for holder in self.holders]
         return new
 
@@ -455,7 +454,7 @@ class World:
 
 
 class _Always:
-    """Lets everything through that a gate refuses: the rates of the gates are in no world, and would couple them."""
+    """Lets everything through that a filter refuses: rates of filters are in no world, and would couple them."""
 
     def take(self, now: float) -> bool:
         return True

@@ -16,8 +16,7 @@ class Mutant(NamedTuple):
 
 
 AUTHORITY = "zbridge/control/authority.py"
-PROOF = "zbridge/control/proof.py"
-AGE = "zbridge/control/command_age.py"
+HOLDERS = "zbridge/control/holders.py"
 ENFORCER = "zbridge/control/enforcer.py"
 LATCH = "zbridge/control/latch.py"
 INTENT = "zbridge/hq/intent.py"
@@ -31,7 +30,7 @@ PRESENCE = "zbridge/robot/presence.py"
 MUTANTS = (
     # the deadman
     Mutant("deadman never fires", None, AUTHORITY, "        elif now >= self._stop_at:", "        elif False:"),
-    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = given_at + self._deadman_s\n\n", "pass\n\n"),
+    Mutant("deadman not started", None, AUTHORITY, "self._stop_at = cause.at + self._deadman_s\n\n", "pass\n\n"),
     Mutant(
         "repeated motion extends by three deadmen",
         None,
@@ -50,8 +49,8 @@ MUTANTS = (
         "deadman sends no stop",
         None,
         AUTHORITY,
-        "reason, stops=stops))\n        self._still()\n        self._held_back = reason",
-        "reason, stops=False))\n        self._still()\n        self._held_back = reason",
+        "cause.reason, stops=cause.stops))\n        self._moved |= self._moving",
+        "cause.reason, stops=False))\n        self._moved |= self._moving",
     ),
     Mutant(
         "timer not armed",
@@ -71,16 +70,38 @@ MUTANTS = (
         "hold-back ends with motion",
         None,
         AUTHORITY,
-        "        self._still()\n        self._held_back = reason\n",
+        "        self._still()\n        self._held_back = cause.reason\n",
         "        self._still()\n        self._held_back = None\n",
     ),
     # the lease: expiry, token, proof
     Mutant(
-        "lease never expires", "bus", AUTHORITY, 'self._handle(Input.EXPIRED, "lease expired", EventKind.ENDED)', "pass"
+        "lease never expires",
+        "bus",
+        AUTHORITY,
+        'self._handle(Input.EXPIRED, Cause(reason="lease expired"))',
+        "pass",
     ),
-    Mutant("expiry leaves the robot moving", "bus", AUTHORITY, "        Input.EXPIRED: (_end, State.STOPPED),\n", ""),
-    Mutant("loss of the holder ignored", "bus", AUTHORITY, "        Input.HOLDER_LOST: (_end, State.STOPPED),\n", ""),
-    Mutant("loss of the bus ignored", "bus", AUTHORITY, "        Input.BUS_LOST: (_end, State.STOPPED),\n", ""),
+    Mutant(
+        "expiry leaves the robot moving",
+        "bus",
+        AUTHORITY,
+        "        Input.EXPIRED: (_end, State.STOPPED),\n",
+        "",
+    ),
+    Mutant(
+        "loss of the holder ignored",
+        "bus",
+        AUTHORITY,
+        "        Input.HOLDER_LOST: (_end, State.STOPPED),\n",
+        "",
+    ),
+    Mutant(
+        "loss of the bus ignored",
+        "bus",
+        AUTHORITY,
+        "        Input.BUS_LOST: (_end, State.STOPPED),\n",
+        "",
+    ),
     Mutant(
         "stop does not end the lease",
         "mixed",
@@ -95,32 +116,32 @@ MUTANTS = (
         "Input.ACQUIRE: (_deny, None),",
         "Input.ACQUIRE: (_grant, State.HELD),",
     ),
-    Mutant("ended leases still drive", None, PROOF, "    if holder.ended is not None:", "    if False:"),
+    Mutant("ended leases still drive", None, HOLDERS, "    if holder.ended is not None:", "    if False:"),
     Mutant(
         "right proofs are wrong",
         None,
-        PROOF,
+        HOLDERS,
         "        if not holder.verifier.proves(shown, key, payload):",
         "        if holder.verifier.proves(shown, key, payload):",
     ),
     Mutant(
         "proofs are not checked",
         "bus",
-        PROOF,
+        HOLDERS,
         "        if not holder.verifier.proves(shown, key, payload):",
         "        if False:",
     ),
     Mutant(
-        "the gate checks no proof",
+        "the admission filter checks no proof",
         "bus",
-        "zbridge/control/gate.py",
-        "        if not verifier.proves(said, key, payload):",
+        "zbridge/control/admission.py",
+        "        if not verifier.proves(authorization, key, payload):",
         "        if False:",
     ),
     Mutant(
         "numbers may be used twice",
         "bus",
-        PROOF,
+        HOLDERS,
         "    if not fresh:\n        raise Malformed",
         "    if False:\n        raise Malformed",
     ),
@@ -128,7 +149,7 @@ MUTANTS = (
         "release does not stop the robot",
         None,
         AUTHORITY,
-        "stops = kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
+        "stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving",
         "stops = kind in (EventKind.STOPPED, EventKind.LATCHED)",
     ),
     Mutant(
@@ -139,18 +160,18 @@ MUTANTS = (
         "            pass\n        return Sender",
     ),
     # the age of commands
-    Mutant("nothing is stale", "bus", AGE, "        return late_s > self.limit_s", "        return False"),
+    Mutant("nothing is stale", "bus", HOLDERS, "        return late_s > self.limit_s", "        return False"),
     Mutant(
         "stale after four seconds",
         "bus",
-        AGE,
+        HOLDERS,
         "        return late_s > self.limit_s",
         "        return late_s > 10 * self.limit_s",
     ),
     Mutant(
         "baseline follows every sample",
         "bus",
-        AGE,
+        HOLDERS,
         "            self._baseline_ms = min(apart_ms, risen_ms)",
         "            self._baseline_ms = apart_ms",
     ),
@@ -269,8 +290,9 @@ MUTANTS = (
         "a yielded gateway never returns",
         "situations",
         OWNERSHIP,
-        "            Input.BEST: (_show, State.OWNING),\n            Input.OUTBID: (_withdraw, State.LOOKING),",
-        "            Input.OUTBID: (_withdraw, State.LOOKING),",
+        "            OwnershipInput.BEST: (_show, OwnershipState.OWNING),\n"
+        "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
+        "            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),",
     ),
     Mutant("robot not stopped by who yields", "situations", DEVICE, "        self._enforcer.stop(_ASIDE)\n", ""),
     Mutant(
@@ -307,8 +329,8 @@ MUTANTS = (
         "any unlatch frees the robot",
         "latch",
         AUTHORITY,
-        "        if not self.latches:\n            self._handle(Input.UNLATCH)",
-        "        self._handle(Input.UNLATCH)",
+        "        if not self.latches:\n            self._handle(Input.UNLATCH, Cause())",
+        "        self._handle(Input.UNLATCH, Cause())",
     ),
     Mutant(
         "latched robots forget at their start",
@@ -322,7 +344,7 @@ MUTANTS = (
         "mode 3 is not written down",
         "situations",
         ENFORCER,
-        "        self.authority.latches.autonomous = True\n        return self._keep",
+        "        self.authority.latches.autonomous = True\n        return self._save",
         "        return self._keep",
     ),
     Mutant(

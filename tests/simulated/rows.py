@@ -13,9 +13,9 @@ from typing import Any
 from unittest.mock import patch
 
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import LeaseClient
 from zbridge.errors import Code
 from zbridge.hq.intent import Intent
+from zbridge.lease.lease_client import LeaseClient
 from zbridge.robot.ownership import Ownership
 
 MACHINES: tuple[Any, ...] = (Authority, LeaseClient, Intent, Ownership)

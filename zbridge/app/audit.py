@@ -10,7 +10,7 @@ from pathlib import Path
 
 from zbridge.app.config import Plan
 from zbridge.control.audit_log import Audit, AuditFile
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.metrics import Metrics
 
 

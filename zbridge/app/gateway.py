@@ -31,7 +31,7 @@ from zbridge.bus.tls.files import own_certificate
 from zbridge.bus.tls.member import own_name
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.control.latch_store import LatchStore
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.errors import ZbridgeError, describe

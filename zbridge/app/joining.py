@@ -21,7 +21,7 @@ from zbridge.app.config import Plan
 from zbridge.bus import OPEN_S, Bus, open_bus
 from zbridge.bus.tls.certificate import Certificate
 from zbridge.bus.tls.files import ends_soon, utc_now
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.errors import BusError, BusRefused
 from zbridge.fleet import topics
 from zbridge.metrics import Metrics

@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterable, Mapping
 from typing import Any
 
 from zbridge.bus import Handle
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.control.latch import LatchRecord
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import Held

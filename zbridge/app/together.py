@@ -26,7 +26,7 @@ from zbridge.app.prometheus import serve_metrics
 from zbridge.app.tasks import together
 from zbridge.bus import Bus
 from zbridge.bus.tls.files import own_certificate
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.errors import ZbridgeError
 from zbridge.metrics import Metrics
 from zbridge.protocol.session_table import Backoff

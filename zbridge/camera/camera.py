@@ -21,7 +21,7 @@ from zbridge.camera.pace import Pace
 from zbridge.camera.relay import Relay
 from zbridge.camera.settings import CameraPlan
 from zbridge.camera.upstream import fetch
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.errors import LinkError, ProtocolError, describe
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics

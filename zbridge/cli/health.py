@@ -7,7 +7,7 @@ import msgspec
 from zbridge.bus import BusSettings
 from zbridge.cli.bus import console
 from zbridge.client import connect
-from zbridge.client.health import Health, Level, health
+from zbridge.client.health import Health, HealthLevel, health
 from zbridge.errors import BusError
 from zbridge.fleet.printable import as_json as to_json
 from zbridge.fleet.printable import shown
@@ -26,7 +26,7 @@ async def report_health(settings: BusSettings, realm: str, robot: str | None, *,
         trouble = None if robots else f"no robots on {realm}/"
     except BusError as error:
         robots, trouble = {}, f"no bus: {error}"
-    level = Level.CRITICAL if trouble is not None else max(each.level for each in robots.values())
+    level = HealthLevel.CRITICAL if trouble is not None else max(each.level for each in robots.values())
     line = f"{level.name} - {trouble or _summary(robots)}"
     if as_json:
         fields = {

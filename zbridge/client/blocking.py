@@ -181,9 +181,9 @@ class ControlFeed(StateFeed[Control]):
         self._control = source
 
     @contextlib.contextmanager
-    def __call__(self, who: str | None = None, **wishes: Any) -> Iterator[Driver]:
+    def __call__(self, who: str | None = None, **request: Any) -> Iterator[Driver]:
         """Hold the lease while the context lasts; see :meth:`zbridge.client.fleet.ControlFeed.__call__`."""
-        with _entered(self._loop, self._control(who, **wishes)) as holder:
+        with _entered(self._loop, self._control(who, **request)) as holder:
             yield Driver(self._loop, holder)
 
 

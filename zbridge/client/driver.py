@@ -6,24 +6,22 @@ import asyncio
 import contextlib
 import getpass
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher, Sample
 from zbridge.bus.tls.membership import Right, lacking
-from zbridge.control.clocks import raw_ms
-from zbridge.control.lease_client import RETRY_S, LeaseClient
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
-from zbridge.control.lease_holder import LeaseHolder
-from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, BusRefused, Held, LeaseLost, NeutralFirst, PayloadError, Refused
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.lease.lease_client import RETRY_S, LeaseClient
+from zbridge.lease.lease_events import NAMED, LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_holder import LeaseHolder, raw_ms
 
-__all__ = ["RETRY_S", "Driver", "default_who", "holding"]
+__all__ = ["RETRY_S", "Driver", "default_who"]
 
 REPEAT_S = 0.05
 """Seconds between the commands of :meth:`Driver.during`."""
@@ -203,13 +201,13 @@ class Driver:
                 raise BusRefused(f"{self.robot}: {lacks}") from None
             raise
 
-    def look(self, sample: Sample) -> None:
+    def read_control(self, sample: Sample) -> None:
         """Take news from ``control``: the holder of the lease, and refusals of this program's commands."""
         try:
             control = payloads.decode(Control, sample.payload)
         except PayloadError:
             return
-        for refusal in self._holder.look(control):
+        for refusal in self._holder.read_control(control):
             text = f"{self.robot}: {refusal.command}: {refusal.reason}"
             self._refusal = refused(refusal.code, text)
 
@@ -261,24 +259,3 @@ class Driver:
         self.loss = LeaseLost(text, holder=holder)
         self.loss.expired = event is not None and event.expired
         self.lost.set()
-
-
-@contextlib.asynccontextmanager
-async def holding(
-    bus: Bus,
-    keys: KeySpace,
-    request: Acquire,
-    name: str,
-    *,
-    takeover: bool,
-    wait_s: float,
-    clock_ms: Callable[[], float] = raw_ms,
-) -> AsyncIterator[Driver]:
-    """Hold the lease while the context lasts. name: what it is asked for as; ``request.who`` begins with it."""
-    driver = Driver(bus, keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
-    try:
-        await driver.acquire()
-        with contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), driver.look)):
-            yield driver
-    finally:
-        await asyncio.shield(driver.release())

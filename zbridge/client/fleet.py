@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import itertools
 import os
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
-from typing import Any
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from typing import Any, TypeVar
 
 from zbridge.bus import Bus, Sample
 from zbridge.client import stops
-from zbridge.client.driver import Driver, default_who, holding
+from zbridge.client.driver import Driver, default_who
 from zbridge.client.feed import WAITING, WAITING_IMAGES, Feed, StateFeed, reader
-from zbridge.client.settled import settled
 from zbridge.client.stops import Outcome
-from zbridge.control.clocks import raw_ms
 from zbridge.errors import BusError, Malformed, PayloadError, Refused, refusal
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
@@ -41,12 +40,19 @@ from zbridge.fleet.messages import (
     Text,
 )
 from zbridge.fleet.topics import KeySpace, Topic, escape, is_name, split_key, unescape
+from zbridge.lease.lease_holder import raw_ms
 
+T = TypeVar("T")
+
+QUERY_AFTER_S = (0.02, 0.1, 0.3, 0.5)
+"""Seconds between two queries for robots; the last one repeats."""
+SETTLE_S = 3.0
+"""Longest time for which robots are queried until two results are the same, seconds."""
 ANSWER_S = 5.0
 """Longest wait for a robot's answer, seconds."""
 _attempts = itertools.count(1)
-"""Numbers the wishes for a lease. Each has a liveliness token of its own: a gateway may hear of the end of the token of
-an earlier wish only after it has granted a later one, which must not end for it."""
+"""Numbers the requests for a lease. Each has a liveliness token of its own: a gateway may learn of the end of the token
+of an earlier request only after it has granted a later one, which must not end for it."""
 
 
 class Fleet:
@@ -87,10 +93,10 @@ class Fleet:
         While gateways come to the bus, or come back, an answer may be partial: it is asked for again until two in a row
         name the same robots with a status each, within three seconds.
         """
-        robots = await settled(self._look, lambda seen: seen.keys() if all(seen.values()) else None)
+        robots = await settled(self._query_robots, lambda seen: seen.keys() if all(seen.values()) else None)
         return dict(sorted(robots.items()))
 
-    async def _look(self) -> dict[str, Status | None]:
+    async def _query_robots(self) -> dict[str, Status | None]:
         robots: dict[str, Status | None] = dict.fromkeys(await self._gateways())
         for answer in await self._bus.ask(f"{self.realm}/*/{topics.STATUS.path}"):
             split = split_key(answer.key)
@@ -118,10 +124,10 @@ class Fleet:
 
         Asked for again as :meth:`robots` is.
         """
-        tables = await settled(self._look_at_sessions, lambda seen: seen.keys())
+        tables = await settled(self._query_sessions, lambda seen: seen.keys())
         return dict(sorted(tables.items()))
 
-    async def _look_at_sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
+    async def _query_sessions(self) -> dict[tuple[str, str], tuple[SessionEntry, ...]]:
         tables: dict[tuple[str, str], tuple[SessionEntry, ...]] = {}
         for answer in await self._bus.ask(f"{self.realm}/*/@rpc/sessions/*"):
             split = split_key(answer.key)
@@ -212,10 +218,13 @@ class ControlFeed(StateFeed[Control]):
             alive=f"operator.{escape(name)}.{self._bus.zid}.{next(self._attempts)}",
         )
         clock_ms = self._clock_ms
-        async with holding(
-            self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms
-        ) as driver:
-            yield driver
+        driver = Driver(self._bus, self._keys, request, name, takeover=takeover, wait_s=wait_s, clock_ms=clock_ms)
+        try:
+            await driver.acquire()
+            with contextlib.closing(self._bus.subscribe(self.key_expr, driver.read_control)):
+                yield driver
+        finally:
+            await asyncio.shield(driver.release())
 
 
 def _names(who: str | None, name: str | None, own: str | None) -> tuple[str, str]:
@@ -299,15 +308,15 @@ class Robot:
 
         Raises BusError if no gateway does within 3 s, Refused if the robot cannot be stopped or reached.
         """
-        await stops.stop_robot(
-            self._bus, self._keys, stops.new_stop(self._own, reason, latch=False, secret=self._secret)
-        )
+        await self._stop(reason, latch=False)
 
     async def latch(self, reason: str | None = None) -> None:
         """Stop the robot as :meth:`stop` does, and let nobody drive it before :meth:`unlatch`."""
-        await stops.stop_robot(
-            self._bus, self._keys, stops.new_stop(self._own, reason, latch=True, secret=self._secret)
-        )
+        await self._stop(reason, latch=True)
+
+    async def _stop(self, reason: str | None, *, latch: bool) -> None:
+        stop = stops.new_stop(self._own, reason, latch=latch, secret=self._secret)
+        await stops.stop_robot(self._bus, self._keys, stop)
 
     async def unlatch(self) -> tuple[Latch, ...]:
         """Release the latched stops of this robot; return those that were in force.
@@ -358,3 +367,21 @@ class Robot:
                 raise BusError(f"{self.name}: {answer.error}")
             return payloads.decode(message, answer.payload)
         raise BusError(f"{self.name}: no gateway answered within {ANSWER_S:g} s")
+
+
+async def settled(query: Callable[[], Awaitable[T]], compared: Callable[[T], object]) -> T:
+    """Query until two results in a row are the same, for at most :data:`SETTLE_S` seconds; return the last.
+
+    Results may be partial for a while, as when many gateways join the bus at once. compared: returns the part of a
+    result that must be the same, or None if the result is known to be partial.
+    """
+    loop = asyncio.get_running_loop()
+    end, found = loop.time() + SETTLE_S, await query()
+    for after_s in itertools.chain(QUERY_AFTER_S, itertools.repeat(QUERY_AFTER_S[-1])):
+        if loop.time() + after_s > end:
+            break
+        await asyncio.sleep(after_s)
+        before, found = compared(found), await query()
+        if before is not None and compared(found) == before:
+            break
+    return found

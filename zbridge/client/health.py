@@ -1,7 +1,7 @@
 """How robots are, as monitoring asks: ok, warning or critical, with the reason.
 
 A status that is answered by the bus's last value may be old: a gateway publishes its own once a second, and one that
-was heard while somebody listened shows that the gateway's event loop turns.
+arrived while somebody subscribed shows that the gateway's event loop turns.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PEER = 80
 """Characters of an address that a reason shows."""
 
 
-class Level(IntEnum):
+class HealthLevel(IntEnum):
     """The exit code that monitoring expects."""
 
     OK = 0
@@ -36,21 +36,21 @@ class Level(IntEnum):
 class Health(msgspec.Struct, frozen=True):
     """How one robot is. reason: what is wrong, or was noticed."""
 
-    level: Level
+    level: HealthLevel
     state: str | None = None
     reason: str | None = None
     host: str | None = None
 
 
-def judge(status: Status | None, *, heard: bool) -> Health:
-    """Judge a robot by its last status, None if there is none. heard: its gateway published a status just now."""
+def judge(status: Status | None, *, fresh: bool) -> Health:
+    """Judge a robot by its last status, None if there is none. fresh: its gateway published a status just now."""
     if status is None:
-        return Health(Level.CRITICAL, reason="no gateway serves it")
-    level, reason = _LEVELS.get(status.state, Level.CRITICAL), status.reason
-    if not heard:
-        level, reason = Level.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
-    elif level is Level.OK and reason:
-        level = Level.WARNING
+        return Health(HealthLevel.CRITICAL, reason="no gateway serves it")
+    level, reason = _LEVELS.get(status.state, HealthLevel.CRITICAL), status.reason
+    if not fresh:
+        level, reason = HealthLevel.CRITICAL, f"its gateway has said nothing for {LISTEN_S:g} s"
+    elif level is HealthLevel.OK and reason:
+        level = HealthLevel.WARNING
     return Health(level, status.state, reason, status.host)
 
 
@@ -80,40 +80,40 @@ def _is_of_the_network(link: LinkStatus) -> bool:
 
 async def health(fleet: Fleet, robot: str | None = None) -> dict[str, Health]:
     """Judge one robot, or all that have a gateway or a status, by name. Takes 1 s, up to LISTEN_S if one is silent."""
-    heard: dict[str, Status] = {}
+    received: dict[str, Status] = {}
     came = asyncio.Event()
 
-    async def hear() -> None:
+    async def receive() -> None:
         async for name, status in fleet.statuses(robot):
-            heard[name] = status
+            received[name] = status
             came.set()
 
-    hearing = asyncio.ensure_future(hear())
+    receiving = asyncio.ensure_future(receive())
     try:
         known = await fleet.robots()
         wanted = {robot} if robot is not None else set(known)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LISTEN_S):
-                while not wanted or not wanted <= set(heard):
+                while not wanted or not wanted <= set(received):
                     came.clear()
                     await came.wait()
     finally:
-        hearing.cancel()
-        await asyncio.gather(hearing, return_exceptions=True)
-    names = wanted if robot is not None else wanted | set(heard)
-    statuses = {name: status for name, status in {**known, **heard}.items() if status is not None}
-    judged = {name: judge(statuses.get(name), heard=name in heard) for name in sorted(names)}
+        receiving.cancel()
+        await asyncio.gather(receiving, return_exceptions=True)
+    names = wanted if robot is not None else wanted | set(received)
+    statuses = {name: status for name, status in {**known, **received}.items() if status is not None}
+    judged = {name: judge(statuses.get(name), fresh=name in received) for name in sorted(names)}
     for name, text in same_addresses(statuses).items():
         if (each := judged.get(name)) is not None:
             reason = "; ".join(filter(None, (each.reason, text)))
-            judged[name] = msgspec.structs.replace(each, level=max(each.level, Level.WARNING), reason=reason)
+            judged[name] = msgspec.structs.replace(each, level=max(each.level, HealthLevel.WARNING), reason=reason)
     return judged
 
 
-_LEVELS: dict[str, Level] = {
-    "established": Level.OK,
-    "handshaking": Level.WARNING,
-    "connecting": Level.WARNING,
-    "closing": Level.WARNING,
-    "offline": Level.CRITICAL,
+_LEVELS: dict[str, HealthLevel] = {
+    "established": HealthLevel.OK,
+    "handshaking": HealthLevel.WARNING,
+    "connecting": HealthLevel.WARNING,
+    "closing": HealthLevel.WARNING,
+    "offline": HealthLevel.CRITICAL,
 }

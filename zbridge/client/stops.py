@@ -1,8 +1,8 @@
 """Stops robots, latches them, and releases them: what is reported is what their gateways confirmed.
 
-A stop has an id of its own, and is repeated until ``control`` shows that id: whatever the network loses or holds up, a
-robot whose gateway carried the stop out is told from one whose gateway did not. A robot's latched stop is released by
-its id; a stop of the whole fleet has one id for all robots.
+A stop has an id of its own, and is repeated until ``control`` shows that id: whatever the network loses or delays, a
+confirmed stop was carried out by the robot's gateway. A robot's latched stop is released by its id; a stop of the whole
+fleet has one id for all robots.
 Source: the design's "Latched stop".
 """
 
@@ -118,7 +118,7 @@ async def unlatch_fleet(bus: Bus, realm: str, names: Iterable[str], name: str) -
     """Release the latched stops of the whole fleet at these robots, as ``name``; return for each what came of it.
 
     A robot that was not reached by a stop of all may have been sent it by its own name: that is released, too. Robots
-    that do not know a released id are told of it, for they may hear of the stop later.
+    that do not know a released id are sent it, for they may learn of the stop later.
     """
     names, latches = sorted(names), dict[str, tuple[Latch, ...]]()
     outcomes = dict[str, Outcome].fromkeys(names)
@@ -166,7 +166,7 @@ async def _shown(
     loop = asyncio.get_running_loop()
     shown: asyncio.Future[Control] = loop.create_future()
 
-    def look(sample: Sample) -> None:
+    def read_control(sample: Sample) -> None:
         with contextlib.suppress(PayloadError):
             control = payloads.decode(Control, sample.payload)
             if shows(control) and not shown.done():
@@ -174,7 +174,7 @@ async def _shown(
 
     publisher = bus.publisher(keys.key(topics.CMD_STOP.path), topics.CMD_STOP)
     with (
-        contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), look, history=True)),
+        contextlib.closing(bus.subscribe(keys.key(topics.CONTROL.path), read_control, history=True)),
         contextlib.closing(publisher),
     ):
         ends_at = loop.time() + within_s

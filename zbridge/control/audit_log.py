@@ -27,7 +27,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.events import Event, EventKind
+from zbridge.control.events import AuthorityEvent, EventKind
 from zbridge.errors import ConfigError
 from zbridge.fleet.printable import as_json
 from zbridge.metrics import Metrics
@@ -64,7 +64,7 @@ _Kind = tuple[EventKind, str | None, str | None, str | None, bool]
 class _Folded(msgspec.Struct):
     """An event that was written, and how often it happened since."""
 
-    event: Event
+    event: AuthorityEvent
     count: int = 0
 
 
@@ -83,7 +83,7 @@ class Audit:
     def __repr__(self) -> str:
         return f"<Audit {self._robot}>"
 
-    def write(self, event: Event) -> None:
+    def write(self, event: AuthorityEvent) -> None:
         """Write one event, or count it for the next :meth:`flush` if it repeats itself or comes too often."""
         kind = (event.what, event.who, event.command, event.reason, event.stops)
         folded = self._folded.get(kind)
@@ -94,7 +94,7 @@ class Audit:
             self._folded[kind] = _Folded(event)
         else:
             who = event.who if event.who in self._budgets[event.what] else None
-            others = Event(event.what, who, OTHERS, stops=event.stops)
+            others = AuthorityEvent(event.what, who, OTHERS, stops=event.stops)
             self._folded.setdefault((event.what, who, None, OTHERS, event.stops), _Folded(others)).count += 1
 
     def flush(self) -> None:
@@ -120,7 +120,7 @@ class Audit:
         self._counts = float(len(self._folded))
         self.flush()
 
-    def _affords(self, event: Event) -> bool:
+    def _affords(self, event: AuthorityEvent) -> bool:
         """Return whether the actor may have another line, and take it off its budget."""
         budgets = self._budgets[event.what]
         left = budgets.get(event.who, BURST)
@@ -131,7 +131,7 @@ class Audit:
             budgets[event.who] = left - 1
         return left >= 1
 
-    def _line(self, event: Event, count: int) -> None:
+    def _line(self, event: AuthorityEvent, count: int) -> None:
         if event.what is not EventKind.REFUSED:
             log.info("%s: %s%s", self._robot, event, f", {count} times" if count > 1 else "")
         fields = {

@@ -13,13 +13,13 @@ Who calls what. The lease server calls :meth:`acquire`, :meth:`takeover`, :meth:
 and :meth:`vanished` for lost liveliness tokens. The enforcer calls :meth:`admit` for each command that needs the lease,
 :meth:`require_motion` if the command is motion, :meth:`applied` after the robot was sent it, :meth:`stop`,
 :meth:`hold_back`, and :meth:`expire` at :meth:`deadline`. After each call it takes :meth:`events`, writes each down,
-and sends the robot its stop at once for one that ``stops``. The gate reads :attr:`verifier` and :attr:`moving` from the
-bus's threads; all else is for the event loop's thread.
+and sends the robot its stop at once for one that ``stops``. The admission filters read :attr:`verifier` and
+:attr:`moving` from the bus's threads; all else is for the event loop's thread.
 
 Guarantees. Questions about the lease and :meth:`admit` do first what is due by then. Commanded motion always has a
 deadline. No lease ends while the robot is ``moving`` without an event that stops it. Which program sent a command is
 decided by its proof first and its number second: knowing a lease's public id allows nothing. What was given too long
-ago (:mod:`zbridge.control.command_age`) extends no lease and no motion, and allows no motion either.
+ago (:class:`zbridge.control.holders.CommandAge`) extends no lease and no motion, and allows no motion either.
 """
 
 from __future__ import annotations
@@ -31,17 +31,21 @@ from typing import ClassVar, TypeAlias
 
 from msgspec import UNSET
 
-from zbridge.control.command_age import MAX_AGE_S, CommandAge
-from zbridge.control.events import Event, EventKind, Input, Sender, State
+from zbridge.control.events import AuthorityEvent as Event
+from zbridge.control.events import AuthorityInput as Input
+from zbridge.control.events import AuthorityState as State
+from zbridge.control.events import Cause, EventKind
+from zbridge.control.events import CommandSender as Sender
+from zbridge.control.holders import MAX_AGE_S, CommandAge, Holder, Holders
 from zbridge.control.latch import STOPS, Latches, LatchRecord, latch_of
-from zbridge.control.proof import Holder, Holders, Verifier
-from zbridge.control.refusal_counts import RefusalCounts
-from zbridge.control.wishes import capped, name_of
+from zbridge.control.requests import RefusalCounts, capped, name_of
 from zbridge.errors import Held, Latched, NeutralFirst, Refused
 from zbridge.fleet.messages import Acquire, Authorization, Control, FleetLatches, Latch, Lease, Stop
+from zbridge.lease.proof import Verifier
+from zbridge.machine import step
 from zbridge.protocol.kept import Exported
 
-Row: TypeAlias = dict[Input, tuple[Callable[..., Lease | None], State | None]]
+Row: TypeAlias = dict[Input, tuple[Callable[["Authority", Cause], Lease | None], State | None]]
 
 
 class Authority:
@@ -70,8 +74,8 @@ class Authority:
         self.latches = latches if latches is not None else Latches()
         self._stops: deque[bytes] = deque(maxlen=STOPS)
         """The ids of the last stops that had one."""
-        self._unkept: set[bytes] = set()
-        """The ids of latched stops that are not yet where they survive this process."""
+        self._unsaved: set[bytes] = set()
+        """The ids of latched stops that are not yet stored where they survive this process."""
         self._state = State.LATCHED if self.latches else State.FREE
         self._holders = Holders(random)
         self._autonomous = False
@@ -97,12 +101,12 @@ class Authority:
 
     @property
     def moving(self) -> bool:
-        """Whether the robot was told to move, or to move by itself, and has not been stopped since."""
+        """Whether the robot was sent motion, or ordered to move by itself, and has not been stopped since."""
         return bool(self._moving) or self.on_its_own
 
     @property
     def driven(self) -> bool:
-        """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be at rest."""
+        """Whether a program drives the robot or set its mode to autonomous; if not, the robot must be stopped."""
         return bool(self._moving) or self._autonomous
 
     # Questions about the lease. received_ms: the gateway's raw clock, for the age of what is dated.
@@ -110,26 +114,28 @@ class Authority:
     def acquire(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
         """Grant the lease of a robot that is free or stopped, held with a lower priority, or by who asks again."""
         self.expire(now)
-        outranks = self._holders.current is not None and request.priority > self._holders.current.priority
-        again = self._holders.current is not None and self._holders.current.asks_again(request)
-        asked = Input.OUTRANK if outranks else Input.AGAIN if again else Input.ACQUIRE
-        return self._reply("acquire", request.who, now, asked, request, EventKind.ACQUIRED, now, received_ms)
+        holder, given = self._holders.current, Input.ACQUIRE
+        if holder is not None and request.priority > holder.priority:
+            given = Input.OUTRANK
+        elif holder is not None and holder.asks_again(request):
+            given = Input.AGAIN
+        return self._reply("acquire", given, Cause(now, received_ms, request, kind=EventKind.ACQUIRED))
 
     def takeover(self, request: Acquire, now: float, received_ms: float = 0.0) -> Lease:
         """Grant the lease whoever has it; the previous holder loses it, and a moving robot is stopped."""
         self.expire(now)
-        kind = EventKind.TAKEN_OVER
-        return self._reply("takeover", request.who, now, Input.TAKEOVER, request, kind, now, received_ms)
+        cause = Cause(now, received_ms, request, kind=EventKind.TAKEN_OVER)
+        return self._reply("takeover", Input.TAKEOVER, cause)
 
     def renew(self, shown: Authorization, key: str, now: float, received_ms: float = 0.0) -> Lease:
         """Postpone the end of the lease by its full length; a stale question does not. key: the key queried."""
         self.expire(now)
-        return self._reply("renew", None, now, Input.RENEW, shown, key, now, received_ms)
+        return self._reply("renew", Input.RENEW, Cause(now, received_ms, shown=shown, key=key))
 
     def release(self, shown: Authorization, key: str, now: float) -> Lease:
-        """End the lease at its holder's wish; a moving robot is stopped. key: the key that was queried."""
+        """End the lease at its holder's request; a moving robot is stopped. key: the key that was queried."""
         self.expire(now)
-        return self._reply("release", None, now, Input.RELEASE, shown, key)
+        return self._reply("release", Input.RELEASE, Cause(now, shown=shown, key=key))
 
     # Commands
 
@@ -170,17 +176,15 @@ class Authority:
             return
         if not moving and not stale and self._moved:
             self._moved = set() if whole else self._moved - {part}
-            if self._moved:  # a part that moved has not rested yet: its stick may still be pushed
+            if self._moved:  # a part that moved had no neutral yet: its stick may still be deflected
                 return
         (parts.add if moving else parts.discard)(part)
-        if stale and parts:  # motion of another part goes on, and with it its deadman
+        if stale and parts:  # motion of another part continues, and with it its deadman
             return
-        action, after = self.TABLE[self._state][_MOTION if parts else _STALE_NEUTRAL if stale else _NEUTRAL]
-        action(self, given_at)
-        self._state = after or self._state
+        self._handle(_MOTION if parts else _STALE_NEUTRAL if stale else _NEUTRAL, Cause(given_at))
 
     def mode_chosen(self, *, autonomous: bool) -> None:
-        """Record that the robot was told the holder's choice of its mode."""
+        """Record that the robot was sent the holder's choice of its mode."""
         self._autonomous = autonomous
         self.on_its_own = self.on_its_own or autonomous
 
@@ -199,7 +203,7 @@ class Authority:
 
     def stop(self, reason: str) -> None:
         """Stop the robot and end the lease, whoever asks: nobody drives before acquiring anew."""
-        self._handle(Input.STOP, reason, EventKind.STOPPED)
+        self._handle(Input.STOP, Cause(reason=reason, kind=EventKind.STOPPED))
 
     def take_stop(self, stop: Stop, *, fleet: bool) -> None:
         """Stop the robot as somebody on the bus demands. fleet: all robots of the realm were sent this stop."""
@@ -209,27 +213,25 @@ class Authority:
             latch = latch_of(stop, fleet=fleet)
             self.latches.add(latch)
             if latch.id in self.latches:
-                self._unkept.add(latch.id)
+                self._unsaved.add(latch.id)
                 self._latch(latch)
                 return
         self.stop("stop")
 
     def adopt(self, answers: Iterable[FleetLatches]) -> None:
         """Take over the fleet's latched stops that other gateways know."""
-        for latch in self.latches.adopt(answers):
-            self._latch(latch)
+        self._latch(*self.latches.adopt(answers))
 
     def merge(self, record: LatchRecord) -> None:
         """Take over what another gateway of this robot knows."""
-        for latch in self.latches.merge(record):
-            self._latch(latch)
+        self._latch(*self.latches.merge(record))
 
     def unlatch(self, stop_id: bytes, who: str, *, fleet: bool) -> None:
         """Release a latched stop; raise Refused. who: the name that asks. The robot may be acquired with the last."""
         if self.latches.release(stop_id, fleet=fleet):
             self._events.append(Event(EventKind.UNLATCHED, who))
         if not self.latches:
-            self._handle(Input.UNLATCH)
+            self._handle(Input.UNLATCH, Cause())
 
     def restore_latches(self, state: Exported) -> None:
         """Take over the latched stops of another process, before this one serves the robot; raise ProtocolError."""
@@ -237,12 +239,9 @@ class Authority:
         if self.latches:
             self._state = State.LATCHED
 
-    def latches_kept(self) -> None:
+    def latches_saved(self) -> None:
         """Record that all latched stops survive this process, or cannot: ``control`` confirms them from now on."""
-        self._unkept.clear()
-
-    def _latch(self, latch: Latch) -> None:
-        self._handle(Input.LATCH, latch.reason or "stop", EventKind.LATCHED, latch.who)
+        self._unsaved.clear()
 
     @property
     def stop_ids(self) -> frozenset[bytes]:
@@ -250,17 +249,17 @@ class Authority:
         return frozenset(self._stops)
 
     def hold_back(self, reason: str, *, stops: bool = True) -> None:
-        """Stop the robot, or (``stops=False``) record that it is at rest; motion needs a neutral first."""
-        self._handle(Input.HOLD_BACK, reason, stops=stops)
+        """Stop the robot, or (``stops=False``) record that it is stopped; motion needs a neutral first."""
+        self._handle(Input.HOLD_BACK, Cause(reason=reason, stops=stops))
 
     def vanished(self, alive: str) -> None:
         """Record that a liveliness token is gone; if the holder named it, the lease ends."""
         if self._holders.current is not None and self._holders.current.alive == alive:
-            self._handle(Input.HOLDER_LOST, "holder lost", EventKind.ENDED)
+            self._handle(Input.HOLDER_LOST, Cause(reason="holder lost"))
 
     def bus_lost(self) -> None:
         """Record that no program can reach the gateway any more; the lease ends."""
-        self._handle(Input.BUS_LOST, "bus lost", EventKind.ENDED)
+        self._handle(Input.BUS_LOST, Cause(reason="bus lost"))
 
     # Time
 
@@ -273,9 +272,9 @@ class Authority:
     def expire(self, now: float) -> None:
         """Do what is due: end a lease that was not renewed, stop motion that was not repeated."""
         if self._holders.current is not None and now >= self._holders.current.expires_at:
-            self._handle(Input.EXPIRED, "lease expired", EventKind.ENDED)
+            self._handle(Input.EXPIRED, Cause(reason="lease expired"))
         elif now >= self._stop_at:
-            self._handle(Input.DEADMAN, "deadman")
+            self._handle(Input.DEADMAN, Cause(reason="deadman"))
 
     # What happened
 
@@ -300,121 +299,124 @@ class Authority:
             expires_in_s=self._expires_in_s(now),
             refusals=self._refusals.shown(),
             latches=self.latches.in_force,
-            stops=tuple(stop_id for stop_id in self._stops if stop_id not in self._unkept),
+            stops=tuple(stop_id for stop_id in self._stops if stop_id not in self._unsaved),
         )
 
-    def _handle(self, said: Input, *arguments: object, **options: object) -> Lease | None:
-        """Carry out the table: the action, then the next state. Ignore an input that the state has no entry for."""
-        entry = self.TABLE[self._state].get(said)
-        if entry is None:
-            return None
-        action, after = entry
-        reply = action(self, *arguments, **options)
-        self._state = after or self._state
+    def _handle(self, given: Input, cause: Cause) -> Lease | None:
+        self._state, reply = step(self.TABLE, self._state, given, self, cause)
         return reply
 
-    def _reply(self, command: str, who: str | None, now: float, asked: Input, *arguments: object) -> Lease:
+    def _reply(self, command: str, given: Input, cause: Cause) -> Lease:
         """Answer a question about the lease; count it if it is refused."""
         try:
-            return self._handle(asked, *arguments) or Lease(ok=True)
+            return self._handle(given, cause) or Lease(ok=True)
         except Refused as refusal:
-            self.refuse(command, refusal, who if who is not None else refusal.who)
+            self.refuse(command, refusal, cause.request.who if cause.request is not None else refusal.who)
             holder = self._holders.current.who if self._holders.current else None
-            expires_in_s = self._expires_in_s(now)
+            expires_in_s = self._expires_in_s(cause.at)
             return Lease(ok=False, expires_in_s=expires_in_s, holder=holder, reason=str(refusal), code=refusal.code)
+
+    def _latch(self, *latches: Latch) -> None:
+        for latch in latches:
+            cause = Cause(reason=latch.reason or "stop", kind=EventKind.LATCHED, who=latch.who)
+            self._handle(Input.LATCH, cause)
 
     def _expires_in_s(self, now: float) -> float | None:
         return max(0.0, self._holders.current.expires_at - now) if self._holders.current else None
 
     # Actions
 
-    def _grant(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
+    def _grant(self, cause: Cause) -> Lease:
         """End the current lease, if there is one, and give a new one; raise Malformed, and change nothing."""
+        request = cause.request
+        assert request is not None
         who, lease_s = name_of(request), capped("lease_s", request.lease_s, self.lease_s)
         deadman_s = capped("deadman_s", request.deadman_s, self.deadman_s)
         if self._holders.current is not None:
-            self._end(f"taken over by {who}", EventKind.ENDED)
+            self._end(Cause(reason=f"taken over by {who}"))
         elif self.moving:
-            self._hold_back(f"moving for nobody when {who} acquired")
+            self._hold_back(Cause(reason=f"moving for nobody when {who} acquired"))
         lease, token = self._holders.new_lease()
         self.verifier, self._deadman_s = Verifier(lease, token), deadman_s
         age = CommandAge(min(self._max_age_s, deadman_s) if self._max_age_s < math.inf else math.inf)
-        age.late_s(request.t, received_ms)
-        expires_at = now + lease_s
+        age.late_s(request.t, cause.received_ms)
+        expires_at = cause.at + lease_s
         self._holders.current = Holder(
             who, request.priority, self.verifier, lease_s, request.alive, expires_at, age, request.t
         )
         self._held_back = None
         self._moved.clear()
-        self._events.append(Event(kind, who, priority=request.priority))
+        self._events.append(Event(cause.kind, who, priority=request.priority))
         max_age_s = age.limit_s if request.t is not UNSET and age.limit_s < math.inf else UNSET
         return Lease(ok=True, lease=lease, token=token, expires_in_s=lease_s, holder=who, max_age_s=max_age_s)
 
-    def _deny(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
+    def _deny(self, cause: Cause) -> Lease:
         """Refuse the lease and name its holder."""
         assert self._holders.current is not None
         raise Held(f"held by {self._holders.current.described}", holder=self._holders.current.who)
 
-    def _extend(self, shown: Authorization, key: str, now: float, received_ms: float) -> Lease:
+    def _explain(self, cause: Cause) -> None:
+        """Refuse what only a holder may ask, and say why its lease ended if it had one."""
+        self._questioner(cause)
+
+    def _questioner(self, cause: Cause) -> Holder:
+        """Return the holder who asks; raise Refused for other senders."""
+        assert cause.shown is not None
+        return self._holders.of_question(cause.shown, cause.key)
+
+    def _extend(self, cause: Cause) -> Lease:
         """Renew the lease if its holder asks, and asked lately; raise Refused for other senders."""
-        holder = self._holders.of_question(shown, key)
-        if holder.age.is_stale(holder.late_s(shown, received_ms)):
-            return Lease(ok=True, expires_in_s=holder.expires_at - now, holder=holder.who)
-        holder.expires_at = now + holder.lease_s
+        holder = self._questioner(cause)
+        assert cause.shown is not None
+        if holder.age.is_stale(holder.late_s(cause.shown, cause.received_ms)):
+            return Lease(ok=True, expires_in_s=holder.expires_at - cause.at, holder=holder.who)
+        holder.expires_at = cause.at + holder.lease_s
         return Lease(ok=True, expires_in_s=holder.lease_s, holder=holder.who)
 
-    def _give_back(self, shown: Authorization, key: str) -> None:
+    def _give_back(self, cause: Cause) -> None:
         """End the lease if its holder asks; raise Refused for other senders."""
-        self._holders.of_question(shown, key)
-        self._end("released", EventKind.RELEASED)
+        self._questioner(cause)
+        self._end(Cause(reason="released", kind=EventKind.RELEASED))
 
-    def _explain(self, shown: Authorization, key: str, now: float = 0.0, received_ms: float = 0.0) -> None:
-        """Refuse what only a holder may ask, and say why its lease ended if it had one."""
-        self._holders.of_question(shown, key)
-
-    def _move(self, given_at: float) -> None:
+    def _move(self, cause: Cause) -> None:
         """Start the deadman."""
-        self._stop_at = given_at + self._deadman_s
+        self._stop_at = cause.at + self._deadman_s
 
-    def _rest(self, given_at: float) -> None:
+    def _rest(self, cause: Cause) -> None:
         """Stop the deadman; neutral also takes the robot out of its mode, and allows motion again."""
-        self._rest_stale(given_at)
+        self._rest_stale(cause)
         self._held_back = None
 
-    def _rest_stale(self, given_at: float) -> None:
+    def _rest_stale(self, cause: Cause) -> None:
         """Stop the deadman; neutral also takes the robot out of its mode."""
         self._autonomous = False
         self._stop_at = math.inf
 
-    def _hold_back(self, reason: str, *, stops: bool = True) -> None:
-        """Require neutral before motion; tell of it once for each reason, and always with a stop."""
-        if stops or self.moving or self._held_back != reason:
+    def _hold_back(self, cause: Cause) -> None:
+        """Require neutral before motion; report it once for each reason, and always with a stop."""
+        if cause.stops or self.moving or self._held_back != cause.reason:
             who = self._holders.current.who if self._holders.current else None
-            self._events.append(Event(EventKind.STOPPED, who, reason, stops=stops))
+            self._events.append(Event(EventKind.STOPPED, who, cause.reason, stops=cause.stops))
         self._moved |= self._moving
         self._still()
-        self._held_back = reason
+        self._held_back = cause.reason
 
-    def _end(self, reason: str, kind: EventKind, who: str | None = None) -> None:
-        """End the lease, if there is one, and stop the robot: if it moves, or if that was asked for.
-
-        who: of a latched stop, what its sender says.
-        """
-        stops = kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving
-        holder, self.verifier = self._holders.end(reason), None
+    def _end(self, cause: Cause) -> None:
+        """End the lease, if there is one, and stop the robot if it moves, or if that was asked for."""
+        stops = cause.kind in (EventKind.STOPPED, EventKind.LATCHED) or self.moving
+        holder, self.verifier = self._holders.end(cause.reason), None
         self._still()
         self._held_back = None
         self._moved.clear()
         self._deadman_s = self.deadman_s
-        if kind is not EventKind.LATCHED:
-            who = holder.who if holder else None
-        self._events.append(Event(kind, who, reason, stops=stops))
+        who = cause.who if cause.kind is EventKind.LATCHED else holder.who if holder else None
+        self._events.append(Event(cause.kind, who, cause.reason, stops=stops))
 
-    def _refuse_latched(self, request: Acquire, kind: EventKind, now: float, received_ms: float) -> Lease:
+    def _refuse_latched(self, cause: Cause) -> Lease:
         """Refuse the lease, and say who latched the robot."""
         raise Latched(self.latches.described)
 
-    def _free(self) -> None:
+    def _free(self, cause: Cause) -> None:
         """Do nothing: from now on the robot may be acquired."""
 
     def _still(self) -> None:

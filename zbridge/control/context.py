@@ -1,19 +1,90 @@
-"""What the parts that serve one robot share."""
+"""What the parts that serve one robot share: the bus, counters, clocks, lasting conditions, faults of its protocol."""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable
 
 import msgspec
 
 from zbridge.bus import Bus
-from zbridge.control import clocks
-from zbridge.control.conditions import Conditions
-from zbridge.control.faults import Faults
+from zbridge.errors import FAULT, Unsupported, describe
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
+from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.plugin import Robot
+
+log = logging.getLogger("zbridge.robot.commands")
+
+LOGGED = 16
+"""Faults that are logged, each once."""
+_BOOT = getattr(time, "CLOCK_BOOTTIME", None)
+
+
+def suspended_s() -> float:
+    """Return for how many seconds this machine was suspended since it was booted; 0 where the platform does not say.
+
+    The result may be too small by the time between two readings, never too large.
+    """
+    if _BOOT is None:
+        return 0.0
+    since_boot = time.clock_gettime(_BOOT)
+    return since_boot - time.monotonic()
+
+
+class Conditions:
+    """Lasting faults of a robot that is served all the same, or of its gateway; ``status.reason`` shows them.
+
+    Each part that finds a fault sets a condition under a name of its own and clears it when the fault has passed.
+    ``changed`` is called when a condition is set, changed or cleared.
+    """
+
+    def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
+        self.changed = changed
+        self._texts: dict[str, str] = {}
+
+    def __repr__(self) -> str:
+        return f"<Conditions {sorted(self._texts)}>"
+
+    @property
+    def texts(self) -> tuple[str, ...]:
+        """The texts for people, oldest first."""
+        return tuple(self._texts.values())
+
+    def set(self, name: str, text: str | None) -> None:
+        """Set the condition of a name; None clears it."""
+        if self._texts.get(name) == text:
+            return
+        if text is None:
+            del self._texts[name]
+        else:
+            self._texts[name] = text
+        self.changed()
+
+
+class Faults:
+    """Exceptions in the code of one robot's protocol, as refusals. robot: its name, for the log."""
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._logged: set[str] = set()
+
+    def __repr__(self) -> str:
+        return f"<Faults {sorted(self._logged)}>"
+
+    def refusal(self, what: str, error: Exception) -> Unsupported:
+        """Return the refusal of what ran into a fault, and note the fault."""
+        self.note(what, error)
+        return Unsupported(f"{FAULT}{describe(error)}")
+
+    def note(self, what: str, error: Exception) -> None:
+        """Log a fault with its traceback, each once."""
+        fault = describe(error)
+        if fault not in self._logged and len(self._logged) < LOGGED:
+            self._logged.add(fault)
+            log.error("%s: %s: %s%s", self._robot, what, FAULT, fault, exc_info=error)
 
 
 class RobotContext(msgspec.Struct, frozen=True):
@@ -21,7 +92,7 @@ class RobotContext(msgspec.Struct, frozen=True):
 
     publish: shows a message on the bus. pump: writes to the robot what its sessions have to write.
     clock: seconds on the event loop's time line, from any thread. clock_ns: Unix time in nanoseconds, for stamps.
-    raw_ms, suspended_s: see :mod:`zbridge.control.clocks`.
+    raw_ms, suspended_s: see the functions.
     """
 
     robot: Robot
@@ -34,5 +105,5 @@ class RobotContext(msgspec.Struct, frozen=True):
     pump: Callable[[], object]
     clock: Callable[[], float]
     clock_ns: Callable[[], int]
-    raw_ms: Callable[[], float] = clocks.raw_ms
-    suspended_s: Callable[[], float] = clocks.suspended_s
+    raw_ms: Callable[[], float] = raw_ms
+    suspended_s: Callable[[], float] = suspended_s

@@ -1,8 +1,8 @@
 """Enforces what the authority of one robot decides: stops in time, ``control``, the audit log, counters.
 
 Theory of operation. The authority decides and has no clock; the enforcer carries out. A command of the holder's passes
-three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is told,
-:meth:`Enforcer.moved` after it was told. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
+three times: :meth:`Enforcer.admit` before it is read, :meth:`Enforcer.permit` before the robot is sent it,
+:meth:`Enforcer.moved` afterwards. Every caller of the authority calls :meth:`Enforcer.settle` afterwards: it
 sends the robot its stop where an event asks for it, writes every event down, publishes ``control``, and arms the timer
 for the authority's deadline. The timer is re-armed only for an earlier deadline: commands mostly postpone it, and an
 early wake-up is harmless. Before anything is written to the robot, or read from it or from the bus,
@@ -17,11 +17,11 @@ import math
 from collections.abc import Callable, Iterable
 
 from zbridge.bus import Sample
+from zbridge.control.admission import CommandFilter, RefusalLimit
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
 from zbridge.control.context import RobotContext
-from zbridge.control.events import Event, EventKind, Sender
-from zbridge.control.gate import CommandGate, Sieve
+from zbridge.control.events import AuthorityEvent, CommandSender, EventKind
 from zbridge.control.latch import Latches, LatchRecord, read_stop
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import Standstill
@@ -31,7 +31,7 @@ from zbridge.fleet.messages import Drive, FleetLatches, FleetMessage, Mode, Moto
 from zbridge.fleet.topics import KeySpace
 from zbridge.protocol.session import State
 
-Keep = Callable[[Latches], "asyncio.Future[None] | None"]
+Save = Callable[[Latches], "asyncio.Future[None] | None"]
 
 SUSPENDED_S = 0.1
 """A machine that was suspended for longer stops its robots, and ends their leases."""
@@ -42,7 +42,7 @@ _CONTROL_S = 0.05
 class Enforcer:
     """Carries out the decisions of one robot's authority.
 
-    limits: None where drives are not limited. keep: writes the latched stops down, so that they survive this process;
+    limits: None where drives are not limited. save: writes the latched stops down, so that they survive this process;
     returns what ends when that is done, None where it is.
     """
 
@@ -53,13 +53,13 @@ class Enforcer:
         standstill: Standstill,
         audit: Audit,
         limits: MotionLimits | None = None,
-        keep: Keep = lambda latches: None,
+        save: Save = lambda latches: None,
     ) -> None:
         self.authority = authority
-        self._keep = keep
-        self._keeping = 0
+        self._save = save
+        self._saving = 0
         """Writings of latched stops that have not ended."""
-        self.gate = CommandGate(authority, context.keys, context.clock)
+        self.admission = CommandFilter(authority, context.keys, context.clock)
         """Sorts commands on the bus's threads."""
         self._context = context
         self._clock = context.clock
@@ -71,7 +71,7 @@ class Enforcer:
         """Called after :meth:`settle`: whether the robot is driven, or (``at_once``) how it is stopped, may be new."""
         self._stops_anew = False
         """Whether a command has just changed how the robot is stopped."""
-        self._sieves: dict[str, Sieve] = {"commands": self.gate.sieve}
+        self._refusal_limits: dict[str, RefusalLimit] = {"commands": self.admission.refusals}
         self._fleet_stop = KeySpace(context.keys.realm, "*").key(topics.CMD_STOP.path)
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
@@ -89,14 +89,14 @@ class Enforcer:
 
     # A command of the holder's
 
-    def admit(self, sample: Sample, now: float) -> Sender:
+    def admit(self, sample: Sample, now: float) -> CommandSender:
         """Return who of the holders sent a command, and renew the lease; raise Refused for other senders."""
         sender = self.authority.admit(sample.attachment, sample.key, sample.payload, now, self._context.raw_ms())
         if self.authority.eventful:
             self.settle()
         return sender
 
-    def require_fresh(self, sender: Sender) -> None:
+    def require_fresh(self, sender: CommandSender) -> None:
         """Raise Refused for a command that is too old to set the robot in motion."""
         if sender.stale:
             self._stale.value += 1
@@ -107,7 +107,7 @@ class Enforcer:
         self.authority.require_motion()
 
     def permit(self, command: Drive | Motor, now: float) -> Drive | Motor:
-        """Return what the robot may be told of a motion, within the limits; raise Refused where it may not move."""
+        """Return the motion that the robot may be sent, within the limits; raise Refused where it may not move."""
         self.authority.require_motion()
         if self._limits is None or not isinstance(command, Drive):
             return command
@@ -115,10 +115,10 @@ class Enforcer:
         self._slowed.value += limited is not command and limited != command
         return limited
 
-    def moved(self, path: str, command: Drive | Motor, now: float, sender: Sender, *, moving: bool) -> None:
+    def moved(self, path: str, command: Drive | Motor, now: float, sender: CommandSender, *, moving: bool) -> None:
         """Record that the robot was sent motion, or neutral.
 
-        Raises Refused where the link had just begun to take again: then a stop went instead of the motion.
+        Raises Refused where the link has just recovered from a stall: then a stop went instead of the motion.
         """
         authority = self.authority
         if moving:
@@ -132,7 +132,7 @@ class Enforcer:
                 self._standstill.neutral(now)
 
     def commanded(self, command: FleetMessage) -> None:
-        """Note that the robot was told something that may move it: a mode, or a raw message."""
+        """Record that the robot was sent something that may move it: a mode, or a raw message."""
         self._stops_anew = isinstance(command, Mode | Raw)
         if isinstance(command, Mode):
             self.authority.mode_chosen(autonomous=command.mode == "autonomous")
@@ -151,10 +151,10 @@ class Enforcer:
         self.settle()
 
     def stop_commanded(self, sample: Sample) -> None:
-        """Obey a stop from the bus, which anybody may send; the gate folds those that follow at once."""
+        """Obey a stop from the bus, which anybody may send; the admission filter folds those that follow at once."""
         self.authority.take_stop(read_stop(sample.payload), fleet=sample.key == self._fleet_stop)
         self.settle()
-        self.gate.stopped()
+        self.admission.stopped()
 
     def adopt(self, answers: Iterable[FleetLatches]) -> None:
         """Take over the fleet's latched stops that other gateways know."""
@@ -168,7 +168,7 @@ class Enforcer:
         self.settle()
         if self.authority.latches.autonomous and not known:
             self._remind()
-            self._keep_latches()
+            self._save_latches()
             if not self.authority.driven:
                 self._send_stop()
 
@@ -178,9 +178,9 @@ class Enforcer:
         self._remind()
 
     def write_autonomous(self) -> asyncio.Future[None] | None:
-        """Write down that the robot is told to move by itself; return what ends when that is done, None where it is."""
+        """Store that the robot was ordered to move by itself; return what ends when that is done, None where it is."""
         self.authority.latches.autonomous = True
-        return self._keep(self.authority.latches)
+        return self._save(self.authority.latches)
 
     def hold_back(self, reason: str, *, stops: bool) -> None:
         """Allow no motion before a neutral drive; with ``stops`` the robot is sent its stop."""
@@ -188,7 +188,7 @@ class Enforcer:
         self.settle()
 
     def bus_lost(self) -> None:
-        """End the lease: its holder cannot be heard any more."""
+        """End the lease: its holder cannot reach the gateway any more."""
         self.authority.bus_lost()
         self.settle()
 
@@ -213,14 +213,14 @@ class Enforcer:
         if self._clock() >= self._timer_at:
             self._on_time()
 
-    def watch_sieve(self, command: str, sieve: Sieve) -> None:
-        """Show with every :meth:`beat` what a gate refused by itself."""
-        self._sieves[command] = sieve
+    def watch_refusals(self, command: str, limit: RefusalLimit) -> None:
+        """Show with every :meth:`beat` what an admission filter dropped."""
+        self._refusal_limits[command] = limit
 
     def beat(self) -> None:
         """Publish ``control``, and write down what was folded. To be called once a second."""
-        self._count_kept_back()
-        self._keep_latches()
+        self._count_dropped()
+        self._save_latches()
         self.report()
         self._audit.flush()
 
@@ -249,32 +249,32 @@ class Enforcer:
         if changed:
             self.report()
 
-    def _carry_out(self, event: Event) -> None:
+    def _carry_out(self, event: AuthorityEvent) -> None:
         if event.what is EventKind.REFUSED:
             self._refused.value += 1
         else:
             if event.what is not EventKind.ACQUIRED and self._limits is not None:
-                self._limits.at_rest()
+                self._limits.stopped()
             self._context.metrics.count("control", what=event.what.value).value += 1
         if event.stops:
             self._send_stop()
         if event.what in (EventKind.LATCHED, EventKind.UNLATCHED):
-            self._keep_latches()
+            self._save_latches()
         self._audit.write(event)
 
-    def _keep_latches(self) -> None:
+    def _save_latches(self) -> None:
         """Write the latched stops down; ``control`` confirms a new one when that has ended."""
-        writing = self._keep(self.authority.latches)
+        writing = self._save(self.authority.latches)
         if writing is not None:
-            self._keeping += 1
-            writing.add_done_callback(self._on_kept)
-        elif not self._keeping:
-            self.authority.latches_kept()
+            self._saving += 1
+            writing.add_done_callback(self._on_saved)
+        elif not self._saving:
+            self.authority.latches_saved()
 
-    def _on_kept(self, _: object) -> None:
-        self._keeping -= 1
-        if not self._keeping:
-            self.authority.latches_kept()
+    def _on_saved(self, _: object) -> None:
+        self._saving -= 1
+        if not self._saving:
+            self.authority.latches_saved()
             self.report()
 
     def _remind(self) -> None:
@@ -294,13 +294,13 @@ class Enforcer:
         except Refused as refusal:
             self.authority.refuse("stop", refusal)
 
-    def _count_kept_back(self) -> None:
-        """Show what the gates refused by themselves since the last time: an entry for each code, with its count."""
-        for command, sieve in self._sieves.items():
-            for refusal, count in sieve.kept_back():
+    def _count_dropped(self) -> None:
+        """Show what the admission filters dropped since the last time: an entry for each code, with its count."""
+        for command, limit in self._refusal_limits.items():
+            for refusal, count in limit.dropped():
                 self.authority.refuse(command, refusal, count=count)
                 self._refused.value += count - 1  # settling counts one
-        self._same_stops.value = self.gate.same_stops
+        self._same_stops.value = self.admission.same_stops
         self.settle()
 
     def _arm(self, deadline: float) -> None:

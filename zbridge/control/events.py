@@ -1,15 +1,17 @@
-"""The right to drive a robot: its states, the inputs that change them, and the events that come of it. Sans-IO."""
+"""The right to drive a robot: its states, the inputs that change them, and the events that result. Sans-IO."""
 
 from __future__ import annotations
 
+import math
 from enum import Enum, StrEnum
 
 import msgspec
 
 from zbridge.errors import Code
+from zbridge.fleet.messages import Acquire, Authorization
 
 
-class State(StrEnum):
+class AuthorityState(StrEnum):
     """The state of the right to drive; ``control`` shows the middle three as ``held``."""
 
     FREE = "free"
@@ -20,8 +22,8 @@ class State(StrEnum):
     LATCHED = "latched"
 
 
-class Input(StrEnum):
-    """What the authority is told."""
+class AuthorityInput(StrEnum):
+    """What happened, to the authority."""
 
     ACQUIRE = "acquire"
     OUTRANK = "acquire with a higher priority"
@@ -55,7 +57,26 @@ class EventKind(Enum):
     ENDED = "ended"
 
 
-class Sender(msgspec.Struct, frozen=True):
+class Cause(msgspec.Struct, frozen=True):
+    """What comes with an input of the table; each action reads what it needs.
+
+    at: when it happened, or when a command was given. received_ms: the gateway's raw clock. request: for the lease.
+    shown, key: the proof of a question about the lease, and the key that was queried. kind, reason, who: of the event
+    that follows. stops: whether a hold-back sends the robot its stop.
+    """
+
+    at: float = math.inf
+    received_ms: float = 0.0
+    request: Acquire | None = None
+    shown: Authorization | None = None
+    key: str = ""
+    kind: EventKind = EventKind.ENDED
+    reason: str = ""
+    who: str | None = None
+    stops: bool = True
+
+
+class CommandSender(msgspec.Struct, frozen=True):
     """Who sent a command of the lease, and when it was given.
 
     given_at: on the time line of the event loop, seconds. late_s: for how long it was on its way. stale: it is too old
@@ -68,7 +89,7 @@ class Sender(msgspec.Struct, frozen=True):
     stale: bool = False
 
 
-class Event(msgspec.Struct, frozen=True):
+class AuthorityEvent(msgspec.Struct, frozen=True):
     """One event to write down. stops: whether the robot must be sent its stop now."""
 
     what: EventKind

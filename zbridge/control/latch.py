@@ -6,7 +6,7 @@ in which order a partitioned network delivers latches and releases, or how often
 of each robot: a gateway that was away learns of it from the others (:meth:`Latches.adopt`), unless one of them knows
 that it was released.
 
-Beside them stands whether the robot was ever told to move by itself (:attr:`Latches.autonomous`): whichever gateway
+Beside them stands whether the robot was ever ordered to move by itself (:attr:`Latches.autonomous`): whichever gateway
 comes next must stop such a robot in a way that ends that too. Nothing resets it: no robot confirms that it stopped.
 
 Bounds: :data:`LATCHES` ids are in force; one more replaces the last, and the robot stays latched. The last
@@ -37,9 +37,9 @@ WHO, REASON = 64, 128
 
 
 class LatchRecord(msgspec.Struct, frozen=True):
-    """What is kept over a restart: the latched stops in force, and the released ids.
+    """What survives a restart: the latched stops in force, and the released ids.
 
-    autonomous: whether the robot was ever told to move by itself.
+    autonomous: whether the robot was ever ordered to move by itself.
     """
 
     latches: tuple[Latch, ...] = ()
@@ -75,7 +75,7 @@ class Latches:
         self._released = deque(record.released, maxlen=RELEASED)
         self._released_fleet = deque(record.released_fleet, maxlen=RELEASED)
         self.autonomous = record.autonomous
-        """Whether the robot was ever told to move by itself, by this gateway or one before."""
+        """Whether the robot was ever ordered to move by itself, by this gateway or one before."""
 
     def __bool__(self) -> bool:
         return bool(self._in_force)
@@ -127,7 +127,7 @@ class Latches:
 
         fleet: whether who asks may release latches of the fleet, and of the fleet only. Raises Unsupported for a latch
         of the other kind, Malformed for one of the robot that was never known. A latch of the fleet that is not known
-        here is remembered as released: this gateway may hear of it later.
+        here is remembered as released: this gateway may learn of it later.
         """
         latch = self._in_force.get(stop_id)
         if latch is not None and latch.fleet is not fleet:

@@ -1,6 +1,6 @@
-"""Keeps the latched stops of one robot on disk: a gateway that starts reads them before it serves its robot.
+"""Stores the latched stops of one robot on disk: a gateway that starts reads them before it serves its robot.
 
-With them it keeps whether the robot was ever told to move by itself (:attr:`Latches.autonomous`).
+It also stores whether the robot was ever ordered to move by itself (:attr:`Latches.autonomous`).
 
 A gateway that owns its robot writes ``<realm>@<robot>.latches``. One that waits for another gateway writes what that
 one says to ``<realm>@<robot>.standby.latches``: both may run on one machine, and neither may overwrite what the other
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
@@ -85,7 +85,7 @@ class LatchStore:
 
     @property
     def autonomous(self) -> bool:
-        """Whether any file says that the robot was told to move by itself; after :meth:`load`."""
+        """Whether any file says that the robot was ordered to move by itself; after :meth:`load`."""
         return any(record.autonomous for record in self._written.values())
 
     def mirror(self, record: LatchRecord) -> None:

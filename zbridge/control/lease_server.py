@@ -1,6 +1,6 @@
 """Answers queries about the lease of one robot: acquire, takeover, renew, release, unlatch, what listeners refused.
 
-Every kind of query has a gate on the bus's threads; the authority decides, the enforcer carries out.
+Every kind of query has an admission filter on the bus's threads; the authority decides, the enforcer carries out.
 """
 
 from __future__ import annotations
@@ -9,26 +9,25 @@ from collections.abc import Callable
 from functools import partial
 
 from zbridge.bus import Handle, IncomingQuery
+from zbridge.control.admission import NameFilter, QueryFilter
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.gate import NameGate, QueryGate
-from zbridge.control.proof import read
 from zbridge.errors import Code, Malformed, NotReady, PayloadError, Refused, TooFast
 from zbridge.errors import refusal as refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, FleetMessage, Query, Refusals, Unlatch
+from zbridge.lease.lease_events import NAMED
+from zbridge.lease.proof import read
 from zbridge.protocol.rate_limit import RateLimit
 
-TELLINGS_HZ = 20.0
+REPORTS_HZ = 20.0
 """Times a second that listeners, all together, may report what they refused."""
 TAKEOVERS_HZ = 5.0
 """Takeovers a second, of all programs together."""
 _LISTENER = "hq."
 _COUNTED = 1_000_000
 """Most refusals of one kind that a report counts."""
-_NAMED = 64
-"""Characters of a wrong name that a refusal repeats."""
 _BY_NAME = ("acquire", "takeover", "unlatch", "unlatch_fleet", "refused")
 """Queries whose key ends with the name of who asks. On a secure bus nobody can ask at another's key."""
 _ANYBODY = "*"
@@ -45,22 +44,22 @@ class LeaseServer:
         self._enforcer = enforcer
         self._authority = authority
         self._clock = clock
-        self._gates: dict[str, QueryGate | NameGate] = {
-            "acquire": NameGate(clock),
-            "takeover": NameGate(clock),
-            "renew": QueryGate(authority, clock),
-            "release": QueryGate(authority, clock),
-            "unlatch": NameGate(clock),
-            "unlatch_fleet": NameGate(clock),
-            "refused": NameGate(clock),
+        self._filters: dict[str, QueryFilter | NameFilter] = {
+            "acquire": NameFilter(clock),
+            "takeover": NameFilter(clock),
+            "renew": QueryFilter(authority, clock),
+            "release": QueryFilter(authority, clock),
+            "unlatch": NameFilter(clock),
+            "unlatch_fleet": NameFilter(clock),
+            "refused": NameFilter(clock),
         }
-        for command, gate in self._gates.items():
-            enforcer.watch_sieve(command, gate.sieve)
+        for command, admission in self._filters.items():
+            enforcer.watch_refusals(command, admission.refusals)
         self._closing: str | None = None
         self._waits: str | None = None
         """Why no lease is granted yet."""
         self._takeovers = RateLimit(TAKEOVERS_HZ)
-        self._tellings = RateLimit(TELLINGS_HZ)
+        self._reports = RateLimit(REPORTS_HZ)
 
     def __repr__(self) -> str:
         return f"<LeaseServer {self._context.keys.robot} {self._authority!r}>"
@@ -74,8 +73,8 @@ class LeaseServer:
             self._answer("release", self._release),
             self._answer("unlatch/*", partial(self._unlatch, fleet=False)),
             self._answer("unlatch_fleet/*", partial(self._unlatch, fleet=True)),
-            self._answer("refused/*", self._take_told),
-            self._context.bus.answer(self._context.keys.key(topics.RPC_LATCH.path), self._tell_latches),
+            self._answer("refused/*", self._take_reported),
+            self._context.bus.answer(self._context.keys.key(topics.RPC_LATCH.path), self._report_latches),
             self._context.bus.watch_alive(self._context.keys.alive(_ANYBODY), self._on_alive),
         ]
 
@@ -107,7 +106,7 @@ class LeaseServer:
             self._enforcer.settle()
 
         key = self._context.keys.key(f"@rpc/control/{name}")
-        return self._context.bus.answer(key, answer, lane=self._gates[command])
+        return self._context.bus.answer(key, answer, lane=self._filters[command])
 
     def _on_alive(self, key: str, alive: bool) -> None:
         if not alive:
@@ -138,13 +137,13 @@ class LeaseServer:
     def _unlatch(self, query: IncomingQuery, *, fleet: bool) -> FleetMessage:
         stop_id = payloads.decode(Unlatch, query.payload).id
         name = topics.unescape(query.asked.rpartition("/")[2])
-        self._authority.unlatch(stop_id, name[:_NAMED], fleet=fleet)
+        self._authority.unlatch(stop_id, name[:NAMED], fleet=fleet)
         return Query()
 
-    def _tell_latches(self, query: IncomingQuery) -> None:
+    def _report_latches(self, query: IncomingQuery) -> None:
         query.answer(payloads.encode(self._authority.latches.fleet))
 
-    def _take_told(self, query: IncomingQuery) -> FleetMessage:
+    def _take_reported(self, query: IncomingQuery) -> FleetMessage:
         """Show what a listener refused its HQ programs.
 
         The names of listeners begin with ``hq.``: no refusal can be reported in the name of any other program.
@@ -152,12 +151,12 @@ class LeaseServer:
         name = query.asked.rpartition("/")[2]
         if not name.startswith(_LISTENER):
             raise Malformed(f"its name does not begin with {_LISTENER!r}: only listeners tell what they refused")
-        told = payloads.decode(Refusals, query.payload).refusals
-        for each in told:
+        reported = payloads.decode(Refusals, query.payload).refusals
+        for each in reported:
             _require_own_name(query, each.who or "")
-        if not self._tellings.take(self._clock()):
-            raise TooFast(f"more than {TELLINGS_HZ:g} tellings a second")
-        for each in told:
+        if not self._reports.take(self._clock()):
+            raise TooFast(f"more than {REPORTS_HZ:g} tellings a second")
+        for each in reported:
             count = min(max(each.count, 1), _COUNTED)
             self._authority.refuse(each.command, refused(each.code, each.reason), each.who, by=name, count=count)
         return Query()
@@ -177,7 +176,7 @@ def _request(query: IncomingQuery) -> Acquire:
     name = query.asked.rpartition("/")[2]
     if request.alive is not None and not topics.may_name_token(request.alive, name):
         own = f"{'' if name.startswith(_LISTENER) else 'operator.'}{name}.<id>"
-        raise Malformed(f"alive = {request.alive[:_NAMED]!r}: expected a token of its own name, {own[:_NAMED]!r}")
+        raise Malformed(f"alive = {request.alive[:NAMED]!r}: expected a token of its own name, {own[:NAMED]!r}")
     return request
 
 
@@ -185,4 +184,4 @@ def _require_own_name(query: IncomingQuery, who: str) -> None:
     """Raise Malformed where somebody asks in another name than its key's."""
     name = query.asked.rpartition("/")[2]
     if not topics.speaks_for(who, name):
-        raise Malformed(f"who = {who[:_NAMED]!r}: expected {topics.unescape(name)[:_NAMED]!r}, or that and '.suffix'")
+        raise Malformed(f"who = {who[:NAMED]!r}: expected {topics.unescape(name)[:NAMED]!r}, or that and '.suffix'")

@@ -50,8 +50,8 @@ class MotionLimits:
         """Record the drive that the robot was sent."""
         self._last, self._last_at = drive, now
 
-    def at_rest(self) -> None:
-        """Note that the robot is at rest, whatever it was told last."""
+    def stopped(self) -> None:
+        """Record that the robot was stopped, whatever it was sent last."""
         self._last = Drive()
 
     def _count(self, now: float) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from zbridge.control.command_age import MAX_AGE_S
+from zbridge.control.holders import MAX_AGE_S
 
 Seconds = Annotated[float, msgspec.Meta(gt=0, le=3600)]
 

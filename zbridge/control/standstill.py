@@ -24,7 +24,7 @@ _CONDITION = "stop"
 class Standstill:
     """Sends stops to one robot.
 
-    authority: tells whether somebody drives the robot now, or told it to move by itself.
+    authority: knows whether somebody drives the robot now, or ordered it to move by itself.
     idle_stop_s: seconds between two stops while nobody drives, fewer where the protocol says so; 0: only when motion
     ends, and while a latched stop is in force.
     """
@@ -79,14 +79,14 @@ class Standstill:
 
     def _send(self, now: float, until: float) -> None:
         try:
-            self._tell(now, until)
+            self._write(now, until)
         except Refused as refusal:
             self._conditions.set(_CONDITION, f"cannot be stopped: {refusal}")
             raise
         self._conditions.set(_CONDITION, None)
         self._pump()
 
-    def _tell(self, now: float, until: float) -> None:
+    def _write(self, now: float, until: float) -> None:
         try:
             self._robot.stop(now, until)
         except Refused:

@@ -320,7 +320,7 @@ class Acquire(FleetMessage, frozen=True):
     """Ask for the lease of a robot, or take it over.
 
     who: the name that others are shown. priority: a higher priority gets the lease of a holder with a lower one.
-    lease_s, deadman_s: wishes in seconds, capped by the robot's configuration; None: its default.
+    lease_s, deadman_s: requested times in seconds, capped by the robot's configuration; None: its default.
     alive: the ``<who>`` of a liveliness token below the robot's ``@alive/``; its loss ends the lease.
     t: the sender's CLOCK_MONOTONIC_RAW, ms; absent where the sender does not date its commands.
     """
@@ -352,7 +352,7 @@ class Lease(FleetMessage, frozen=True):
 
 
 class Authorization(FleetMessage, frozen=True):
-    """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.control.proof`.
+    """Shows that a command, or a query about the lease, is the holder's: see :mod:`zbridge.lease.proof`.
 
     Attachment of a command; payload of ``renew`` and ``release``. seq: rises with each command (query) of the lease.
     t: the sender's CLOCK_MONOTONIC_RAW when the command was given, ms; absent where the sender does not date it.

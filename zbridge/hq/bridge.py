@@ -6,11 +6,11 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from zbridge.bus import Bus, Publisher
-from zbridge.control.lease_client import LeaseClient
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic
 from zbridge.fleet.view import RobotView
+from zbridge.lease.lease_client import LeaseClient
 
 PUBLISHERS = 512
 """Keys that the clients of a listener command at a time; a new one replaces the oldest."""

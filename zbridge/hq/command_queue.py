@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import msgspec
 
-from zbridge.control.lease_client import LeaseClient
 from zbridge.errors import BusError, Code, NotReady
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor
 from zbridge.fleet.topics import Topic
 from zbridge.hq.bridge import Bridge
+from zbridge.lease.lease_client import LeaseClient
 
 log = logging.getLogger("zbridge.hq")
 

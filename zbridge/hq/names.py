@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from zbridge.control.wishes import NAMED
 from zbridge.errors import ConfigError
 from zbridge.hq.settings import ListenerPlan
+from zbridge.lease.lease_events import NAMED
 
 _ZID = 6
 """Characters of the bus session's id in a listener's name: they differ between processes."""

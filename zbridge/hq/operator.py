@@ -13,9 +13,6 @@ import logging
 import math
 from collections.abc import Callable
 
-from zbridge.control.lease_client import LeaseClient
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
-from zbridge.control.lease_holder import LeaseHolder
 from zbridge.errors import Code, NotReady, TooFast, Unsupported
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Drive, FleetMessage, Mode, Motor, Raw, Refusal
@@ -23,6 +20,9 @@ from zbridge.fleet.topics import Topic
 from zbridge.hq.bridge import Bridge
 from zbridge.hq.command_queue import CommandQueue
 from zbridge.hq.intent import Action, Intent
+from zbridge.lease.lease_client import LeaseClient
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_holder import LeaseHolder
 from zbridge.protocol.kept import Exported
 from zbridge.protocol.rate_limit import RateLimit
 
@@ -153,7 +153,7 @@ class Operator:
     def look(self, control: Control) -> None:
         """Take news from ``control``: whether the lease is still held, and what was refused."""
         now = self._clock()
-        for refusal in self._lease.look(control):
+        for refusal in self._lease.read_control(control):
             lately = now - self._open.get(refusal.command, -math.inf) < OURS_S
             if refusal.command != "acquire" and (refusal.who is not None or lately):
                 if refusal.code == Code.NEUTRAL_FIRST:

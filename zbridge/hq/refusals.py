@@ -10,14 +10,13 @@ import asyncio
 import logging
 
 from zbridge.bus import Bus
-from zbridge.control.refusal_counts import EXPLAINED
-from zbridge.control.wishes import NAMED
 from zbridge.errors import BusError, Refused
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import TOLD, Refusal, Refusals
 from zbridge.fleet.topics import KeySpace
 from zbridge.hq.tasks import Tasks
+from zbridge.lease.lease_events import EXPLAINED, NAMED
 from zbridge.metrics import Count
 
 log = logging.getLogger("zbridge.hq")

@@ -8,16 +8,16 @@ from __future__ import annotations
 import msgspec
 
 from zbridge.bus import Sample
+from zbridge.control.admission import OF_THE_HOLDER, is_stop
 from zbridge.control.context import RobotContext
 from zbridge.control.enforcer import Enforcer
-from zbridge.control.events import Sender
-from zbridge.control.gate import OF_THE_HOLDER, is_stop
-from zbridge.control.proof import Verifier
+from zbridge.control.events import CommandSender
 from zbridge.errors import Code, EncodeError, Malformed, NotReady, PayloadError, Refused, Unsupported, ZbridgeError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Motor, Raw
 from zbridge.fleet.topics import Delivery, Topic
+from zbridge.lease.proof import Verifier
 from zbridge.protocol.plugin import Outcome
 from zbridge.protocol.session import Session, State
 
@@ -33,7 +33,7 @@ class _Awaiting(msgspec.Struct, frozen=True):
 
     topic: Topic
     command: FleetMessage
-    sender: Sender
+    sender: CommandSender
     verifier: Verifier | None
     since: float
 
@@ -98,7 +98,7 @@ class Commands:
         """Take nothing but stops from now on; None: take commands again."""
         self._closing, self._awaiting = reason, None
 
-    def _refuse(self, command: str, error: ZbridgeError, sender: Sender | None) -> None:
+    def _refuse(self, command: str, error: ZbridgeError, sender: CommandSender | None) -> None:
         refused = error if isinstance(error, Refused) else Malformed(str(error))
         self._enforcer.refuse(command, refused, refused.who or (sender.who if sender is not None else None))
 
@@ -110,7 +110,7 @@ class Commands:
             raise Unsupported("no such command")
         return topic
 
-    def _carry_out(self, topic: Topic, payload: bytes, now: float, sender: Sender | None) -> None:
+    def _carry_out(self, topic: Topic, payload: bytes, now: float, sender: CommandSender | None) -> None:
         if self._closing is not None:
             raise NotReady(self._closing, Code.CLOSING)
         command = payloads.decode(topic.message, payload)
@@ -143,7 +143,7 @@ class Commands:
             self._refuse(waiting.topic.path.removeprefix("@cmd/"), error, waiting.sender)
         self._enforcer.settle()
 
-    def _require_allowed(self, command: FleetMessage, sender: Sender | None) -> None:
+    def _require_allowed(self, command: FleetMessage, sender: CommandSender | None) -> None:
         """Raise Refused where a command that is no drive must not reach the robot now."""
         session = self.require_ready()
         self.require_flowing()
@@ -152,12 +152,12 @@ class Commands:
             _require_sure(session)
             self._enforcer.require_motion()
 
-    def _command(self, topic: Topic, command: FleetMessage, now: float, sender: Sender | None) -> None:
+    def _command(self, topic: Topic, command: FleetMessage, now: float, sender: CommandSender | None) -> None:
         self._show(topic, self._tell(topic, command, now), sender)
         self._enforcer.commanded(command)
         self._pump()
 
-    def _move(self, topic: Topic, command: Drive | Motor, now: float, sender: Sender) -> None:
+    def _move(self, topic: Topic, command: Drive | Motor, now: float, sender: CommandSender) -> None:
         """Tell the robot to move, or to stand: the robot is written to before anything is accounted for."""
         moving = command.moving
         if moving:
@@ -195,7 +195,7 @@ class Commands:
             raise self._context.faults.refusal(topic.path, error) from error
         return outcome
 
-    def _show(self, topic: Topic, outcome: Outcome, sender: Sender | None) -> None:
+    def _show(self, topic: Topic, outcome: Outcome, sender: CommandSender | None) -> None:
         for shown, message in outcome.telemetry:
             self._context.publish(shown, message)
         if outcome.left_out:

@@ -17,19 +17,17 @@ from typing import Any
 import msgspec
 
 from zbridge.bus import Bus, Handle
-from zbridge.control import clocks
 from zbridge.control.audit_log import Audit
 from zbridge.control.authority import Authority
-from zbridge.control.conditions import Conditions
-from zbridge.control.context import RobotContext
-from zbridge.control.enforcer import Enforcer, Keep
-from zbridge.control.faults import Faults
+from zbridge.control.context import Conditions, Faults, RobotContext, suspended_s
+from zbridge.control.enforcer import Enforcer, Save
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.control.lease_server import LeaseServer
 from zbridge.control.motion_limits import MotionLimits
 from zbridge.control.standstill import IDLE_STOP_S, STOP_REPEAT_S, Standstill
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_holder import raw_ms
 from zbridge.metrics import Metrics
 from zbridge.protocol.address import DeviceAddress
 from zbridge.protocol.kept import Budget, Exported
@@ -93,16 +91,16 @@ class Device:
         observer: Observer | None = None,
         clock: Callable[[], float] | None = None,
         clock_ns: Callable[[], int] = time.time_ns,
-        raw_ms: Callable[[], float] = clocks.raw_ms,
-        suspended_s: Callable[[], float] = clocks.suspended_s,
-        keep_latches: Keep = lambda latches: None,
+        raw_ms: Callable[[], float] = raw_ms,
+        suspended_s: Callable[[], float] = suspended_s,
+        keep_latches: Save = lambda latches: None,
         chance: Callable[[], float] = random.random,
         take_over: TakeOver = take_over,
     ) -> None:
         """Begin. share: of the processor, where the process serves other robots too.
 
         shared_address: gateways of other robots may connect to the same addresses. clock: seconds on the event loop's
-        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.clocks`. keep_latches: writes
+        time line. clock_ns: Unix time. raw_ms, suspended_s: see :mod:`zbridge.control.context`. keep_latches: writes
         the latched stops down. chance: 0 to 1. take_over: attaches a connection that another process handed over.
         """
         loop = asyncio.get_running_loop()
@@ -224,7 +222,7 @@ class Device:
         self._on_demand = self._on_demand or self._telemetry.serve()
         self._commanded = self._commanded or [
             *self._leases.serve(),
-            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.gate),
+            context.bus.subscribe(context.keys.key("@cmd/**"), self._commands.take, lane=self._enforcer.admission),
             *self._queries.serve(),
         ]
 

@@ -43,6 +43,7 @@ from zbridge.control.latch import LatchRecord
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Latch
 from zbridge.fleet.topics import KeySpace
+from zbridge.machine import step
 from zbridge.protocol.kept import Exported
 
 log = logging.getLogger("zbridge.app.gateway")
@@ -169,7 +170,7 @@ class Served(Protocol):
         """Serve the robot again."""
 
 
-class State(StrEnum):
+class OwnershipState(StrEnum):
     """How far a gateway has got with a robot."""
 
     LOOKING = "looking"
@@ -178,7 +179,7 @@ class State(StrEnum):
     YIELDED = "yielded"
 
 
-class Input(StrEnum):
+class OwnershipInput(StrEnum):
     """What a gateway found."""
 
     SEEN = "another gateway, or no bus"
@@ -213,7 +214,7 @@ class Ownership:
         self._mirror = mirror
         self._autonomous = autonomous
         self._chance = chance
-        self._state = State.LOOKING
+        self._state = OwnershipState.LOOKING
         self._looks = 1
         """Looks that must still find nobody."""
         self._claimed: list[Handle] = []
@@ -252,14 +253,14 @@ class Ownership:
         others, self._looks = _Others(self._keys.robot), 1
         while True:
             if self._bus_gone or await self._sees(others):
-                found = Input.SEEN
+                found = OwnershipInput.SEEN
             else:
-                found = Input.CLEAR if self._looks > 1 else Input.LAST_CLEAR
-            if self._handle(found) is State.CLAIMING:
+                found = OwnershipInput.CLEAR if self._looks > 1 else OwnershipInput.LAST_CLEAR
+            if self._handle(found) is OwnershipState.CLAIMING:
                 await asyncio.sleep(ANNOUNCE_S)
                 own = self._claim()
-                found = Input.OUTBID if self._better(own, await self._claims()) else Input.BEST
-                if self._handle(found) is State.OWNING:
+                found = OwnershipInput.OUTBID if self._better(own, await self._claims()) else OwnershipInput.BEST
+                if self._handle(found) is OwnershipState.OWNING:
                     self._close_until = others.close_until(self._clock())
                     return
             await asyncio.sleep(LOOK_S)
@@ -267,16 +268,16 @@ class Ownership:
     async def watch(self, served: Served) -> None:
         """Look for other gateways that serve the robot; return when the robot must be left to one of them."""
         self._standing, self._merge = lambda: served.standing, served.merge
-        if self._state is State.YIELDED:
+        if self._state is OwnershipState.YIELDED:
             await served.step_aside()
         self._untold = LOOKS
         while True:
             await self._next_look()
-            if not self.hands_over and not self._waits and await self._meet(served) is State.LOOKING:
+            if not self.hands_over and not self._waits and await self._meet(served) is OwnershipState.LOOKING:
                 log.error("another gateway serves %s: leaving it alone", self._keys.robot)
                 return
 
-    async def _meet(self, served: Served) -> State:
+    async def _meet(self, served: Served) -> OwnershipState:
         """Compare the own claim with those of others, and follow from it; return the new state."""
         own, state = self._claim(), self._state
         try:
@@ -287,18 +288,18 @@ class Ownership:
         if serving:
             goodbye = all(claim.leaving for claim in serving.values())
             self._close_until, self._looks = (-math.inf, 1) if goodbye else (math.inf, LOOKS)
-        elif state is State.YIELDED and not self._owner_gone():
+        elif state is OwnershipState.YIELDED and not self._owner_gone():
             return state
-        found = Input.BEST
+        found = OwnershipInput.BEST
         if self._better(own, serving):
-            found = Input.OUTBID_CONNECTED if served.must_stay else Input.OUTBID
-        if found is Input.OUTBID and self._keeps_latches(own):
+            found = OwnershipInput.OUTBID_CONNECTED if served.must_stay else OwnershipInput.OUTBID
+        if found is OwnershipInput.OUTBID and self._keeps_latches(own):
             return state
-        if self._handle(found) is State.LOOKING:
+        if self._handle(found) is OwnershipState.LOOKING:
             return self._state
         if self._state is not state:
             log.error("%s: %s", self._keys.robot, _TURNS[self._state])
-            await (served.step_in() if self._state is State.OWNING else served.step_aside())
+            await (served.step_in() if self._state is OwnershipState.OWNING else served.step_aside())
         served.heard(serving)
         return self._state
 
@@ -318,7 +319,7 @@ class Ownership:
         """Write the claim for a successor of this gateway; None where the robot is not owned."""
         if self._held_since is None:
             return None
-        yielded = self._state is State.YIELDED
+        yielded = self._state is OwnershipState.YIELDED
         return {"since": self._held_since, "yielded": yielded, "close_until": self._close_until}
 
     def inherit(self, claim: Exported) -> None:
@@ -329,9 +330,9 @@ class Ownership:
         self._waits = True
         self._announce()
         self._held_since, self._close_until = float(claim["since"]), float(claim["close_until"])
-        self._state = State.OWNING
+        self._state = OwnershipState.OWNING
         if claim["yielded"]:
-            self._handle(Input.OUTBID_CONNECTED)
+            self._handle(OwnershipInput.OUTBID_CONNECTED)
 
     def begin(self) -> None:
         """Note that the gateway before has gone."""
@@ -343,21 +344,18 @@ class Ownership:
 
     def release(self) -> None:
         """Withdraw the claim; idempotent."""
-        self._handle(Input.RELEASE)
+        self._handle(OwnershipInput.RELEASE)
 
     @property
     def yielded(self) -> bool:
         """Whether the robot is left to another gateway, while its connection is kept."""
-        return self._state is State.YIELDED
+        return self._state is OwnershipState.YIELDED
 
     # The machine
 
-    def _handle(self, found: Input) -> State:
+    def _handle(self, found: OwnershipInput) -> OwnershipState:
         """Carry out the table and return the new state. A pair that the table lacks changes nothing."""
-        entry = self.TABLE[self._state].get(found)
-        if entry is not None:
-            action, self._state = entry
-            action(self)
+        self._state, _ = step(self.TABLE, self._state, found, self)
         return self._state
 
     def _look_again(self) -> None:
@@ -413,7 +411,7 @@ class Ownership:
     async def _next_look(self) -> None:
         """Wait until it is time to look for others."""
         await asyncio.sleep(CLOSE_S)
-        if self._state is not State.YIELDED and self._clock() >= self._close_until:
+        if self._state is not OwnershipState.YIELDED and self._clock() >= self._close_until:
             await _within(WATCH_S - CLOSE_S, self._came, self._asked)
         if self._came.is_set() and not self._asked.is_set():
             await _within(self._chance() * SPREAD_S, self._asked)
@@ -459,7 +457,7 @@ class Ownership:
             held_s=max(self._clock() - self._held_since, 1e-3),
             healthy=standing.healthy,
             connected_s=standing.connected_s,
-            yielded=self._state is State.YIELDED or self._waits,
+            yielded=self._state is OwnershipState.YIELDED or self._waits,
             leaving=self._leaving,
             latches=standing.latches,
             autonomous=standing.autonomous,
@@ -475,33 +473,33 @@ class Ownership:
                 self._merge(LatchRecord(autonomous=True))
         question.answer(_write(self._claim()))
 
-    TABLE: ClassVar[dict[State, dict[Input, tuple[Callable[[Ownership], None], State]]]] = {
-        State.LOOKING: {
-            Input.SEEN: (_look_again, State.LOOKING),
-            Input.CLEAR: (_count, State.LOOKING),
-            Input.LAST_CLEAR: (_announce, State.CLAIMING),
+    TABLE: ClassVar[dict[OwnershipState, dict[OwnershipInput, tuple[Callable[[Ownership], None], OwnershipState]]]] = {
+        OwnershipState.LOOKING: {
+            OwnershipInput.SEEN: (_look_again, OwnershipState.LOOKING),
+            OwnershipInput.CLEAR: (_count, OwnershipState.LOOKING),
+            OwnershipInput.LAST_CLEAR: (_announce, OwnershipState.CLAIMING),
         },
-        State.CLAIMING: {
-            Input.BEST: (_own, State.OWNING),
-            Input.OUTBID: (_withdraw, State.LOOKING),
-            Input.RELEASE: (_withdraw, State.LOOKING),
+        OwnershipState.CLAIMING: {
+            OwnershipInput.BEST: (_own, OwnershipState.OWNING),
+            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),
+            OwnershipInput.RELEASE: (_withdraw, OwnershipState.LOOKING),
         },
-        State.OWNING: {
-            Input.OUTBID: (_withdraw, State.LOOKING),
-            Input.OUTBID_CONNECTED: (_hide, State.YIELDED),
-            Input.RELEASE: (_withdraw, State.LOOKING),
+        OwnershipState.OWNING: {
+            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),
+            OwnershipInput.OUTBID_CONNECTED: (_hide, OwnershipState.YIELDED),
+            OwnershipInput.RELEASE: (_withdraw, OwnershipState.LOOKING),
         },
-        State.YIELDED: {
-            Input.BEST: (_show, State.OWNING),
-            Input.OUTBID: (_withdraw, State.LOOKING),
-            Input.RELEASE: (_withdraw, State.LOOKING),
+        OwnershipState.YIELDED: {
+            OwnershipInput.BEST: (_show, OwnershipState.OWNING),
+            OwnershipInput.OUTBID: (_withdraw, OwnershipState.LOOKING),
+            OwnershipInput.RELEASE: (_withdraw, OwnershipState.LOOKING),
         },
     }
 
 
 _TURNS = {
-    State.OWNING: "no other gateway serves it better: serving it again",
-    State.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
+    OwnershipState.OWNING: "no other gateway serves it better: serving it again",
+    OwnershipState.YIELDED: "another gateway serves it: leaving the robot alone, and staying connected",
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from zbridge.bus import Bus, Publisher
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import KeySpace, Topic, find

@@ -19,7 +19,7 @@ from zbridge.app.handover.outgoing import Outgoing, Part
 from zbridge.app.handover.processes import PROCESSES, Processes
 from zbridge.app.handover.successor import Successor
 from zbridge.bus import Bus, Handle, IncomingQuery
-from zbridge.control.gate import NameGate
+from zbridge.control.admission import NameFilter
 from zbridge.control.latch_store import LatchStore
 from zbridge.errors import BusError, NotReady, Refused, Unsupported
 from zbridge.fleet import payload as payloads
@@ -111,7 +111,7 @@ class Restarts:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameGate(self._clock))
+        return bus.answer(self._keys.key("@rpc/restart/*"), take, lane=NameFilter(self._clock))
 
     async def _restart_for(self, question: IncomingQuery, bus: Bus) -> None:
         try:

@@ -14,10 +14,10 @@ from collections.abc import Callable, Container, Iterator
 import msgspec
 from foxglove.messages import LogLevel
 
-from zbridge.control.refusal_news import RefusalNews
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Control, FleetMessage, Image, Map, Pose, Scan, Status, Text
 from zbridge.fleet.topics import Topic
+from zbridge.lease.lease_events import RefusalNews
 from zbridge.views.pictures import drawing
 from zbridge.views.pictures.schemas import Schema, foxglove_schema, json_schema
 

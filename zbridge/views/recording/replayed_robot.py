@@ -17,7 +17,7 @@ import msgspec
 
 from zbridge.bus import Bus, Handle, IncomingQuery, Lane, Look, Publisher, Sample
 from zbridge.control.latch import STOPS, read_stop
-from zbridge.control.refusal_counts import RefusalCounts
+from zbridge.control.requests import RefusalCounts
 from zbridge.errors import NotReady, PayloadError, Unsupported
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics

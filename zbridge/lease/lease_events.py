@@ -1,8 +1,8 @@
-"""The lease client's states and inputs, the replies to its questions, and the events that come of them. Sans-IO."""
+"""The lease client's states and inputs, replies to its questions, and what a program is notified of. Sans-IO."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import TypeAlias
 
@@ -11,17 +11,21 @@ import msgspec
 from zbridge.bus import Answer
 from zbridge.errors import BusError, NotReady, PayloadError, Refused, TooFast, ZbridgeError, refusal
 from zbridge.fleet import payload as payloads
-from zbridge.fleet.messages import Lease
+from zbridge.fleet.messages import Control, Lease, Refusal
 
 Reply: TypeAlias = Lease | ZbridgeError | None
 """What a question came to: a lease, granted or not; the error instead of one; None: no gateway answered."""
 
 NO_ANSWER = "no gateway answers"
+NAMED = 64
+"""Characters of a name that are stored."""
+EXPLAINED = 200
+"""Characters of a refusal's reason that are stored."""
 _PASSING: tuple[str, ...] = (*NotReady.codes, *TooFast.codes)
 """Codes that do not decide whose the lease is."""
 
 
-class State(StrEnum):
+class LeaseState(StrEnum):
     """What a program has, and what it waits for."""
 
     FREE = "free"
@@ -36,8 +40,8 @@ class State(StrEnum):
     WANTED = "wanted"
 
 
-class Input(StrEnum):
-    """What the program wants, what was replied, and what is heard."""
+class LeaseInput(StrEnum):
+    """What the program wants, what was replied, and other news."""
 
     WANT = "want"
     DROP = "drop"
@@ -62,7 +66,7 @@ class LeaseEventKind(StrEnum):
 
 
 class LeaseEvent(msgspec.Struct, frozen=True):
-    """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if told.
+    """Something that the program must know. error: why the lease was denied or lost; holder: who has it, if known.
 
     unanswered: whether no gateway said so. expires_in_s: how long the holder's lease lasts at least. expired: whether a
     lost lease was not renewed in time.
@@ -77,7 +81,7 @@ class LeaseEvent(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, kind: LeaseEventKind, reply: Reply, *, expired: bool = False) -> LeaseEvent:
-        """Tell what was replied instead of a lease."""
+        """Make the event of a reply that is no lease."""
         if reply is None:
             return cls(kind, BusError(NO_ANSWER), unanswered=True, expired=expired)
         if isinstance(reply, Lease):
@@ -110,3 +114,29 @@ def code_of(reply: Reply) -> str | None:
 def passes(reply: Reply) -> bool:
     """Return whether this decides nothing about the lease: no reply, or a gateway that cannot say now."""
     return reply is None or code_of(reply) in _PASSING
+
+
+class RefusalNews:
+    """Returns each refusal that concerns a program once for each time its count changes.
+
+    concerns: whether a refusal is the program's own. What listeners report of their programs never is.
+    """
+
+    def __init__(self, concerns: Callable[[Refusal], bool]) -> None:
+        self._concerns = concerns
+        self._counts: dict[tuple[str | None, str, str, str], int] = {}
+
+    def __repr__(self) -> str:
+        return f"<RefusalNews, {len(self._counts)} known>"
+
+    def take(self, control: Control) -> list[Refusal]:
+        """Return what is new since the last call."""
+        news, counts = [], {}
+        for each in control.refusals:
+            if each.by is None and self._concerns(each):
+                key = (each.who, each.command, each.code, each.reason)
+                counts[key] = each.count
+                if each.count != self._counts.get(key, 0):
+                    news.append(each)
+        self._counts = counts
+        return news

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.proofs import packed, proof, shown
-from zbridge.control.proof import LEAST_BYTES, MOST_BYTES, NOTES, Signer, Verifier, read
 from zbridge.errors import Malformed, PayloadError
 from zbridge.fleet.messages import Authorization, Lease
+from zbridge.lease.proof import LEAST_BYTES, MOST_BYTES, NOTES, Signer, Verifier, read
 
 LEASE, TOKEN = bytes(range(8)), bytes(range(100, 132))
 GRANTED = Lease(ok=True, lease=LEASE, token=TOKEN, expires_in_s=3.0, holder="ann")

@@ -1,17 +1,33 @@
-"""The refusals that ``control`` shows, each different one with its count. Sans-IO."""
+"""Requests for the lease, within their bounds, and the refusals that ``control`` shows. Sans-IO."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 
-from zbridge.control.wishes import NAMED
-from zbridge.errors import Code, Refused
-from zbridge.fleet.messages import Refusal
+from zbridge.errors import Code, Malformed, Refused
+from zbridge.fleet.messages import Acquire, Refusal
+from zbridge.lease.lease_events import EXPLAINED, NAMED
 
+LEAST_S = 0.01
+"""The shortest lease or deadman that can be requested, seconds."""
 REFUSALS = 16
 """Different refusals that ``control`` shows; a new one replaces the one that was counted least recently."""
-EXPLAINED = 200
-"""Characters of a reason that are kept."""
+
+
+def name_of(request: Acquire) -> str:
+    """Return the name of who asks, shortened; raise Malformed if people cannot be shown it."""
+    if not request.who or not request.who.isprintable():
+        raise Malformed(f"who = {request.who[:NAMED]!r}: expected a name that others are shown")
+    return request.who[:NAMED]
+
+
+def capped(name: str, requested_s: float | None, most_s: float) -> float:
+    """Return the time requested, at most ``most_s``, which is also the default; raise Malformed if it is no time."""
+    if requested_s is None:
+        return most_s
+    if not requested_s >= LEAST_S:
+        raise Malformed(f"{name} = {requested_s:g}: expected at least {LEAST_S:g}")
+    return min(requested_s, most_s)
 
 
 class RefusalCounts:
@@ -33,7 +49,7 @@ class RefusalCounts:
         return Refusal(who=who, command=command, code=refused.code, reason=reason, count=total, by=by)
 
     def shown(self) -> tuple[Refusal, ...]:
-        """Return all refusals that are kept, the newest last."""
+        """Return all refusals that are shown, the newest last."""
         return tuple(
             Refusal(who=who, command=command, code=code, reason=reason, count=count, by=by)
             for (who, command, code, reason, by), count in self._counts.items()

@@ -10,17 +10,17 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
-from tests.control import decide
+from tests.lease import decide
 from tests.proofs import numbered
 from tests.tables import documented, executed
 from zbridge.bus import Answer
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import ASK_S, LEASE_S, LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
 from zbridge.errors import BusError, Code, NotReady
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import ASK_S, LEASE_S, LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
 
 KEYS = KeySpace("fleet", "r1")
 NOW = 100.0
@@ -93,7 +93,7 @@ class Program:
             self.now += float(step.removesuffix(" s"))
             self.lease.expire(self.now)
         elif step in CONTROLS:
-            assert self.lease.look(CONTROLS[step], self.now) == []
+            assert self.lease.read_control(CONTROLS[step], self.now) == []
         elif step == "renews":
             self.lease.renews = True
         elif step in ("want", "drop", "gateway lost"):
@@ -218,7 +218,7 @@ def test_a_refusal_of_its_own_is_news_each_time_it_is_counted_and_those_of_other
     rows = [("ann", None, 1, 1), ("ann", None, 1, 0), ("ann", None, 2, 1)]
     for who, by, count, news in (*rows, ("bob", None, 1, 0), (None, None, 1, 0), ("ann", "hq.toy", 1, 0)):
         refusal = Refusal(who=who, command="drive", code=Code.BUSY, reason="why", count=count, by=by)
-        assert lease.look(Control(state="held", refusals=(refusal,)), NOW) == [refusal] * news
+        assert lease.read_control(Control(state="held", refusals=(refusal,)), NOW) == [refusal] * news
 
 
 # Any course of events, against a gateway's own authority
@@ -256,7 +256,7 @@ class Holding(RuleBasedStateMachine):
 
     @rule()
     def show(self) -> None:
-        self.lease.look(self.authority.report(self.now), self.now)
+        self.lease.read_control(self.authority.report(self.now), self.now)
 
     @rule()
     def stop(self) -> None:

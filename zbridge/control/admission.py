@@ -1,15 +1,13 @@
-"""Gates choose for every sample and query whether it reaches the event loop, and by which lane.
+"""Admission filters choose for every sample and query whether it reaches the event loop, and with which priority.
 
-Gates run on Zenoh's threads; one thread calls each.
+Theory of operation. Filters run on Zenoh's threads; one thread calls each. Anybody on the bus may send as much as the
+network carries, so input that nobody has to obey must cost little: a filter drops it before the event loop wakes.
 
-Theory of operation. Anybody on the bus may send as much as the network carries. Input that nobody has to obey must cost
-little: a gate drops it before the event loop is woken.
-
-- A command that needs the lease is proven first. Only a proven command enters the lane COMMAND and uses up its number:
-  a sender that merely knows the public id of the lease fills no lane of the holder's and spoils none of its numbers.
+- A command that needs the lease is proven first. Only a proven command gets the priority COMMAND and uses up its
+  number: a sender that merely knows the lease's public id fills no queue of the holder's and spoils no number.
 - All other input is limited in rate. What passes is refused by the event loop with reason and sender. The rest is
   counted by code and shown once a second.
-- A stop is never refused. A stop that follows another within :data:`SAME_STOP_S`, for a robot at rest without a
+- A stop is never refused. A stop that follows another within :data:`SAME_STOP_S`, for a stopped robot without a
   holder, changes nothing and is only counted; one with an id of its own does, for ``control`` has to show the id.
 """
 
@@ -24,17 +22,17 @@ from msgspec import UNSET
 from zbridge.bus import Lane, Look
 from zbridge.control.authority import Authority
 from zbridge.control.latch import read_stop
-from zbridge.control.proof import read
 from zbridge.errors import Code, LeaseLost, Malformed, Refused, TooFast
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Mode, Motor, Raw
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.proof import read
 from zbridge.protocol.rate_limit import RateLimit
 
 OF_THE_HOLDER = (Drive, Motor, Mode, Raw)
 """Commands that move a robot, or may move it: they need the lease."""
 SHOWN_HZ = 20.0
-"""Refused samples or queries a second of each gate that reach the event loop, with reason and sender."""
+"""Refused samples or queries a second of each filter that reach the event loop, with reason and sender."""
 OPEN_HZ = 500.0
 """Commands a second that need no lease, all senders together."""
 NAME_HZ, ALL_NAMES_HZ = 20.0, 100.0
@@ -42,7 +40,7 @@ NAME_HZ, ALL_NAMES_HZ = 20.0, 100.0
 NAMES = 256
 """Names that are limited apart; one more replaces the name that asked longest ago."""
 SAME_STOP_S = 0.05
-"""Seconds within which a second stop changes nothing, for a robot at rest without a holder."""
+"""Seconds within which a second stop changes nothing, for a stopped robot without a holder."""
 _KEPT = 1024
 """Keys whose kind is remembered."""
 
@@ -55,7 +53,7 @@ def is_stop(key: str) -> bool:
     return key.endswith(_STOP_PATH)
 
 
-class Sieve:
+class RefusalLimit:
     """Lets ``rate_hz`` refused samples or queries through to the event loop, and counts the others by code.
 
     Zenoh's thread counts, the event loop's thread reads: no number is written by both.
@@ -65,10 +63,10 @@ class Sieve:
         self._allowance = RateLimit(rate_hz)
         self._clock = clock
         self._counted = dict.fromkeys(_REFUSALS, 0)
-        self._told = dict.fromkeys(_REFUSALS, 0)
+        self._reported = dict.fromkeys(_REFUSALS, 0)
 
     def __repr__(self) -> str:
-        return f"<Sieve {sum(self._counted.values())} kept back>"
+        return f"<RefusalLimit {sum(self._counted.values())} dropped>"
 
     def lane(self, code: Code) -> Lane | None:
         """Return the lane of a refused sample or query; None where it is only counted."""
@@ -81,10 +79,10 @@ class Sieve:
         """Count one that is dropped."""
         self._counted[code] += 1
 
-    def kept_back(self) -> Iterator[tuple[Refused, int]]:
+    def dropped(self) -> Iterator[tuple[Refused, int]]:
         """Yield what was counted since the last call; on the event loop's thread."""
         for code, total in self._counted.items():
-            count, self._told[code] = total - self._told[code], total
+            count, self._reported[code] = total - self._reported[code], total
             if count:
                 yield _REFUSALS[code], count
 
@@ -101,50 +99,53 @@ _STOP = _Kind(leased=False, most_bytes=0, stop=True)
 _UNKNOWN = _Kind(leased=False, most_bytes=topics.LARGE_BYTES)
 
 
-class _Prover:
-    """Tells new input of the holder's from all other input.
+class QueryFilter:
+    """Distinguishes new input of the holder's from all other input: its queries about the lease, each key on its own.
 
     notes: keep each proof for the event loop, which admits the command without proving it again.
     """
 
     def __init__(self, authority: Authority, clock: Clock, *, notes: bool = False) -> None:
         self._notes = notes
-        self.sieve = Sieve(SHOWN_HZ, clock)
+        self.refusals = RefusalLimit(SHOWN_HZ, clock)
         self._authority = authority
         self._newest = (b"", -1)
 
-    def prove(self, key: str, shown: bytes | None, look: Look) -> Lane | None:
-        """Choose the lane: COMMAND if the proof shows the holder as the sender and the number is new."""
+    def __repr__(self) -> str:
+        return f"<QueryFilter {self.refusals!r}>"
+
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
+        """Return COMMAND if the proof shows the holder as the sender and the number is new."""
         verifier = self._authority.verifier
         if shown is None or verifier is None or not verifier.plausible(shown):
-            return self.sieve.lane(Code.NO_LEASE)
+            return self.refusals.lane(Code.NO_LEASE)
         try:
-            said = read(shown)
+            authorization = read(shown)
         except Malformed:
-            return self.sieve.lane(Code.MALFORMED)
-        if said.lease != verifier.lease:
-            return self.sieve.lane(Code.NO_LEASE)
+            return self.refusals.lane(Code.MALFORMED)
+        if authorization.lease != verifier.lease:
+            return self.refusals.lane(Code.NO_LEASE)
         lease, seq = self._newest
-        if said.lease == lease and said.seq <= seq:
-            return self.sieve.lane(Code.OUT_OF_ORDER)
-        payload = look()
-        if not verifier.proves(said, key, payload):
-            return self.sieve.lane(Code.MALFORMED)
-        self._newest = (said.lease, said.seq)
+        if authorization.lease == lease and authorization.seq <= seq:
+            return self.refusals.lane(Code.OUT_OF_ORDER)
+        payload = read_payload()
+        if not verifier.proves(authorization, key, payload):
+            return self.refusals.lane(Code.MALFORMED)
+        self._newest = (authorization.lease, authorization.seq)
         if self._notes:
-            verifier.note(shown, said, key, payload)
+            verifier.note(shown, authorization, key, payload)
         return Lane.COMMAND
 
 
-class CommandGate:
+class CommandFilter:
     """Sorts the commands for one robot. ``clock``: seconds on the event loop's time line, from any thread."""
 
     def __init__(self, authority: Authority, keys: KeySpace, clock: Clock) -> None:
         self._authority = authority
         self._keys = keys
         self._clock = clock
-        self._prover = _Prover(authority, clock, notes=True)
-        self.sieve = self._prover.sieve
+        self._prover = QueryFilter(authority, clock, notes=True)
+        self.refusals = self._prover.refusals
         self._open = RateLimit(OPEN_HZ)
         self._kinds: dict[str, _Kind] = {}
         self._stopped_at = float("-inf")
@@ -152,19 +153,19 @@ class CommandGate:
         """Stops that were counted only."""
 
     def __repr__(self) -> str:
-        return f"<CommandGate {self._keys.robot} {self.sieve!r}>"
+        return f"<CommandFilter {self._keys.robot} {self.refusals!r}>"
 
-    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
         kind = self._kinds.get(key) or self._find(key)
         if kind.stop:
-            return self._stop(look() if size else b"")
+            return self._stop(read_payload() if size else b"")
         if size > kind.most_bytes:
-            return self.sieve.lane(Code.MALFORMED)
+            return self.refusals.lane(Code.MALFORMED)
         if kind.leased:
-            return self._prover.prove(key, shown, look)
+            return self._prover(key, shown, size, read_payload)
         if self._open.take(self._clock()):
             return Lane.OTHER
-        self.sieve.count(Code.RATE)
+        self.refusals.count(Code.RATE)
         return None
 
     def stopped(self) -> None:
@@ -172,7 +173,7 @@ class CommandGate:
         self._stopped_at = self._clock()
 
     def _stop(self, payload: bytes) -> Lane | None:
-        """Let a stop through unless it changes nothing. The holder is looked at last: a new one may come meanwhile."""
+        """Let a stop through unless it changes nothing. The holder is checked last: a new one may come meanwhile."""
         stop_id = read_stop(payload).id
         known = stop_id is UNSET or stop_id in self._authority.stop_ids
         fresh = self._clock() - self._stopped_at < SAME_STOP_S
@@ -196,33 +197,19 @@ class CommandGate:
         return _Kind(leased=topic.message in OF_THE_HOLDER, most_bytes=topic.most_bytes)
 
 
-class QueryGate:
-    """Sorts the holder's queries about the lease; each key has a gate and numbers of its own."""
-
-    def __init__(self, authority: Authority, clock: Clock) -> None:
-        self._prover = _Prover(authority, clock)
-        self.sieve = self._prover.sieve
-
-    def __repr__(self) -> str:
-        return f"<QueryGate {self.sieve!r}>"
-
-    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
-        return self._prover.prove(key, shown, look)
-
-
-class NameGate:
+class NameFilter:
     """Sorts queries for the lease: limits their rate by name (the last chunk of the key) and altogether."""
 
     def __init__(self, clock: Clock) -> None:
-        self.sieve = Sieve(0.0, clock)
+        self.refusals = RefusalLimit(0.0, clock)
         self._clock = clock
         self._all = RateLimit(ALL_NAMES_HZ)
         self._names: OrderedDict[str, RateLimit] = OrderedDict()
 
     def __repr__(self) -> str:
-        return f"<NameGate {len(self._names)} names, {self.sieve!r}>"
+        return f"<NameFilter {len(self._names)} names, {self.refusals!r}>"
 
-    def __call__(self, key: str, shown: bytes | None, size: int, look: Look) -> Lane | None:
+    def __call__(self, key: str, shown: bytes | None, size: int, read_payload: Look) -> Lane | None:
         now, name = self._clock(), key.rpartition("/")[2]
         own = self._names.get(name)
         if own is None:
@@ -233,7 +220,7 @@ class NameGate:
             self._names.move_to_end(name)
         if own.take(now) and self._all.take(now):
             return Lane.OTHER
-        self.sieve.count(Code.RATE)
+        self.refusals.count(Code.RATE)
         return None
 
 

@@ -4,24 +4,32 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 from msgspec import structs
 
 from zbridge.bus import Bus, Handle
-from zbridge.control.lease_client import LeaseClient, Question
-from zbridge.control.lease_events import LeaseEvent
 from zbridge.errors import BusError
 from zbridge.fleet.messages import Control, Refusal
+from zbridge.lease.lease_client import LeaseClient, Question
+from zbridge.lease.lease_events import LeaseEvent
+
+_RAW = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)
+
+
+def raw_ms() -> float:
+    """Return milliseconds of CLOCK_MONOTONIC_RAW, which no time service slews; from any thread."""
+    return time.clock_gettime_ns(_RAW) / 1e6
 
 
 class LeaseHolder:
     """Holds the lease of one robot for one program. All calls belong on the event loop's thread.
 
-    spawn: starts a task. on_event: told of every event of the lease, within the call that caused it or when an answer
-    comes. clock: seconds. The token named in ``request.alive`` is declared with the first question; it is taken back
-    after :meth:`close`, once nothing is asked any more.
+    spawn: starts a task. on_event: notified of every event of the lease, within the call that caused it or when
+    an answer comes. clock: seconds. The token named in ``request.alive`` is declared with the first question; it is
+    taken back after :meth:`close`, once nothing is asked any more.
     """
 
     def __init__(
@@ -79,9 +87,9 @@ class LeaseHolder:
         if token is not None:
             token.close()
 
-    def look(self, control: Control) -> list[Refusal]:
+    def read_control(self, control: Control) -> list[Refusal]:
         """Take news from ``control``; return what was refused to this program since the last call."""
-        news = self.client.look(control, self._clock())
+        news = self.client.read_control(control, self._clock())
         if self.client.free and control.holder == self.client.request.who:
             self._disown()
         self._settle()
@@ -110,7 +118,7 @@ class LeaseHolder:
     def _disown(self) -> None:
         """End a lease whose grant was lost on the way: without its token it ends at the gateway.
 
-        The next token has another name: the gateway may hear of the end of this one after the next lease was granted.
+        The next token has another name: the gateway may learn of the end of this one after the next lease was granted.
         """
         client = self.client
         self.withdraw()
@@ -119,7 +127,7 @@ class LeaseHolder:
             client.request = structs.replace(client.request, alive=f"{self._alive}.{self._disowned}")
 
     def _settle(self) -> None:
-        """Ask what the machine has to ask, and tell what it has to tell."""
+        """Ask what the machine has to ask, and notify the program."""
         question = self.client.question()
         if question is not None:
             self.announce()

@@ -1,6 +1,6 @@
 """Conditions: what status tells people of a robot that is served all the same."""
 
-from zbridge.control.conditions import Conditions
+from zbridge.control.context import Conditions
 
 
 def test_conditions_are_told_oldest_first_and_only_when_they_change() -> None:

@@ -10,10 +10,10 @@ RECALLED: as DROPPED, but the program wants the lease again. HELD: the lease is 
 ``release`` awaits its answer. WANTED: as RETURNING, and the program wants the lease again. Commands may be sent in
 HELD, CHECKING and DOUBTED.
 
-Who calls what. The caller (:class:`zbridge.control.lease_holder.LeaseHolder` on a bus) calls :meth:`want` and
-:meth:`drop` for the program, :meth:`look` for news from ``control``, :meth:`gateway_lost`, and :meth:`expire` at
-:meth:`deadline`. After each call it must ask :meth:`question` and handle :meth:`events`, and must pass the replies to
-:meth:`answered`.
+Who calls what. The caller (:class:`zbridge.lease.lease_holder.LeaseHolder` on a bus) calls :meth:`want` and
+:meth:`drop` for the program, :meth:`read_control` for news from ``control``, :meth:`gateway_lost`, and :meth:`expire`
+at :meth:`deadline`. After each call it must ask :meth:`question` and handle :meth:`events`, and must pass the replies
+to :meth:`answered`.
 
 Guarantees. At most one question is awaited. A reply to an earlier question changes nothing. A lease that is granted
 after :meth:`drop` is released. A lease that ends without :meth:`drop` causes exactly one LOST event.
@@ -28,14 +28,24 @@ from typing import ClassVar, TypeAlias
 import msgspec
 
 from zbridge.bus import Answer
-from zbridge.control.lease_events import Input, LeaseEvent, LeaseEventKind, Reply, State, code_of, passes, read
-from zbridge.control.proof import Signer
-from zbridge.control.refusal_news import RefusalNews
 from zbridge.errors import BusError, Code, PayloadError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Acquire, Control, Lease, Refusal
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_events import (
+    LeaseEvent,
+    LeaseEventKind,
+    LeaseInput,
+    LeaseState,
+    RefusalNews,
+    Reply,
+    code_of,
+    passes,
+    read,
+)
+from zbridge.lease.proof import Signer
+from zbridge.machine import step
 
 ASK_S = 1.0
 """The longest time that one question waits for its answer, seconds."""
@@ -55,7 +65,20 @@ class Question(msgspec.Struct, frozen=True):
     returns: bool = False
 
 
-Row: TypeAlias = dict[Input, tuple[Callable[..., None], State]]
+class _Cause(msgspec.Struct, frozen=True):
+    """What comes with an input of the table.
+
+    signer, lease_s: of a grant. expires_at: when a confirmed lease ends. event: what the program is notified of.
+    """
+
+    now: float
+    signer: Signer | None = None
+    lease_s: float | None = None
+    expires_at: float = math.inf
+    event: LeaseEvent | None = None
+
+
+Row: TypeAlias = dict[LeaseInput, tuple[Callable[["LeaseClient", _Cause], None], LeaseState]]
 
 
 class LeaseClient:
@@ -86,7 +109,7 @@ class LeaseClient:
         self.clock_ms = clock_ms
         self._acquire_key = keys.key((topics.RPC_TAKEOVER if takeover else topics.RPC_ACQUIRE)(name).path)
         self._wait_s = wait_s
-        self._state = State.FREE
+        self._state = LeaseState.FREE
         self._signer: Signer | None = None
         self._lease_s = LEASE_S
         self._expires_at = self._due_at = math.inf
@@ -94,7 +117,7 @@ class LeaseClient:
         self._waiting: Question | None = None
         self._unasked: Question | None = None
         self._later: Reply = None
-        """What the gateway said last when it could not decide."""
+        """The gateway's last reply that could not decide."""
         self._events: list[LeaseEvent] = []
 
     def __repr__(self) -> str:
@@ -108,7 +131,7 @@ class LeaseClient:
     @property
     def free(self) -> bool:
         """Whether there is no lease, and no question on its way."""
-        return self._state is State.FREE
+        return self._state is LeaseState.FREE
 
     def prove(self, key: str, payload: bytes, given_ms: float | None = None) -> bytes:
         """Return the attachment of the next command on this key; only while :attr:`held`.
@@ -125,31 +148,30 @@ class LeaseClient:
         self._later = None
         if self._wait_s is not None:
             self._wait_until = now + self._wait_s
-        self._handle(Input.WANT, now)
+        self._handle(LeaseInput.WANT, _Cause(now))
 
     def drop(self, now: float) -> None:
         """Release the lease, or stop asking for it."""
-        self._handle(Input.DROP, now)
+        self._handle(LeaseInput.DROP, _Cause(now))
 
-    # What is heard
+    # News
 
-    def look(self, control: Control, now: float) -> list[Refusal]:
+    def read_control(self, control: Control, now: float) -> list[Refusal]:
         """Take news from ``control``, and return what was refused to this program since the last call."""
         if self._signer is not None and control.lease != self._signer.lease:
-            self._handle(Input.DOUBT, now)
+            self._handle(LeaseInput.DOUBT, _Cause(now))
         news = []
         for refused in self.news.take(control):
             if refused.code != Code.LEASE_ENDED:
                 news.append(refused)
             elif refused.who is not None:  # of an earlier lease, or of this one: the gateway knows
-                self._handle(Input.DOUBT, now)
+                self._handle(LeaseInput.DOUBT, _Cause(now))
         return news
 
     def gateway_lost(self, now: float) -> None:
         """Record that the robot's gateway is gone, and every lease with it."""
-        self._handle(
-            Input.GATEWAY_LOST, now, LeaseEvent.of(LeaseEventKind.LOST, BusError("the robot's gateway is gone"))
-        )
+        event = LeaseEvent.of(LeaseEventKind.LOST, BusError("the robot's gateway is gone"))
+        self._handle(LeaseInput.GATEWAY_LOST, _Cause(now, event=event))
 
     def answered(self, question: Question, replied: Sequence[Answer] | BusError, now: float) -> None:
         """Take the replies to a question, or why it could not be asked."""
@@ -158,7 +180,7 @@ class LeaseClient:
         self._waiting = None
         reply = read(replied)
         if question.returns:
-            self._handle(Input.RETURNED, now)
+            self._handle(LeaseInput.RETURNED, _Cause(now))
         elif question.key == self._acquire_key:
             self._on_acquire_reply(reply, now)
         else:
@@ -168,14 +190,14 @@ class LeaseClient:
 
     def deadline(self) -> float | None:
         """Return when :meth:`expire` is next due; None: never."""
-        due = self._state is State.PAUSED or (self._state is State.HELD and self.renews)
+        due = self._state is LeaseState.PAUSED or (self._state is LeaseState.HELD and self.renews)
         return self._due_at if due else None
 
     def expire(self, now: float) -> None:
         """Do what is due: renew, or ask again."""
         deadline = self.deadline()
         if deadline is not None and now >= deadline:
-            self._handle(Input.DUE, now)
+            self._handle(LeaseInput.DUE, _Cause(now))
 
     def question(self) -> Question | None:
         """Return the question that must be asked now, once."""
@@ -196,144 +218,145 @@ class LeaseClient:
             except PayloadError as error:
                 reply = error
             else:
-                self._handle(Input.GRANTED, now, signer, reply.expires_in_s)
+                self._handle(LeaseInput.GRANTED, _Cause(now, signer, reply.expires_in_s))
                 return
         if passes(reply):
             self._later = reply = reply or self._later
             if now < self._wait_until:
-                self._handle(Input.LATER, now)
+                self._handle(LeaseInput.LATER, _Cause(now))
                 return
-        self._handle(Input.DENIED, now, LeaseEvent.of(LeaseEventKind.DENIED, reply))
+        self._handle(LeaseInput.DENIED, _Cause(now, event=LeaseEvent.of(LeaseEventKind.DENIED, reply)))
 
     def _on_renew_reply(self, question: Question, reply: Reply, now: float) -> None:
         confirmed = isinstance(reply, Lease) and reply.ok
         if confirmed or code_of(reply) == Code.OUT_OF_ORDER:  # somebody repeated the question, and was first with it
             expires_in_s = reply.expires_in_s if isinstance(reply, Lease) else None
-            self._handle(Input.CONFIRMED, now, question.asked_at + (expires_in_s or self._lease_s))
-        elif self._wait_s is None or (isinstance(reply, Lease) and not passes(reply)):
-            expired = now >= self._expires_at
-            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, reply, expired=expired))
-        elif now >= self._expires_at:
-            self._handle(Input.ENDED, now, LeaseEvent.of(LeaseEventKind.LOST, None, expired=True))
+            expires_at = question.asked_at + (expires_in_s or self._lease_s)
+            self._handle(LeaseInput.CONFIRMED, _Cause(now, expires_at=expires_at))
+            return
+        decided = self._wait_s is None or (isinstance(reply, Lease) and not passes(reply))
+        expired = now >= self._expires_at
+        if decided or expired:
+            event = LeaseEvent.of(LeaseEventKind.LOST, reply if decided else None, expired=expired)
+            self._handle(LeaseInput.ENDED, _Cause(now, event=event))
         else:
-            self._handle(Input.UNANSWERED, now)
+            self._handle(LeaseInput.UNANSWERED, _Cause(now))
 
     # The machine
 
-    def _handle(self, said: Input, *arguments: object) -> None:
-        """Carry out the table. A pair that it lacks changes nothing."""
-        entry = self.TABLE[self._state].get(said)
-        if entry is not None:
-            action, self._state = entry
-            action(self, *arguments)
+    def _handle(self, given: LeaseInput, cause: _Cause) -> None:
+        self._state, _ = step(self.TABLE, self._state, given, self, cause)
 
-    def _wait(self, now: float, *rest: object) -> None:
+    def _wait(self, cause: _Cause) -> None:
         """Do nothing before the answer comes."""
 
-    def _ask(self, now: float, *rest: object) -> None:
+    def _ask(self, cause: _Cause) -> None:
         """Ask for the lease."""
-        left_s = max(RETRY_S, self._wait_until - now) if self._wait_s is not None else ASK_S
+        left_s = max(RETRY_S, self._wait_until - cause.now) if self._wait_s is not None else ASK_S
         request = msgspec.structs.replace(self.request, t=int(self.clock_ms()))
-        self._put(Question(self._acquire_key, payloads.encode(request), min(ASK_S, left_s), now))
+        self._put(Question(self._acquire_key, payloads.encode(request), min(ASK_S, left_s), cause.now))
 
-    def _pause(self, now: float) -> None:
+    def _pause(self, cause: _Cause) -> None:
         """Ask again soon."""
-        self._due_at = min(now + RETRY_S, self._wait_until)
+        self._due_at = min(cause.now + RETRY_S, self._wait_until)
 
-    def _begin(self, now: float, signer: Signer, lease_s: float | None) -> None:
+    def _begin(self, cause: _Cause) -> None:
         """Hold the lease."""
-        self._signer, self._lease_s = signer, lease_s or LEASE_S
-        self._expires_at, self._due_at = now + self._lease_s, now + self._lease_s / 3
-        self._events.append(LeaseEvent(LeaseEventKind.GRANTED, expires_in_s=lease_s))
+        self._signer, self._lease_s = cause.signer, cause.lease_s or LEASE_S
+        self._extend(_Cause(cause.now, expires_at=cause.now + self._lease_s))
+        self._events.append(LeaseEvent(LeaseEventKind.GRANTED, expires_in_s=cause.lease_s))
 
-    def _tell(self, now: float, event: LeaseEvent) -> None:
-        """Tell the program why there is no lease."""
+    def _notify(self, cause: _Cause) -> None:
+        """Notify the program why there is no lease."""
+        assert cause.event is not None
         self._signer = None
-        self._events.append(event)
+        self._events.append(cause.event)
 
-    def _check(self, now: float, *rest: object) -> None:
+    def _check(self, cause: _Cause) -> None:
         """Renew the lease, or learn that it has ended."""
         assert self._signer is not None
         key = self.keys.key(topics.RPC_RENEW.path)
         timeout_s = ASK_S if self._wait_s is None else min(ASK_S, self._lease_s / 3)
-        self._put(Question(key, self._signer.renewal(key, int(self.clock_ms())), timeout_s, now))
+        self._put(Question(key, self._signer.renewal(key, int(self.clock_ms())), timeout_s, cause.now))
 
-    def _extend(self, now: float, expires_at: float) -> None:
+    def _extend(self, cause: _Cause) -> None:
         """Note how long the lease lasts at least."""
-        self._expires_at, self._due_at = expires_at, now + self._lease_s / 3
+        self._expires_at = cause.expires_at
+        self._renew_later(cause)
 
-    def _recheck(self, now: float, expires_at: float) -> None:
+    def _recheck(self, cause: _Cause) -> None:
         """Note how long the lease lasts at least, and renew it again."""
-        self._extend(now, expires_at)
-        self._check(now)
+        self._extend(cause)
+        self._check(cause)
 
-    def _bear(self, now: float) -> None:
-        """Renew later."""
-        self._due_at = now + self._lease_s / 3
+    def _renew_later(self, cause: _Cause) -> None:
+        """Renew in a third of the lease's length."""
+        self._due_at = cause.now + self._lease_s / 3
 
-    def _give_back(self, now: float, signer: Signer | None = None, lease_s: float | None = None) -> None:
+    def _give_back(self, cause: _Cause) -> None:
         """Release the lease."""
-        signer, self._signer = signer or self._signer, None
+        signer, self._signer = cause.signer or self._signer, None
         assert signer is not None
         key = self.keys.key(topics.RPC_RELEASE.path)
-        self._put(Question(key, signer.release(key), ASK_S, now, returns=True))
+        self._put(Question(key, signer.release(key), ASK_S, cause.now, returns=True))
 
     def _put(self, question: Question) -> None:
         self._waiting = self._unasked = question
 
     _HELD: ClassVar[Row] = {
-        Input.DROP: (_give_back, State.RETURNING),
-        Input.GATEWAY_LOST: (_tell, State.FREE),
-        Input.ENDED: (_tell, State.FREE),
+        LeaseInput.DROP: (_give_back, LeaseState.RETURNING),
+        LeaseInput.GATEWAY_LOST: (_notify, LeaseState.FREE),
+        LeaseInput.ENDED: (_notify, LeaseState.FREE),
     }
-    TABLE: ClassVar[dict[State, Row]] = {
-        State.FREE: {
-            Input.WANT: (_ask, State.ASKING),
+    TABLE: ClassVar[dict[LeaseState, Row]] = {
+        LeaseState.FREE: {
+            LeaseInput.WANT: (_ask, LeaseState.ASKING),
         },
-        State.ASKING: {
-            Input.GRANTED: (_begin, State.HELD),
-            Input.DENIED: (_tell, State.FREE),
-            Input.LATER: (_pause, State.PAUSED),
-            Input.DROP: (_wait, State.DROPPED),
-            Input.GATEWAY_LOST: (_tell, State.DROPPED),
+        LeaseState.ASKING: {
+            LeaseInput.GRANTED: (_begin, LeaseState.HELD),
+            LeaseInput.DENIED: (_notify, LeaseState.FREE),
+            LeaseInput.LATER: (_pause, LeaseState.PAUSED),
+            LeaseInput.DROP: (_wait, LeaseState.DROPPED),
+            LeaseInput.GATEWAY_LOST: (_notify, LeaseState.DROPPED),
         },
-        State.DROPPED: {
-            Input.WANT: (_wait, State.RECALLED),
-            Input.GRANTED: (_give_back, State.RETURNING),
-            Input.DENIED: (_wait, State.FREE),
-            Input.LATER: (_wait, State.FREE),
+        LeaseState.DROPPED: {
+            LeaseInput.WANT: (_wait, LeaseState.RECALLED),
+            LeaseInput.GRANTED: (_give_back, LeaseState.RETURNING),
+            LeaseInput.DENIED: (_wait, LeaseState.FREE),
+            LeaseInput.LATER: (_wait, LeaseState.FREE),
         },
-        State.RECALLED: {
-            Input.GRANTED: (_begin, State.HELD),
-            Input.DENIED: (_ask, State.ASKING),
-            Input.LATER: (_ask, State.ASKING),
-            Input.DROP: (_wait, State.DROPPED),
-            Input.GATEWAY_LOST: (_tell, State.DROPPED),
+        LeaseState.RECALLED: {
+            LeaseInput.GRANTED: (_begin, LeaseState.HELD),
+            LeaseInput.DENIED: (_ask, LeaseState.ASKING),
+            LeaseInput.LATER: (_ask, LeaseState.ASKING),
+            LeaseInput.DROP: (_wait, LeaseState.DROPPED),
+            LeaseInput.GATEWAY_LOST: (_notify, LeaseState.DROPPED),
         },
-        State.PAUSED: {
-            Input.DUE: (_ask, State.ASKING),
-            Input.DROP: (_wait, State.FREE),
-            Input.GATEWAY_LOST: (_tell, State.FREE),
+        LeaseState.PAUSED: {
+            LeaseInput.DUE: (_ask, LeaseState.ASKING),
+            LeaseInput.DROP: (_wait, LeaseState.FREE),
+            LeaseInput.GATEWAY_LOST: (_notify, LeaseState.FREE),
         },
-        State.HELD: _HELD | {Input.DOUBT: (_check, State.CHECKING), Input.DUE: (_check, State.CHECKING)},
-        State.CHECKING: _HELD
+        LeaseState.HELD: _HELD
+        | {LeaseInput.DOUBT: (_check, LeaseState.CHECKING), LeaseInput.DUE: (_check, LeaseState.CHECKING)},
+        LeaseState.CHECKING: _HELD
         | {
-            Input.DOUBT: (_wait, State.DOUBTED),
-            Input.CONFIRMED: (_extend, State.HELD),
-            Input.UNANSWERED: (_bear, State.HELD),
+            LeaseInput.DOUBT: (_wait, LeaseState.DOUBTED),
+            LeaseInput.CONFIRMED: (_extend, LeaseState.HELD),
+            LeaseInput.UNANSWERED: (_renew_later, LeaseState.HELD),
         },
-        State.DOUBTED: _HELD
+        LeaseState.DOUBTED: _HELD
         | {
-            Input.CONFIRMED: (_recheck, State.CHECKING),
-            Input.UNANSWERED: (_check, State.CHECKING),
+            LeaseInput.CONFIRMED: (_recheck, LeaseState.CHECKING),
+            LeaseInput.UNANSWERED: (_check, LeaseState.CHECKING),
         },
-        State.RETURNING: {
-            Input.WANT: (_wait, State.WANTED),
-            Input.RETURNED: (_wait, State.FREE),
+        LeaseState.RETURNING: {
+            LeaseInput.WANT: (_wait, LeaseState.WANTED),
+            LeaseInput.RETURNED: (_wait, LeaseState.FREE),
         },
-        State.WANTED: {
-            Input.RETURNED: (_ask, State.ASKING),
-            Input.DROP: (_wait, State.RETURNING),
-            Input.GATEWAY_LOST: (_tell, State.RETURNING),
+        LeaseState.WANTED: {
+            LeaseInput.RETURNED: (_ask, LeaseState.ASKING),
+            LeaseInput.DROP: (_wait, LeaseState.RETURNING),
+            LeaseInput.GATEWAY_LOST: (_notify, LeaseState.RETURNING),
         },
     }

@@ -7,18 +7,18 @@ from collections.abc import Coroutine
 from typing import Any
 
 from tests.clock import jumping
-from tests.control import decide
+from tests.lease import decide
 from tests.proofs import numbered
 from zbridge.bus import IncomingQuery
 from zbridge.bus.fake import FakeBus
 from zbridge.control.authority import Authority
-from zbridge.control.lease_client import LeaseClient
-from zbridge.control.lease_events import LeaseEvent, LeaseEventKind
-from zbridge.control.lease_holder import LeaseHolder
 from zbridge.errors import BusError
 from zbridge.fleet import payload as payloads
 from zbridge.fleet.messages import Acquire
 from zbridge.fleet.topics import KeySpace
+from zbridge.lease.lease_client import LeaseClient
+from zbridge.lease.lease_events import LeaseEvent, LeaseEventKind
+from zbridge.lease.lease_holder import LeaseHolder
 
 KEYS = KeySpace("fleet", "r1")
 TOKEN = "operator.ann.1"
@@ -82,7 +82,7 @@ async def test_a_lease_that_control_shows_and_nobody_knows_of_loses_its_token() 
     scene = Scene()
     scene.holder.announce()
     scene.authority.acquire(Acquire(who="ann"), scene.loop.time())
-    scene.holder.look(scene.authority.report(scene.loop.time()))
+    scene.holder.read_control(scene.authority.report(scene.loop.time()))
     assert await scene.tokens() == []
     scene.authority.stop("its token is lost")
     scene.holder.want()

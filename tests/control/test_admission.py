@@ -11,9 +11,9 @@ import pytest
 
 from tests.proofs import Holder, lease, numbered, packed, shown
 from zbridge.bus import Lane
-from zbridge.control import gate as gates
+from zbridge.control import admission
+from zbridge.control.admission import OPEN_HZ, SHOWN_HZ, CommandFilter, NameFilter, QueryFilter, RefusalLimit
 from zbridge.control.authority import Authority
-from zbridge.control.gate import OPEN_HZ, SHOWN_HZ, CommandGate, NameGate, QueryGate, Sieve
 from zbridge.errors import Code, Refused
 from zbridge.fleet.messages import Acquire
 from zbridge.fleet.topics import KeySpace
@@ -24,17 +24,17 @@ FORWARD = packed({"forward": 0.5})
 FLOOD = 1000
 
 
-def kept_back(sieve: Sieve) -> dict[Code, int]:
-    return {refusal.code: count for refusal, count in sieve.kept_back()}
+def dropped(limit: RefusalLimit) -> dict[Code, int]:
+    return {refusal.code: count for refusal, count in limit.dropped()}
 
 
 class Rig:
-    """A robot's authority, which gave its lease, and its gates, at a time that stands still."""
+    """A robot's authority, which gave its lease, and its filters, at a time that stands still."""
 
     def __init__(self, *, held: bool = True) -> None:
         self.now = 100.0
         self.authority = Authority(3.0, 2.0, numbered())
-        self.gate = CommandGate(self.authority, KeySpace("fleet", "r1"), lambda: self.now)
+        self.filter = CommandFilter(self.authority, KeySpace("fleet", "r1"), lambda: self.now)
         self._leases = itertools.count(1)
         self.held = self.grant() if held else lease(1)
 
@@ -43,7 +43,7 @@ class Rig:
         return lease(next(self._leases))
 
     def command(self, attachment: bytes | None, payload: bytes = FORWARD, key: str = DRIVE) -> Lane | None:
-        return self.gate(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
+        return self.filter(key, attachment, len(payload) + len(attachment or b""), lambda: payload)
 
     def drive(self) -> Lane | None:
         return self.command(self.held.attachment("drive", FORWARD))
@@ -64,8 +64,8 @@ FEW = {Lane.OTHER: int(SHOWN_HZ), None: FLOOD - int(SHOWN_HZ)}
 def test_of_what_cannot_be_a_proof_a_few_a_second_are_shown_and_the_others_counted(attachment, key) -> None:
     rig = Rig()
     assert rig.flood([attachment] * FLOOD, key) == FEW
-    assert kept_back(rig.gate.sieve) == {Code.NO_LEASE: FEW[None]}
-    assert kept_back(rig.gate.sieve) == {}
+    assert dropped(rig.filter.refusals) == {Code.NO_LEASE: FEW[None]}
+    assert dropped(rig.filter.refusals) == {}
     rig.now += 1.0
     assert rig.flood([attachment] * FLOOD, key) == FEW
     assert rig.drive() is Lane.COMMAND, "the holder's goes by its own lane all the same"
@@ -74,7 +74,7 @@ def test_of_what_cannot_be_a_proof_a_few_a_second_are_shown_and_the_others_count
 def test_neither_a_lease_that_was_not_granted_nor_the_lease_before_goes_by_the_holders_lane() -> None:
     rig = Rig(held=False)
     assert rig.flood(rig.held.attachment("drive", FORWARD) for _ in range(FLOOD)) == FEW
-    assert kept_back(rig.gate.sieve) == {Code.NO_LEASE: FEW[None]}
+    assert dropped(rig.filter.refusals) == {Code.NO_LEASE: FEW[None]}
     rig = Rig()
     former, rig.held.seq = rig.held, 10**6
     assert rig.drive() is Lane.COMMAND
@@ -89,7 +89,7 @@ def test_who_knows_the_leases_id_or_overheard_a_command_neither_fills_the_holder
     assert rig.command(overheard) is Lane.COMMAND
     assert rig.flood(rig.forged(2**63 + number) for number in range(FLOOD)) == FEW
     assert rig.flood([overheard] * FLOOD) == {None: FLOOD}
-    assert kept_back(rig.gate.sieve) == {Code.MALFORMED: FEW[None], Code.OUT_OF_ORDER: FLOOD}
+    assert dropped(rig.filter.refusals) == {Code.MALFORMED: FEW[None], Code.OUT_OF_ORDER: FLOOD}
     assert rig.drive() is Lane.COMMAND
 
 
@@ -112,7 +112,7 @@ def test_a_command_that_is_larger_than_its_key_allows_is_refused_whoever_proves_
     assert rig.drive() is Lane.COMMAND
     assert rig.command(None, bytes(70_000), "fleet/r1/@cmd/scan") is Lane.OTHER
     assert {rig.command(None, large) for _ in range(FLOOD)} == {Lane.OTHER, None}
-    assert set(kept_back(rig.gate.sieve)) == {Code.MALFORMED}
+    assert set(dropped(rig.filter.refusals)) == {Code.MALFORMED}
 
 
 @pytest.mark.parametrize("name", ["light", "fly", "*", "sensor/front"])
@@ -120,7 +120,7 @@ def test_commands_that_need_no_lease_have_a_rate_and_cost_the_holder_none_of_its
     rig = Rig()
     lanes = rig.flood([None] * FLOOD, f"fleet/r1/@cmd/{name}")
     assert lanes == {Lane.OTHER: OPEN_HZ, None: FLOOD - OPEN_HZ}
-    assert kept_back(rig.gate.sieve) == {Code.RATE: FLOOD - OPEN_HZ}
+    assert dropped(rig.filter.refusals) == {Code.RATE: FLOOD - OPEN_HZ}
     assert rig.drive() is Lane.COMMAND
 
 
@@ -132,11 +132,11 @@ def test_every_stop_is_let_through_until_one_was_carried_out_just_now(key: str) 
     rig = Rig()
     assert {rig.command(None, bytes(10_000), key) for _ in range(FLOOD)} == {Lane.STOP}
     rig.authority.stop("stop")
-    rig.gate.stopped()
+    rig.filter.stopped()
     assert rig.flood([None] * FLOOD, key) == {None: FLOOD}
-    assert rig.gate.same_stops == FLOOD
-    assert kept_back(rig.gate.sieve) == {}, "nobody was refused anything"
-    rig.now += 2 * gates.SAME_STOP_S
+    assert rig.filter.same_stops == FLOOD
+    assert dropped(rig.filter.refusals) == {}, "nobody was refused anything"
+    rig.now += 2 * admission.SAME_STOP_S
     assert rig.command(None, key=key) is Lane.STOP
 
 
@@ -144,7 +144,7 @@ def test_every_stop_is_let_through_until_one_was_carried_out_just_now(key: str) 
 def test_a_stop_right_after_a_stop_is_let_through_where_the_robot_is_held_or_may_move_again(happens) -> None:
     rig = Rig()
     rig.authority.stop("stop")
-    rig.gate.stopped()
+    rig.filter.stopped()
     assert rig.command(None, key=STOP) is None
     happens(rig)
     assert rig.command(None, key=STOP) is Lane.STOP
@@ -155,24 +155,24 @@ def test_a_stop_right_after_a_stop_is_let_through_where_the_robot_is_held_or_may
 
 def test_the_holders_questions_are_told_from_everybody_elses() -> None:
     rig = Rig()
-    gate = QueryGate(rig.authority, lambda: rig.now)
-    lanes = Counter(gate(RENEW, question, 0, bytes) for question in [None, b"", rig.forged(2**60)] * FLOOD)
+    filter_ = QueryFilter(rig.authority, lambda: rig.now)
+    lanes = Counter(filter_(RENEW, question, 0, bytes) for question in [None, b"", rig.forged(2**60)] * FLOOD)
     assert lanes == {Lane.OTHER: SHOWN_HZ, None: 3 * FLOOD - SHOWN_HZ}
     question = rig.held.question("renew")
-    assert gate(RENEW, question, 0, bytes) is Lane.COMMAND
-    assert gate(RENEW, question, 0, bytes) is None
-    assert sum(kept_back(gate.sieve).values()) == 3 * FLOOD - SHOWN_HZ + 1
+    assert filter_(RENEW, question, 0, bytes) is Lane.COMMAND
+    assert filter_(RENEW, question, 0, bytes) is None
+    assert sum(dropped(filter_.refusals).values()) == 3 * FLOOD - SHOWN_HZ + 1
 
 
 def test_who_asks_too_often_for_a_lease_costs_only_its_own_name_and_many_names_have_a_rate_together() -> None:
     now = 100.0
-    gate = NameGate(lambda: now)
-    lanes = Counter(gate(ACQUIRE + "noise", None, 0, bytes) for _ in range(FLOOD))
-    assert lanes == {Lane.OTHER: gates.NAME_HZ, None: FLOOD - gates.NAME_HZ}
-    assert gate(ACQUIRE + "ann", None, 0, bytes) is Lane.OTHER
-    assert kept_back(gate.sieve) == {Code.RATE: FLOOD - gates.NAME_HZ}
+    filter_ = NameFilter(lambda: now)
+    lanes = Counter(filter_(ACQUIRE + "noise", None, 0, bytes) for _ in range(FLOOD))
+    assert lanes == {Lane.OTHER: admission.NAME_HZ, None: FLOOD - admission.NAME_HZ}
+    assert filter_(ACQUIRE + "ann", None, 0, bytes) is Lane.OTHER
+    assert dropped(filter_.refusals) == {Code.RATE: FLOOD - admission.NAME_HZ}
     now += 2.0
-    assert gate(ACQUIRE + "noise", None, 0, bytes) is Lane.OTHER
-    lanes = Counter(gate(f"{ACQUIRE}n{number}", None, 0, bytes) for number in range(FLOOD))
-    assert lanes[Lane.OTHER] == gates.ALL_NAMES_HZ - 1
-    assert len(gate._names) == gates.NAMES, "the others are forgotten"
+    assert filter_(ACQUIRE + "noise", None, 0, bytes) is Lane.OTHER
+    lanes = Counter(filter_(f"{ACQUIRE}n{number}", None, 0, bytes) for number in range(FLOOD))
+    assert lanes[Lane.OTHER] == admission.ALL_NAMES_HZ - 1
+    assert len(filter_._names) == admission.NAMES, "the others are forgotten"

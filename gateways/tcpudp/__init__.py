@@ -1,17 +1,18 @@
 """The TCP/UDP package protocol: an HQ program with a joystick, a lidar, a SLAM map.
 
-``messages`` declares the packets, ``settings`` the settings blocks, ``versions`` the versions; ``session`` holds
-the conversation in both roles; ``translate`` is the device side, ``hq`` and ``maps`` the HQ side. ``simulator`` is a
-simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
+``messages`` declares the packets, ``settings`` the settings blocks and versions; ``session`` holds the conversation in
+both roles; ``translate`` and ``telemetry`` are the device side, ``hq``, ``hq_client`` and ``maps`` the HQ side,
+``options`` the options of both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed
+ones, which share no code with the rest.
 """
 
 from __future__ import annotations
 
-from gateways.tcpudp.hq import HqOptions, TcpUdpHq
+from gateways.tcpudp.hq import TcpUdpHq
 from gateways.tcpudp.messages import codecs
-from gateways.tcpudp.settings import HQ_BLOCKS
-from gateways.tcpudp.translate import NAME, Options, TcpUdpRobot
-from gateways.tcpudp.versions import VERSIONS
+from gateways.tcpudp.options import NAME, HqOptions, Options
+from gateways.tcpudp.settings import HQ_BLOCKS, VERSIONS
+from gateways.tcpudp.translate import TcpUdpRobot
 from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\

@@ -33,9 +33,9 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.session import RobotRole, limits
-from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
-from gateways.tcpudp.versions import VERSIONS
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.robot_role import RobotRole
+from gateways.tcpudp.settings import ROBOT_BLOCKS, VERSIONS, Feature, RobotSettings13, Settings
 from zbridge.protocol import ClientIds, Session, Simulation
 from zbridge.simulation.simulator import STEP_S, Simulator
 from zbridge.simulation.world import Body, Grid, cast

@@ -25,7 +25,8 @@ from typing import Any
 
 import msgpack
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import Options
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.clock import JumpingLoop
 from tests.proofs import Holder, numbered, packed
 from zbridge.bus import Handle, IncomingQuery, Lane, Sample

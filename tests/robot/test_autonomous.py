@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import Options
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.robot.scene import SETTINGS, STOP, Rig, established, serving
 from zbridge.control.latch import Latches, LatchRecord
 from zbridge.robot.commands import WRITE_S

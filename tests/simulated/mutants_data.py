@@ -25,7 +25,7 @@ OWNERSHIP = "zbridge/robot/ownership.py"
 COMMANDS = "zbridge/robot/commands.py"
 DEVICE = "zbridge/robot/device.py"
 STANDSTILL = "zbridge/control/standstill.py"
-TCPUDP = "gateways/tcpudp/translate/robot.py"
+TCPUDP = "gateways/tcpudp/translate.py"
 PRESENCE = "zbridge/robot/presence.py"
 
 MUTANTS = (

@@ -1,9 +1,11 @@
-"""The gateway plays HQ towards one robot: what may be sent, and what must arrive. Sans-IO.
+"""The gateway plays HQ towards one robot: which packets may be sent, and when they are repeated. Sans-IO.
 
 Source: "The gateway as HQ" and "Translation" of the protocol page. The handshake is :mod:`.hq_handshake`.
 
-Robots of 1.1 and 1.2 misread a tenth of what they get: what is sent once and matters (mode, lidar) is sent to them
-again after :data:`AGAIN_S`. A stop cancels these repetitions, and takes back what might move the robot after it.
+An unregistered packet id crashes a robot: :meth:`HqRole.may_send` checks each kind of packet against the settings that
+the robot announced. Robots of 1.1 and 1.2 misread a tenth of the packets: a packet that is sent once and matters (mode,
+lidar) is sent to them again after :data:`AGAIN_S`. A stop cancels these repetitions, and withdraws every packet that
+might move the robot after it.
 """
 
 from __future__ import annotations
@@ -19,13 +21,12 @@ from gateways.tcpudp.messages import (
     ClientGetSLAMMap,
     ClientLidarMode,
     DebugMessage,
+    OpaquePacket,
     Packet,
 )
 from gateways.tcpudp.session.hq_handshake import HqHandshake
-from gateways.tcpudp.session.registered import Registered
-from gateways.tcpudp.settings import Feature
-from gateways.tcpudp.versions import ANNOUNCED
-from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed, Spare
+from gateways.tcpudp.settings import ANNOUNCED, Feature
+from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed, Spare, Unsupported
 
 MAX_WRITE = 4096
 """Bytes of the longest packet a deployed robot reads whole."""
@@ -68,7 +69,9 @@ class HqRole(HqHandshake):
         super().__init__(limits, udp=udp, announce=announce, signs=signs)
         self.sent_autonomous: bool = predecessor is not None and predecessor.sent_autonomous
         """Whether the robot was ever sent mode 3; outlives connections. No packet shows that another mode ended it."""
-        self._registered = Registered(force)
+        self._force = frozenset(force)
+        self._registered: set[type[Packet]] = set()
+        """Classes of packets that the robot's settings were found to allow."""
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
         self._raw: deque[bytes] = deque(maxlen=LIMIT)
@@ -86,7 +89,23 @@ class HqRole(HqHandshake):
 
     def may_send(self, message: Packet) -> None:
         """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
-        self._registered.check(message, self.settings, self._agreed)
+        if type(message) in self._registered:
+            return
+        if isinstance(message, OpaquePacket):
+            if message.id not in self._force:
+                raise Unsupported(f"packet {message.id} may crash the robot; list it in options.force if it knows it")
+            return
+        spec = message.spec
+        if spec.id in self._force or not spec.features or not self._force.isdisjoint(spec.features):
+            return
+        # Of several features the first one that the robot's version has a flag for decides.
+        feature = next((feature for feature in spec.features if hasattr(self.settings, feature.value)), None)
+        if feature is None:
+            names = " or ".join(feature.value for feature in spec.features)
+            raise Unsupported(f"{spec.name}: version {self._agreed} has no {names}")
+        if not getattr(self.settings, feature.value):
+            raise Unsupported(f"{spec.name}: the robot does not announce {feature.value}")
+        self._registered.add(type(message))
 
     @property
     def misreads(self) -> bool:

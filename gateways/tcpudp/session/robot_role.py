@@ -1,13 +1,25 @@
-"""The gateway plays the robot towards one HQ program. Sans-IO.
+"""The gateway plays the robot towards one HQ program, and decides whose datagrams are that program's. Sans-IO.
 
 Source: "Handshake", "Settings and version negotiation" and "The gateway as robot" of the protocol page.
 
 Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
 :class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
-steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only; :class:`ClientSource`
-decides whose they are. The client's 7 never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3
-always send it. A program that gets a 6 sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 tells that
-the program got no 6: the 5 may have been somebody else's, and the source is dropped.
+steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only. The client's 7 never makes
+a source: 7(false) is reliable, 7(true) is not, as programs of 1.3 always send it. A program that gets a 6 sends its 7
+at once. So a 7 later than :data:`PROBE_S` after the 4 tells that the program got no 6: the 5 may have been somebody
+else's, and the source is dropped.
+
+Any process of the HQ program's host can send datagrams, and they tell nothing but their source. A port becomes the
+client's source in two ways only:
+
+- by a 5 between our 4 and its 7 (:meth:`ClientSource.claims_probe`). If a second port sends a 5 too, the session takes
+  datagrams of neither;
+- after the handshake, while the client has no source, by a packet with its id from the port that deployed programs bind
+  (:meth:`ClientSource.claims_late`): a program of 1.3 whose 5 was lost sends 11, 12 and 61 by UDP all the same. If it
+  has another source then, one of the two is not the client, and the session takes datagrams of neither any more.
+
+The session calls :meth:`ClientSource.bind` with the first datagram that it is given, and :meth:`ClientSource.lose` when
+a rival shows up.
 """
 
 from __future__ import annotations
@@ -27,16 +39,16 @@ from gateways.tcpudp.messages import (
     ServerSettings,
     ServerStartUDP,
     ServerUDPConnection,
+    read_header,
 )
-from gateways.tcpudp.session.packets import PacketSession, id_of
-from gateways.tcpudp.session.source import CLIENT_PORT, FROM_HQ, ClientSource
-from gateways.tcpudp.settings import HQ_BLOCKS, SETTINGS, Settings, read_settings
-from gateways.tcpudp.versions import LISTED, VERSIONS
+from gateways.tcpudp.session import Decode, PacketSession, decoders, id_of
+from gateways.tcpudp.settings import HQ_BLOCKS, LISTED, SETTINGS, VERSIONS, Settings, read_settings
 from zbridge.protocol import (
     FRAME,
     Datagram,
     Exported,
     Handshake,
+    Kept,
     Limits,
     NotReady,
     ProtocolError,
@@ -47,6 +59,77 @@ from zbridge.protocol import (
     newest,
     parse_versions,
 )
+
+CLIENT_PORT = 11000
+"""The UDP port that deployed HQ programs bind."""
+FROM_HQ: dict[int, Decode] = decoders(Role.ROBOT)
+"""How to read what an HQ program may send, by packet id."""
+_UNASSIGNED = (0, SERVER_ID)
+"""The ``id`` bytes that no client is given."""
+_NO_HEADER = (-1, -1)
+_PROBE = ClientUDPConnection.spec.id
+
+
+class ClientSource(Kept):
+    """The source of one client's datagrams. ``client_port``: the UDP port that it is known to bind; 0: none."""
+
+    kept: ClassVar[dict[str, Any]] = {"bound": bool, "_port": int, "_contested": bool}
+
+    def __init__(self, client_id: int, client_port: int) -> None:
+        self.client_port = client_port
+        self.bound = False
+        """True while datagrams come from a port that is taken for the client's."""
+        self._client_id = client_id
+        self._port = 0
+        self._contested = False
+        """True once two ports were taken for the client's after the handshake."""
+
+    def __repr__(self) -> str:
+        return f"<ClientSource of {self._client_id}: {self._port if self.bound else 'none'}>"
+
+    def claims_probe(self, datagram: bytes, port: int) -> bool:
+        """True for a 5 with the client's id or an unassigned one."""
+        sender_id, packet_id = _header(datagram)
+        own = sender_id == self._client_id or sender_id in _UNASSIGNED
+        return self._claim(port) if own and packet_id == _PROBE else False
+
+    def claims_late(self, datagram: bytes, port: int) -> bool:
+        """True for a packet with the client's id from its port, unless that is its source or was contested."""
+        if port != self.client_port or self._contested or (self.bound and self._port == port):
+            return False
+        sender_id, packet_id = _header(datagram)
+        return self._claim(port) if sender_id == self._client_id and packet_id in FROM_HQ else False
+
+    def bind(self) -> None:
+        """Take the port of the last claim for the client's."""
+        self.bound = True
+
+    def lose(self, *, for_good: bool = False) -> None:
+        """Have no source; ``for_good``: let none be claimed late."""
+        self.bound = False
+        self._contested = self._contested or for_good
+
+    def sender_of(self, datagram: bytes) -> int:
+        """Give the ``id`` byte of a datagram; -1 if it is no packet."""
+        return _header(datagram)[0]
+
+    def may_bear(self, sender_id: int) -> bool:
+        """True for the ``id`` bytes of the client's datagrams, and for -1, which decoding will refuse."""
+        return sender_id in (_NO_HEADER[0], self._client_id, *_UNASSIGNED)
+
+    def _claim(self, port: int) -> bool:
+        if not self.bound:
+            self._port = port
+        return True
+
+
+def _header(datagram: bytes) -> tuple[int, int]:
+    """Give the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
+    try:
+        return read_header(datagram)
+    except ProtocolError:
+        return _NO_HEADER
+
 
 PROBE_S = 2.0
 """Seconds an HQ program has for its datagram 5."""

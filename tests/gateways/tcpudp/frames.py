@@ -10,8 +10,10 @@ from typing import NamedTuple
 import msgspec
 
 from gateways.tcpudp.messages import Packet
-from gateways.tcpudp.session import HqRole, RobotRole
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.options import Options
+from gateways.tcpudp.session.hq_role import HqRole
+from gateways.tcpudp.session.robot_role import RobotRole
+from gateways.tcpudp.translate import TcpUdpRobot
 from zbridge.fleet.messages import FleetMessage
 from zbridge.fleet.topics import Topic
 from zbridge.protocol.session import Datagram

@@ -17,7 +17,7 @@ from unittest import mock
 import pytest
 
 from gateways.tcpudp import PROTOCOL
-from gateways.tcpudp.hq import HqOptions
+from gateways.tcpudp.options import HqOptions
 from gateways.tcpudp.session import robot_role as sessions
 from tests.clock import scene_of
 from tests.gateways.tcpudp.frames import ANSWER_TRUE, LISTED, START, bearing, client_settings, framed

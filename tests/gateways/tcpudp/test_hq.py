@@ -10,9 +10,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp.hq import HqClient, HqOptions, TcpUdpHq, display
-from gateways.tcpudp.hq import client as client_module
+from gateways.tcpudp import hq as display
+from gateways.tcpudp import hq_client as client_module
+from gateways.tcpudp.hq import TcpUdpHq
+from gateways.tcpudp.hq_client import HqClient
 from gateways.tcpudp.messages import Packet, encode_packet
+from gateways.tcpudp.options import HqOptions
 from tests.gateways.tcpudp import frames as f
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as codec

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from gateways.tcpudp import messages as m
-from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp.options import Options
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import Feature
-from gateways.tcpudp.translate import Options, TcpUdpRobot
+from gateways.tcpudp.translate import TcpUdpRobot
 from tests.gateways.tcpudp import frames as f
 from tests.gateways.tcpudp.golden import GOLDEN
 from zbridge.errors import EncodeError, Refused

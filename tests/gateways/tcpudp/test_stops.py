@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from gateways.tcpudp.translate import Options
+from gateways.tcpudp.options import Options
 from tests.gateways.tcpudp.frames import LISTED, LISTED_14, START, Stage, server_settings
 from tests.robot.test_device import Program, Rig, established, serving
 from zbridge.errors import Refused

@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from gateways.tcpudp.translate import Options
+from gateways.tcpudp.options import Options
 from tests.gateways.tcpudp.frames import LISTED, LISTED_14, Stage, counted, framed, server_settings
 from tests.robot.test_device import serving
 from zbridge.errors import ProtocolError

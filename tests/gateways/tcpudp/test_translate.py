@@ -6,7 +6,8 @@ import struct
 import numpy as np
 import pytest
 
-from gateways.tcpudp.translate import Options, TcpUdpRobot, polar_ranges
+from gateways.tcpudp.options import Options
+from gateways.tcpudp.translate import TcpUdpRobot, polar_ranges
 from tests.gateways.tcpudp.frames import LISTED, STOP, Stage, bearing, server_settings
 from zbridge.errors import EncodeError, Refused
 from zbridge.fleet import topics

@@ -22,9 +22,9 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.session import HqRole
+from gateways.tcpudp.options import NAME, Options
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
-from gateways.tcpudp.translate.options import NAME, Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Cells, FleetMessage, Map, Pose, Raw, Switch, Text
 from zbridge.protocol import Form, Kept, ProtocolError, Spare, Telemetry, Translate

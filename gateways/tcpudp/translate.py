@@ -1,6 +1,7 @@
 """One robot of the TCP/UDP package protocol, seen from its HQ: commands to packets, and its stop. Sans-IO.
 
-Source: "Translation" and "The gateway as HQ" of the protocol page. Telemetry is translated by :mod:`.telemetry`.
+Source: "Translation", "Packets" (61) and "The gateway as HQ" of the protocol page. Telemetry is translated by
+:mod:`.telemetry`.
 
 Theory of operation of the stop. One slot of the outbox holds what is repeated: the packets of the last drive, or packet
 13. Packet 13 does not end mode 3, and no packet acknowledges a mode: a robot that stalls drops what piled up, another
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from gateways.tcpudp.messages import (
     PACKETS,
@@ -34,11 +35,11 @@ from gateways.tcpudp.messages import (
     OpaquePacket,
     Packet,
 )
-from gateways.tcpudp.session import HqRole, limits
+from gateways.tcpudp.options import NAME, Options
+from gateways.tcpudp.session import limits
+from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import Feature
-from gateways.tcpudp.translate.options import NAME, Options
-from gateways.tcpudp.translate.scans import polar_ranges
-from gateways.tcpudp.translate.telemetry import OFF, ON, TelemetryTranslator
+from gateways.tcpudp.telemetry import OFF, ON, TelemetryTranslator
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Mode, Raw, Scan, Switch, Text
 from zbridge.fleet.topics import Topic
@@ -53,6 +54,9 @@ from zbridge.protocol import (
     Translate,
     Unsupported,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
 
 REPEAT_S = 0.25
 """Seconds after which a drive command is repeated while the robot moves."""
@@ -291,3 +295,40 @@ _COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
     topics.CMD_SCAN.path: TcpUdpRobot._feed_scan,
     topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
 }
+
+
+SCAN_POINTS = 360
+"""Points deployed robots take in simulated lidar data, one a degree."""
+
+
+def polar_ranges(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    """Resample a scan to float32[360] in the robot's unit, index = degree counter-clockwise from straight ahead.
+
+    Each degree takes the nearest point of the scan, 0 where the scan has none or it is invalid or out of range.
+    """
+    import numpy as np
+
+    with np.errstate(all="ignore"):  # a point with an absurd number counts as not measured
+        return _polar(scan, unit_m)
+
+
+def _polar(scan: Scan, unit_m: float) -> np.ndarray[Any, np.dtype[np.float32]]:
+    import numpy as np
+
+    count = len(scan.ranges)
+    polar = np.zeros(SCAN_POINTS, np.float32)
+    if count == 0 or not scan.angle_increment or not math.isfinite(scan.angle_increment + scan.angle_min):
+        return polar
+    step = abs(scan.angle_increment)
+    circle = 2 * math.pi / step
+    offsets = np.radians(np.arange(SCAN_POINTS)) - scan.angle_min
+    nearest = np.rint(np.mod(math.copysign(1.0, scan.angle_increment) * offsets, 2 * math.pi) / step)
+    nearest = np.where(nearest >= circle - 0.5, 0.0, nearest)  # after the last point comes the first
+    covered = nearest < count
+    indices = nearest[covered].astype(np.int64)
+    ranges = np.asarray(scan.ranges, np.float32)
+    values = ranges[indices]
+    usable = np.isfinite(values) & (values >= scan.range_min) & (values <= scan.range_max)
+    lengths = values / np.float32(unit_m)
+    polar[covered] = np.where(usable & np.isfinite(lengths), lengths, 0)
+    return polar

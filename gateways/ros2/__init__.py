@@ -1,7 +1,7 @@
 """ROS 2 robots whose nodes use rmw_zenoh: read and driven over plain Zenoh, without ROS.
 
 ``messages`` says what is heard; ``graph`` who publishes and who takes commands; ``session`` holds the conversation;
-``translate`` is the device side, ``settings`` its options. ``simulator`` is a simulated robot. HQ programs of other
+``translate`` is the device side, ``options`` its options. ``simulator`` is a simulated robot. HQ programs of other
 protocols drive it; it has no HQ side of its own: what ROS users see is ``zbridge ros2``.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import Options
 from zbridge.protocol import (
     Codec,
     KeyedSample,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from gateways.ros2.messages import HEARD, KEPT, TWIST, TWIST_STAMPED, Command, Heard
-from gateways.ros2.settings import Options
+from gateways.ros2.options import Options
 from zbridge.protocol import ProtocolError
 from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
 

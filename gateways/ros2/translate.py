@@ -21,8 +21,8 @@ from gateways.ros2.messages import (
     OccupancyGrid,
     Odometry,
 )
+from gateways.ros2.options import Options
 from gateways.ros2.session import RosRole
-from gateways.ros2.settings import Options
 from gateways.ros2.twists import REST, Velocity
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Drive, FleetMessage, Image, Map, Motion, Pose, Scan, Scanner

@@ -1,15 +1,16 @@
 """WC2EC: Webots robots, by the controller program of the simulation, in the field's dialect or the document's.
 
-``messages`` declares the messages of both dialects; ``devices`` is the table of a robot's devices; ``session`` holds
-the conversation in both roles; ``settings`` and ``translate`` are the device side, ``hq`` the HQ side. ``simulator`` is
-a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code with the rest.
+``messages`` declares the messages of both dialects; ``session`` holds the conversation in both roles; ``devices`` and
+``translate`` are the device side, ``hq``, ``hq_client`` and ``device_table`` the HQ side, ``options`` the options of
+both. ``simulator`` is a simulated robot; ``conformance`` has peers as fragile as deployed ones, which share no code
+with the rest.
 """
 
 from __future__ import annotations
 
-from gateways.wc2ec.hq import HqOptions, Wc2EcHq
+from gateways.wc2ec.hq import Wc2EcHq
 from gateways.wc2ec.messages import Dialect, codecs
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.options import HqOptions, Options
 from gateways.wc2ec.translate import NAME, Wc2EcRobot
 from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
 

@@ -34,8 +34,8 @@ from gateways.wc2ec.messages import (
     SetValue,
     Wc2EcMessage,
 )
+from gateways.wc2ec.options import Options
 from gateways.wc2ec.session import ExternalRole
-from gateways.wc2ec.settings import Options
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
 from zbridge.fleet.topics import Topic

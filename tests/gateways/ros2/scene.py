@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import Options
 from gateways.ros2.translate import RosRobot
 from tests.gateways.rig import drained
 from zbridge.metrics import Metrics

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateways.ros2.settings import Options
+from gateways.ros2.options import Options
 from tests.gateways.rig import planned
 from zbridge.app import config
 from zbridge.errors import ConfigError

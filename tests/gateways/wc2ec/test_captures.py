@@ -3,7 +3,7 @@
 The values are read off the bytes by hand: twelve registrations, then twenty rounds of six readings, and one more.
 """
 
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.options import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import payloads
 from zbridge.fleet.messages import Device, Devices, Reading

@@ -16,9 +16,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateways.wc2ec import device_table
+from gateways.wc2ec import hq as display
 from gateways.wc2ec.conformance.parser import ControllerReader as Reader
-from gateways.wc2ec.hq import HqOptions, Wc2EcHq, Wheels, device_table, display
-from gateways.wc2ec.settings import DeviceOption, Options
+from gateways.wc2ec.hq import Wc2EcHq
+from gateways.wc2ec.options import DeviceOption, HqOptions, Options, Wheels
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.captures import stream
 from tests.conformance.scene import table

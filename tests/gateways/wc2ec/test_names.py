@@ -7,7 +7,7 @@ import struct
 import msgpack
 import pytest
 
-from gateways.wc2ec.settings import Options
+from gateways.wc2ec.options import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.gateways.wc2ec.golden import DISTANCE, data, registration
 from zbridge.bus import Publisher

@@ -8,8 +8,8 @@ from typing import Any, Self
 import pytest
 
 from gateways.wc2ec import PROTOCOL
+from gateways.wc2ec.options import Options
 from gateways.wc2ec.session import ExternalRole
-from gateways.wc2ec.settings import Options
 from gateways.wc2ec.translate import Wc2EcRobot
 from tests.conformance.scene import table
 from tests.gateways.rig import drained, planned

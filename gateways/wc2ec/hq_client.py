@@ -1,4 +1,4 @@
-"""What external controllers say, as fleet commands. Sans-IO.
+"""One external controller: its session, and its messages as fleet commands. Sans-IO.
 
 A robot without motors is shown two, ``left`` and ``right``. Deployed controllers set them one after the other: what is
 set within ``join_s`` becomes one drive; a stop never waits. Source: "The gateway as Webots controller".
@@ -8,17 +8,56 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
+from gateways.wc2ec.device_table import LEFT, RIGHT, DeviceTable, ShownDevice
 from gateways.wc2ec.devices import LINEAR, ROTATIONAL
-from gateways.wc2ec.hq.client import HqClient
-from gateways.wc2ec.hq.device_table import DeviceTable, ShownDevice
-from gateways.wc2ec.hq.options import HqOptions
-from gateways.wc2ec.messages import ChangeSensor, DisableSensor, EnableSensor, SetSensor, SetValue, Wc2EcMessage
+from gateways.wc2ec.messages import (
+    ChangeSensor,
+    Dialect,
+    DisableSensor,
+    EnableSensor,
+    SetSensor,
+    SetValue,
+    Wc2EcMessage,
+)
+from gateways.wc2ec.options import HqOptions
+from gateways.wc2ec.session import ControllerRole
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motor, SensorSetting
 from zbridge.fleet.view import RobotView
-from zbridge.protocol import ProtocolError, Telemetry
+from zbridge.protocol import Limits, ProtocolError, Telemetry
+
+
+class HqClient(ControllerRole):
+    """One controller: which devices it was told, which it enabled (draft), and how it set the two wheels."""
+
+    kept: ClassVar[dict[str, Any]] = {
+        "registered": set[int],
+        "enabled": set[int],
+        "wheels": dict[str, float],
+        "fresh": set[str],
+        "joined_at": float,
+        "said_at": float,
+    }
+    handled = frozenset({SetValue})
+
+    def __init__(self, dialect: Dialect, *, values: int, bounds: Limits) -> None:
+        super().__init__(dialect, values=values, bounds=bounds)
+        self.registered: set[int] = set()
+        self.enabled: set[int] = set()
+        self.wheels = {LEFT: 0.0, RIGHT: 0.0}
+        self.fresh: set[str] = set()
+        """The wheels that were set since the last drive."""
+        self.joined_at = math.inf
+        """When the values set so far become a drive, at the latest."""
+        self.said_at = -math.inf
+        """When the last value came."""
+
+    def accept(self, message: Wc2EcMessage, now: float) -> bool:
+        self.said_at = now
+        return super().accept(message, now)
+
 
 _MOST = 1e9
 

@@ -1,6 +1,6 @@
-"""What a session with a ROS 2 robot hears: a class for each topic, whose body is the ROS message. Sans-IO.
+"""The messages of a ROS 2 robot: those received, a class for each topic, and the velocities sent. Sans-IO.
 
-The bodies are those of rosbags: fields as in the ``.msg`` files, arrays as numpy arrays.
+The bodies of received messages are those of rosbags: fields as in the ``.msg`` files, arrays as numpy arrays.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from zbridge.protocol import KeyedSample
+from zbridge.ros2 import Types
 
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 _NS_PER_S = 1_000_000_000
@@ -78,3 +79,25 @@ KEPT = frozenset({"map"})
 """Topics whose last message comes to who is late."""
 LIVE = (LaserScan, Odometry, Imu)
 """Messages that are sent as soon as they are measured: their stamps tell the robot's clock."""
+
+
+class Velocity(msgspec.Struct, frozen=True):
+    """What a Twist says: m/s forward and to the left, rad/s counter-clockwise."""
+
+    forward: float = 0.0
+    left: float = 0.0
+    turn: float = 0.0
+
+
+REST = Velocity()
+
+
+def write_twist(types: Types, type_name: str, velocity: Velocity) -> bytes:
+    """Write a velocity as CDR of one of the two types; the stamp of a TwistStamped is zero."""
+    linear = types.message("geometry_msgs/msg/Vector3", x=velocity.forward, y=velocity.left)
+    angular = types.message("geometry_msgs/msg/Vector3", z=velocity.turn)
+    twist = types.message(TWIST, linear=linear, angular=angular)
+    if type_name == TWIST_STAMPED:
+        header = types.message("std_msgs/msg/Header", frame_id="base_link")
+        twist = types.message(TWIST_STAMPED, header=header, twist=twist)
+    return types.encode(twist)

@@ -16,9 +16,8 @@ import struct
 from typing import Any
 
 from gateways.ros2.graph import Graph
-from gateways.ros2.messages import LIVE, TWIST_STAMPED, Command, Event, Ignored
+from gateways.ros2.messages import LIVE, REST, TWIST_STAMPED, Command, Event, Ignored, Velocity, write_twist
 from gateways.ros2.options import Options
-from gateways.ros2.twists import REST, Velocity, write_twist
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Count,

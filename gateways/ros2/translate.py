@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gateways.ros2.messages import (
+    REST,
     BatteryState,
     CompressedImage,
     Heard,
@@ -20,10 +21,10 @@ from gateways.ros2.messages import (
     LaserScan,
     OccupancyGrid,
     Odometry,
+    Velocity,
 )
 from gateways.ros2.options import Options
 from gateways.ros2.session import RosRole
-from gateways.ros2.twists import REST, Velocity
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Battery, Drive, FleetMessage, Image, Map, Motion, Pose, Scan, Scanner
 from zbridge.fleet.topics import Topic

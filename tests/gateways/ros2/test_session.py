@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from gateways.ros2.twists import Velocity
+from gateways.ros2.messages import Velocity
 from tests.gateways.ros2.scene import KINDS, STAMPED, TWIST, TYPES, RosScene, header, key, token
 from zbridge.errors import NotReady
 from zbridge.protocol import KeyedSample, SampleKind

@@ -10,7 +10,7 @@ from __future__ import annotations
 from gateways.alf.hq import AlfHq, HqOptions
 from gateways.alf.messages import Dialect, codecs
 from gateways.alf.translate import NAME, AlfRobot, Options
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
 
@@ -57,16 +57,11 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError(f"an ALF vehicle has at most {LINKS} links")
     dialect = _dialect(simulation.dialect)
     if simulation.fragile:
-        from gateways.alf.conformance.fragile_robot import simulate_fragile
+        from gateways.alf.conformance.fragile_robot import fragile_vehicle
 
-        host, port = simulation.addresses[0].host, simulation.addresses[0].port
-        laser = simulation.addresses[1].port if len(simulation.addresses) > 1 else None
-
-        def ready(drive_port: int, laser_port: int | None) -> None:
-            ports = (drive_port,) if laser_port is None else (drive_port, laser_port)
-            simulation.ready(tuple(Address(host, port) for port in ports))
-
-        await simulate_fragile(host, port, dialect=dialect.value, laser_port=laser, seed=simulation.seed, ready=ready)
+        links = len(simulation.addresses)
+        first, *others = fragile_vehicle(dialect.value, servers=links, seed=simulation.seed)
+        await first.simulate(simulation, *others)
     else:
         from gateways.alf.simulator import simulate
 
@@ -74,13 +69,14 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.alf.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.alf.conformance.fragile_hq import FragileHq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("ALF HQ programs have no versions and no datagrams")
-    dialect = _dialect(simulation.dialect)
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, dialect=dialect.value, drive=simulation.drive)
+    dialect, address = _dialect(simulation.dialect), simulation.address
+    # What the listener is configured to serve is not known here.
+    hq = FragileHq(dialect=dialect.value, serves="both", deployed="driving")
+    await hq.simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(

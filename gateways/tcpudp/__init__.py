@@ -13,7 +13,7 @@ from gateways.tcpudp.messages import codecs
 from gateways.tcpudp.options import NAME, HqOptions, Options
 from gateways.tcpudp.settings import HQ_BLOCKS, VERSIONS
 from gateways.tcpudp.translate import TcpUdpRobot
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -65,16 +65,10 @@ async def _simulate(simulation: Simulation) -> None:
     if simulation.version is not None and simulation.version not in VERSIONS:
         raise ConfigError(f"version {simulation.version!r}: expected one of {', '.join(VERSIONS)}")
     if simulation.fragile:
-        from gateways.tcpudp.conformance.fragile_robot import simulate_fragile
+        from gateways.tcpudp.conformance.fragile_robot import FragileRobot
 
-        (address,), version = simulation.addresses, simulation.version or "1.3"
-
-        def ready(port: int) -> None:
-            simulation.ready((Address(address.host, port),))
-
-        await simulate_fragile(
-            address.host, address.port, version=version, udp=simulation.udp, seed=simulation.seed, ready=ready
-        )
+        robot = FragileRobot(version=simulation.version or "1.3", udp=simulation.udp, seed=simulation.seed)
+        await robot.simulate(simulation)
     else:
         from gateways.tcpudp.simulator import simulate
 
@@ -82,16 +76,15 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.tcpudp.conformance.fragile_hq import FragileHq
 
-    version = simulation.version or "1.3"
+    version, address = simulation.version or "1.3", simulation.address
     if simulation.dialect is not None:
         raise ConfigError("TCP/UDP HQ programs have no dialects")
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
     udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, version=version, udp=udp, drive=simulation.drive)
+    await FragileHq(version=version, udp=udp).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(

@@ -12,7 +12,7 @@ from gateways.wc2ec.hq import Wc2EcHq
 from gateways.wc2ec.messages import Dialect, codecs
 from gateways.wc2ec.options import HqOptions, Options
 from gateways.wc2ec.translate import NAME, Wc2EcRobot
-from zbridge.protocol import Address, ConfigError, HqSimulation, Protocol, Simulation
+from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 TEMPLATE = """\
 [device]
@@ -86,14 +86,10 @@ async def _simulate(simulation: Simulation) -> None:
     if len(simulation.addresses) > 1:
         raise ConfigError("a Webots robot has one link")
     dialect = _dialect(simulation.dialect)
-    (address,) = simulation.addresses
     if simulation.fragile:
-        from gateways.wc2ec.conformance.fragile_robot import simulate_fragile
+        from gateways.wc2ec.conformance.fragile_robot import FragileController
 
-        def ready(port: int) -> None:
-            simulation.ready((Address(address.host, port),))
-
-        await simulate_fragile(address.host, address.port, dialect=dialect.value, seed=simulation.seed, ready=ready)
+        await FragileController(dialect.value, seed=simulation.seed).simulate(simulation)
     else:
         from gateways.wc2ec.simulator import simulate
 
@@ -101,13 +97,12 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.conformance.fragile_hq import simulate_fragile_hq
+    from gateways.wc2ec.conformance.fragile_hq import FragileController
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")
-    dialect = _dialect(simulation.dialect)
-    address = simulation.address
-    await simulate_fragile_hq(address.host, address.port, dialect=dialect.value, drive=simulation.drive)
+    dialect, address = _dialect(simulation.dialect), simulation.address
+    await FragileController(dialect=dialect.value).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(

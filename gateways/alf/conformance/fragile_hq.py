@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple, NoReturn, Unpack
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.parser import END, INFO, INIT, SCAN, Dialect, Fields, Message, Phase, VehicleReader, show
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import HqProgram, run_hq_program
+from zbridge.simulation.fragile import Work
+from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds, Ended
 from zbridge.simulation.timing import Ticker
 
@@ -260,25 +260,3 @@ class FragileHq(HqProgram):
     def _send_end(self) -> None:
         if not self._midway:
             self._write_now(wire.end(self.dialect))
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    points: int = wire.POINTS,
-    drive: tuple[float, float] | None = None,
-) -> None:
-    """Run the fragile driving HQ until cancelled, dead or left by the vehicle; log violations, print what it does.
-
-    drive: forward and turn, fractions of full scale; None: its stick stays centred. Raise OSError if nobody listens.
-    """
-    hq = FragileHq(
-        dialect=dialect,
-        points=points,
-        serves="both",  # what the listener is configured to serve is not known here
-        deployed="driving",
-        note=log_violations(),
-    )
-    await run_hq_program(hq, host, port, drive)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from typing import Unpack
 
 from gateways.alf.conformance import parser as wire
 from gateways.alf.conformance.machine import Machine
 from gateways.alf.conformance.parser import Dialect, Fields, Message, Phase, Repeats, Times, show
-from zbridge.simulation.fragile import FragileServer, Work, log_violations, simulate
+from zbridge.simulation.fragile import FragileServer, Work, log_violations
 from zbridge.simulation.judge import Bounds, Chances
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
@@ -233,36 +232,10 @@ class FragileVehicle(FragileServer):
                     self._finish(f"the HQ read nothing for {self._times.send_s:g} s")
 
 
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    laser_port: int | None,
-    seed: int,
-    ready: Callable[[int, int | None], None],
-    times: Times = _DEPLOYED,
-    points: int = wire.POINTS,
-) -> None:
-    """Run a fragile vehicle until cancelled or dead; log each violation, and print what it died of.
-
-    Without ``laser_port`` one server does everything; with it (0: any) ``port`` drives and ``laser_port`` measures.
-    ``ready`` is called with both ports once both listen.
-    """
-    one = laser_port is None
+def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: Times = _DEPLOYED) -> list[FragileVehicle]:
+    """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Roles")."""
     server = partial(FragileVehicle, dialect, seed=seed, times=times)
-    drive = server(laser=one, drive=True, points=points, note=log_violations("vehicle" if one else "drive"))
-    if laser_port is None:
-        return await simulate(drive, host, port, lambda number: ready(number, None))
-    laser = server(laser=True, drive=False, machine=drive.machine, note=log_violations("laser"))
-    ports: dict[str, int] = {}
-
-    def listening(name: str, number: int) -> None:
-        ports[name] = number
-        if len(ports) == 2:
-            ready(ports["drive"], ports["laser"])
-
-    async with asyncio.TaskGroup() as tasks:
-        tasks.create_task(simulate(drive, host, port, lambda number: listening("drive", number)))
-        tasks.create_task(simulate(laser, host, laser_port, lambda number: listening("laser", number)))
-    return None
+    if servers == 1:
+        return [server(laser=True, drive=True, note=log_violations("vehicle"))]
+    drive = server(laser=False, drive=True, note=log_violations("drive"))
+    return [drive, server(laser=True, drive=False, machine=drive.machine, note=log_violations("laser"))]

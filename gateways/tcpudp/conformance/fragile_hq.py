@@ -16,8 +16,7 @@ from typing import Unpack
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.operator import Operator
 from gateways.tcpudp.conformance.parser import Channel, Feature, HqTimes, Packet
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import run_hq_program
+from zbridge.simulation.fragile import Work
 from zbridge.simulation.judge import Bounds, Ended, show
 from zbridge.simulation.timing import STAMPED, Read, ReadingThread
 
@@ -368,20 +367,3 @@ class FragileHq(Operator):
         while True:
             self.send(*self._stick)
             await asyncio.sleep(period_s)
-
-
-async def simulate_fragile_hq(
-    host: str,
-    port: int,
-    *,
-    version: str,
-    udp: bool,
-    drive: tuple[float, float] | None = None,
-    times: HqTimes = _DEPLOYED,
-) -> None:
-    """Run a fragile HQ until cancelled, dead or left; log violations, print what it does and what it died of.
-
-    drive: forward and turn, fractions of full scale; None: its stick stays centred. Raise OSError if nobody listens.
-    """
-    hq = FragileHq(version=version, udp=udp, times=times, note=log_violations())
-    await run_hq_program(hq, host, port, drive)

@@ -9,13 +9,13 @@ import math
 import random
 import socket
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.machine import Machine
 from gateways.tcpudp.conformance.parser import Channel, Feature, Loss, Packet, Times
-from zbridge.simulation.fragile import FragileServer, Work, log_violations, simulate
+from zbridge.simulation.fragile import FragileServer, Work
 from zbridge.simulation.judge import Bounds, Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
 from zbridge.simulation.timing import PollingReader, Ticker
@@ -400,18 +400,3 @@ class FragileRobot(FragileServer):
             if self._conn is not conn:
                 return
             await self._send(kind, body or self.machine.body(kind))
-
-
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    version: str,
-    udp: bool,
-    seed: int,
-    ready: Callable[[int], None],
-    times: Times = _DEPLOYED,
-) -> None:
-    """Run a fragile robot until cancelled or dead; log each violation, and print what it died of."""
-    robot = FragileRobot(version=version, udp=udp, seed=seed, times=times, note=log_violations())
-    await simulate(robot, host, port, ready)

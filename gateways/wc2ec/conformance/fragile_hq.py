@@ -11,8 +11,8 @@ from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.parser import ControllerReader, Dialect, Message
-from zbridge.simulation.fragile import Work, log_violations
-from zbridge.simulation.hq_program import HqProgram, run_hq_program
+from zbridge.simulation.fragile import Work
+from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds, Ended, show
 
 MOTOR_TYPES = (53, 46)
@@ -216,13 +216,3 @@ class FragileController(HqProgram):
         disabled_s = time.monotonic() - self._disabled.get(number, -math.inf)
         if number not in self.enabled and disabled_s > self._flight_s:
             self._violate(f"data of sensor {number}, which is not enabled: {raw}")
-
-
-async def simulate_fragile_hq(
-    host: str, port: int, *, dialect: Dialect, split: bool = False, drive: tuple[float, float] | None = None
-) -> None:
-    """Run a fragile external controller until cancelled, dead or left; log each violation, and print what it does.
-
-    drive: forward and turn, fractions of full scale; None: it sets no motor. Raise OSError if nobody listens.
-    """
-    await run_hq_program(FragileController(dialect=dialect, split=split, note=log_violations()), host, port, drive)

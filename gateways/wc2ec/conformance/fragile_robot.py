@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
 from gateways.wc2ec.conformance.machine import Motor, Robot
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Message, Reader, Times
-from zbridge.simulation.fragile import FragileServer, log_violations, simulate
+from zbridge.simulation.fragile import FragileServer
 from zbridge.simulation.judge import Bounds, Chances, Ended, show
 from zbridge.simulation.sockets import drain, reset_on_close
 from zbridge.simulation.timing import Ticker
@@ -150,21 +150,3 @@ class FragileController(FragileServer):
             self.robot.set_motor(message)
         elif needless := self.robot.set_sensor(message):
             self._event(needless)
-
-
-async def simulate_fragile(
-    host: str,
-    port: int,
-    *,
-    dialect: Dialect,
-    seed: int,
-    ready: Callable[[int], None],
-    devices: Sequence[Device] | None = None,
-    times: Times = _DEPLOYED,
-) -> None:
-    """Run a fragile controller until its external controller left, dead or cancelled; log each violation.
-
-    It prints why it ended, if it was not cancelled. ``ready`` is called with the port once it listens.
-    """
-    controller = FragileController(dialect, devices=devices, seed=seed, times=times, note=log_violations())
-    await simulate(controller, host, port, ready)

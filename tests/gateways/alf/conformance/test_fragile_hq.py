@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateways.alf.conformance.fragile_hq import FragileHq, simulate_fragile_hq
+from gateways.alf.conformance.fragile_hq import FragileHq
 from gateways.alf.conformance.parser import Dialect
 from gateways.alf.conformance.parser import VehicleReader as Reader
 from tests.captures import stream
@@ -215,7 +215,9 @@ async def test_lists_are_bounded_and_every_violation_is_told() -> None:
 
 async def test_the_program_logs_and_prints_what_it_died_of_and_nobody_listening_is_an_error(capsys, caplog) -> None:
     vehicle = Listening()
-    task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", vehicle.port, dialect="text", points=POINTS))
+    task = asyncio.create_task(
+        FragileHq(points=POINTS, serves="both", deployed="driving").simulate("127.0.0.1", vehicle.port, None)
+    )
     async with asyncio.timeout(LONG_S):
         await vehicle.accept()
         await vehicle.send_bytes(b"3|1;4|nan;")

@@ -14,12 +14,13 @@ import pytest
 
 from gateways.alf.conformance import parser
 from gateways.alf.conformance.fragile_hq import FragileHq
-from gateways.alf.conformance.fragile_robot import FragileVehicle, simulate_fragile
+from gateways.alf.conformance.fragile_robot import FragileVehicle, fragile_vehicle
 from gateways.alf.conformance.machine import Machine
 from gateways.alf.conformance.parser import Dialect, Repeats, Times
 from tests.captures import payloads
 from tests.conformance.scene import LONG_S, Peer, serving, until
 from tests.gateways.alf.conformance.scene import DIALECTS, MESSAGES, AlfScene, conversations
+from zbridge.protocol import Address, Simulation
 
 QUICK = Times(
     cycle_s=0.005, scan_s=0.02, info_s=0.05, first_s=5, gap_s=5, window_commands=0, flight_s=0.05, answer_s=0.15,
@@ -344,26 +345,19 @@ async def test_neither_judge_finds_fault_with_the_other(dialect: Dialect) -> Non
 # As a process
 
 
-async def simulating(laser_port: int | None, dialect: Dialect = "text") -> list[Hq]:
-    ports: asyncio.Future[list[int]] = asyncio.get_running_loop().create_future()
-    run = simulate_fragile(
-        "127.0.0.1",
-        0,
-        dialect=dialect,
-        laser_port=laser_port,
-        seed=3,
-        ready=lambda drive, laser: ports.set_result([drive, laser] if laser else [drive]),
-        times=QUICK,
-    )
-    task = asyncio.create_task(run)
-    scenes = [Hq(None, Peer(port), task) for port in await ports]
+async def simulating(servers: int, dialect: Dialect = "text") -> list[Hq]:
+    bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    simulation = Simulation((Address("127.0.0.1", 0),) * servers, ready=bound.set_result)
+    first, *others = fragile_vehicle(dialect, servers=servers, seed=3, times=QUICK)
+    task = asyncio.create_task(first.simulate(simulation, *others))
+    scenes = [Hq(None, Peer(address.port), task) for address in await bound]
     for scene in scenes:
         await scene.connect("")
     return scenes
 
 
 async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.LogCaptureFixture) -> None:
-    hq, eye = await simulating(0)
+    hq, eye = await simulating(2)
     async with asyncio.timeout(4 * LONG_S):
         assert (await eye.read())[0] == "2"
         before = after = (await eye.read())[3 + 44 : 3 + 726]
@@ -382,7 +376,7 @@ async def test_two_servers_share_the_work_and_are_one_vehicle(caplog: pytest.Log
 
 
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
-    (hq,) = await simulating(None, "binary")
+    (hq,) = await simulating(1, "binary")
     await hq.play(["> 48", "over", "close"])
     assert capsys.readouterr().out.startswith("died: id 72, of which this server knows nothing")
     assert [record.levelno for record in caplog.records if "violation" in record.message] == [logging.ERROR]

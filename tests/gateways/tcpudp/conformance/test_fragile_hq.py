@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes, simulate_fragile_hq
+from gateways.tcpudp.conformance.fragile_hq import FragileHq, HqTimes
 from gateways.tcpudp.conformance.parser import Feature
 from tests import captures
 from tests.conformance.scene import Listening, calling, table, until
@@ -357,7 +357,7 @@ async def test_every_packet_of_the_operator_is_that_of_the_page() -> None:
 async def test_the_command_logs_violations_and_prints_the_death(caplog, capsys) -> None:
     sockets = Sockets()
     with caplog.at_level(logging.ERROR):
-        task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", sockets.port, version="1.1", udp=False))
+        task = asyncio.create_task(FragileHq(version="1.1", udp=False).simulate("127.0.0.1", sockets.port, None))
         await Robot(None, sockets, task).play(["shake 1.1", "< STOP", "> 02000000 01 3c", "over"])
     sockets.close()
     assert "violation: unknown packet id 60" in caplog.text

@@ -11,12 +11,13 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss, simulate_fragile
+from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss
 from gateways.tcpudp.conformance.parser import Feature, Times
 from tests import captures
 from tests.conformance.scene import LONG_S, Peer, serving, table, until
 from tests.gateways.tcpudp.conformance.udp_scene import NAMES as SHARED
 from tests.gateways.tcpudp.conformance.udp_scene import UdpScene
+from zbridge.protocol import Address, Simulation
 
 QUICK = Times(read_s=0.002, probe_s=0.3, silence_s=0.3, part_s=0.08, flight_s=0.1, unasked_s=0)
 CLIENT = 7
@@ -371,11 +372,10 @@ async def test_a_datagram_from_another_socket_is_noted() -> None:
 
 
 async def test_the_simulator_logs_violations_and_says_what_it_died_of(caplog, capsys) -> None:
-    port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-    task = asyncio.create_task(
-        simulate_fragile("127.0.0.1", 0, version="1.3", udp=False, seed=3, ready=port.set_result)
-    )
-    hq = Hq(None, Peer(await port), task)
+    bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+    simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
+    task = asyncio.create_task(FragileRobot(version="1.3", udp=False, seed=3).simulate(simulation))
+    hq = Hq(None, Peer((await bound)[0].port), task)
     with contextlib.closing(hq.peer), contextlib.closing(hq.udp):
         await hq.connect("")
         client = (await hq.packet())[6]

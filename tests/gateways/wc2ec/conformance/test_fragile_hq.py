@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_hq import FragileController, simulate_fragile_hq
+from gateways.wc2ec.conformance.fragile_hq import FragileController
 from tests.captures import stream
 from tests.conformance.scene import LONG_S, Listening, Scene, calling, table, until
 
@@ -178,7 +178,7 @@ async def test_each_dialect_has_its_own_commands() -> None:
 
 async def test_the_program_logs_and_prints_what_it_died_of(capsys, caplog) -> None:
     webots = Webots()
-    task = asyncio.create_task(simulate_fragile_hq("127.0.0.1", webots.port, dialect="deployed", split=True))
+    task = asyncio.create_task(FragileController(split=True).simulate("127.0.0.1", webots.port, None))
     async with asyncio.timeout(LONG_S):
         await webots.accept()
         await webots.send(bytes.fromhex(NAMES["DATA"]) + b"\x09")

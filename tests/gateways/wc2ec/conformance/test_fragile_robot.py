@@ -12,10 +12,11 @@ from typing import Any
 
 import pytest
 
-from gateways.wc2ec.conformance.fragile_robot import FragileController, simulate_fragile
+from gateways.wc2ec.conformance.fragile_robot import FragileController
 from gateways.wc2ec.conformance.machine import Robot
 from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Kind, Reader, Times
 from tests.conformance.scene import LONG_S, Peer, Scene, serving, table, until
+from zbridge.protocol import Address, Simulation
 
 QUICK = Times(step_s=0.005, register_s=0.0, part_s=5)
 """As quick as a test, and patient where patience is not what it is about."""
@@ -271,10 +272,10 @@ def test_it_drives_as_its_wheels_turn_and_sees_the_wall_that_it_nears(left: floa
 
 async def test_the_program_ends_with_its_external_controller_and_says_why(capsys, caplog) -> None:
     for said, words in (("", "the external controller left the robot at rest: closed"), ("ENABLE 84", "died: unknown")):
-        port: asyncio.Future[int] = asyncio.get_running_loop().create_future()
-        started = simulate_fragile("127.0.0.1", 0, dialect="draft", seed=3, ready=port.set_result, times=QUICK)
-        task = asyncio.create_task(started)
-        talk = Talk(None, External(await port), task)
+        bound: asyncio.Future[tuple[Address, ...]] = asyncio.get_running_loop().create_future()
+        simulation = Simulation((Address("127.0.0.1", 0),), ready=bound.set_result)
+        task = asyncio.create_task(FragileController("draft", seed=3, times=QUICK).simulate(simulation))
+        talk = Talk(None, External((await bound)[0].port), task)
         with contextlib.closing(talk.peer):
             await talk.play(["connect", f"> {said}", "shut", "over"])
         assert capsys.readouterr().out.startswith(words)

@@ -7,9 +7,9 @@ fragile as deployed ones, which share no code with the rest.
 
 from __future__ import annotations
 
-from gateways.alf.hq import AlfHq, HqOptions
-from gateways.alf.messages import Dialect, codecs
-from gateways.alf.translate import NAME, AlfRobot, Options
+from gateways.alf.hq import AlfHq, AlfHqOptions
+from gateways.alf.messages import AlfDialect, codecs
+from gateways.alf.translate import NAME, AlfOptions, AlfRobot
 from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
 LINKS = 2
@@ -42,11 +42,11 @@ gap_s = 0.0                             # least time between two messages
 """
 
 
-def _dialect(name: str | None) -> Dialect:
+def _dialect(name: str | None) -> AlfDialect:
     try:
-        return Dialect(name or "text")
+        return AlfDialect(name or "text")
     except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
+        names = ", ".join(dialect.value for dialect in AlfDialect)
         raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
 
 
@@ -69,25 +69,25 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.alf.conformance.fragile_hq import FragileHq
+    from gateways.alf.conformance.fragile_hq import FragileAlfHq
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("ALF HQ programs have no versions and no datagrams")
     dialect, address = _dialect(simulation.dialect), simulation.address
     # What the listener is configured to serve is not known here.
-    hq = FragileHq(dialect=dialect.value, serves="both", deployed="driving")
+    hq = FragileAlfHq(dialect=dialect.value, serves="both", deployed="driving")
     await hq.simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="ALF: a vehicle with a laser scanner",
-    options=Options,
+    options=AlfOptions,
     links=LINKS,
     robot=AlfRobot,
     simulate=_simulate,
     hq=AlfHq,
-    hq_options=HqOptions,
+    hq_options=AlfHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

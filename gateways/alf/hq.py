@@ -16,8 +16,8 @@ import numpy.typing as npt
 from gateways.alf.messages import (
     MOST_POINTS,
     POINTS,
+    AlfDialect,
     AlfMessage,
-    Dialect,
     DriveCommand,
     DriveInfo,
     Measurement,
@@ -39,7 +39,7 @@ COUNTER_ENDS = 2**31
 """One more than the largest integer that deployed receivers can read."""
 FULL_INFO = 100
 """The speed of drive info at full scale."""
-_FULL_SPEED = {Dialect.TEXT: 255, Dialect.BINARY: 100}
+_FULL_SPEED = {AlfDialect.TEXT: 255, AlfDialect.BINARY: 100}
 """The speed that HQ programs send at full scale."""
 _MM_PER_M = 1000
 _RAW_16 = 32767
@@ -47,7 +47,7 @@ _RAW_16 = 32767
 Ints = npt.NDArray[np.int64]
 
 
-class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AlfHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
@@ -58,7 +58,7 @@ class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
 
 
-class HqClient(VehicleRole):
+class AlfClient(VehicleRole):
     """The session of one client.
 
     scanner: the scanner init that it was sent last, encoded. laser: whether it is shown measurements and scanner init.
@@ -152,11 +152,11 @@ class AlfHq(HqSide):
     kept: ClassVar[dict[str, Any]] = {"_sequence": int}
     deadman_s = DEADMAN_S
 
-    def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: AlfHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self._dialect = Dialect(options.dialect)
-        self._write = write_text if self._dialect is Dialect.TEXT else write_binary
+        self._dialect = AlfDialect(options.dialect)
+        self._write = write_text if self._dialect is AlfDialect.TEXT else write_binary
         self._auto = options.serve == "auto"
         self._laser, self._drive = options.serve != "drive", options.serve != "laser"
         self.follows = (("scan", "scanner") if self._laser else ()) + (("motion",) if self._drive else ())
@@ -167,12 +167,12 @@ class AlfHq(HqSide):
         self._sweep: Sweep | None = None
         self._sequence = 0
 
-    def session(self, number: int, bounds: Limits) -> HqClient:
-        session = HqClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
+    def session(self, number: int, bounds: Limits) -> AlfClient:
+        session = AlfClient(self._dialect, points=self.options.points, gap_s=self.options.gap_s, bounds=bounds)
         session.laser, session.drive = self._laser, self._drive and not self._auto
         return session
 
-    def begin(self, session: HqClient, now: float) -> None:
+    def begin(self, session: AlfClient, now: float) -> None:
         scan = self.view.scan
         known = scan if scan is not None and len(scan.ranges) else self.view.scanner
         if session.laser and known is not None:
@@ -199,7 +199,7 @@ class AlfHq(HqSide):
         self._sequence = scan.seq if isinstance(scan.seq, int) else self._sequence + 1
         frame = self._write(sweep.measurement(scan, self._sequence))
 
-        def send(session: HqClient, now: float) -> None:
+        def send(session: AlfClient, now: float) -> None:
             if session.laser:
                 session.know(sweep.init)
                 session.outbox.set("scan", (frame,), now)
@@ -218,7 +218,7 @@ class AlfHq(HqSide):
 
     def _measured(self, value: float) -> float:
         value = _finite(value)
-        return value if self._dialect is Dialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
+        return value if self._dialect is AlfDialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
 
     # What is understood
 
@@ -226,7 +226,7 @@ class AlfHq(HqSide):
         """A turn without speed only sets the wheels, and so is neutral."""
         return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
-    def take(self, session: HqClient, message: AlfMessage) -> tuple[Telemetry, ...]:
+    def take(self, session: AlfClient, message: AlfMessage) -> tuple[Telemetry, ...]:
         if not isinstance(message, DriveCommand):
             raise ProtocolError(f"{message.spec.name} from an HQ program")
         if not self._drive:
@@ -234,7 +234,7 @@ class AlfHq(HqSide):
             return ()
         if self._auto and not session.drive:  # no deployed program can read both kinds ("The gateway as vehicle")
             session.show_drive()
-        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        straight = FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
         speed = min(1.0, message.speed / self._full_speed)
         if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot

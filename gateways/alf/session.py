@@ -13,13 +13,13 @@ import msgspec
 from gateways.alf.messages import (
     MOST_POINTS,
     POINTS,
+    AlfDialect,
     AlfMessage,
-    Dialect,
+    AlfSender,
     DriveCommand,
     End,
     Measurement,
     ScannerInit,
-    Sender,
     binary_frame_end,
     binary_size,
     read_binary,
@@ -52,7 +52,7 @@ class AlfSession(Session[AlfMessage]):
 
     def __init__(
         self,
-        dialect: Dialect,
+        dialect: AlfDialect,
         *,
         points: int = POINTS,
         points_from_scanner: bool = False,
@@ -64,7 +64,7 @@ class AlfSession(Session[AlfMessage]):
         self._ids = self._SENT_BY_PEER
         self._broken = False
         self._points_from_scanner = points_from_scanner
-        if dialect is Dialect.TEXT:
+        if dialect is AlfDialect.TEXT:
             limit = text_limit(MOST_POINTS if points_from_scanner else max(points, POINTS))
             self.frame_end = text_frame_end(limit)
             self._read, self._write = read_text, write_text
@@ -83,7 +83,7 @@ class AlfSession(Session[AlfMessage]):
         return self._write(message)
 
     def decode(self, frame: bytes) -> AlfMessage:
-        if self.dialect is Dialect.TEXT:
+        if self.dialect is AlfDialect.TEXT:
             broken, self._broken = self._broken, not frame.endswith(b";")
             if broken:  # these bytes are the rest of a message that was too long
                 raise ProtocolError(f"{len(frame)} bytes more of a message without an end")
@@ -111,15 +111,15 @@ class AlfSession(Session[AlfMessage]):
         super().close(reason, now)
 
 
-class HqRole(AlfSession):
+class AlfHqRole(AlfSession):
     """We play HQ towards a vehicle. ``drives``: the first command of a link that drives; it repeats from the start."""
 
     role = Role.HQ
-    _SENT_BY_PEER = sent_by(Sender.VEHICLE)
+    _SENT_BY_PEER = sent_by(AlfSender.VEHICLE)
 
     def __init__(
         self,
-        dialect: Dialect,
+        dialect: AlfDialect,
         *,
         points: int = POINTS,
         points_from_scanner: bool = False,
@@ -145,7 +145,7 @@ class VehicleRole(AlfSession):
     """We play the vehicle towards an HQ."""
 
     role = Role.ROBOT
-    _SENT_BY_PEER = sent_by(Sender.HQ)
+    _SENT_BY_PEER = sent_by(AlfSender.HQ)
 
 
 def points_of(scanner: ScannerInit) -> int:

@@ -17,14 +17,14 @@ import numpy.typing as npt
 from gateways.alf.messages import (
     MOST_POINTS,
     POINTS,
+    AlfDialect,
     AlfMessage,
-    Dialect,
     DriveCommand,
     DriveInfo,
     Measurement,
     ScannerInit,
 )
-from gateways.alf.session import HqRole, points_of
+from gateways.alf.session import AlfHqRole, points_of
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Floats, Motion, Scan, Scanner, Switch
 from zbridge.fleet.topics import Topic
@@ -55,8 +55,8 @@ _MOST_TABLE_MM = 100_000
 _FORWARD, _BACKWARD = 0, 1
 _COUNTER_ENDS = 2**32
 UNITS = {
-    Dialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
-    Dialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
+    AlfDialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
+    AlfDialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
 }
 """One unit of acceleration (m/s2) and of gyro (rad/s), unless the options tell another."""
 
@@ -64,7 +64,7 @@ Ints = npt.NDArray[np.int64]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AlfOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device.options]``; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["text", "binary"] = "text"
@@ -89,18 +89,18 @@ class AlfRobot(Robot):
         "_command": DriveCommand,
     }
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: AlfOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
         self.link_names = (VEHICLE,) if links == 1 else (DRIVE, LASER)
         self.dialect = options.dialect  # type: ignore[misc]
-        self._dialect = Dialect(options.dialect)
-        self._session: HqRole | None = None
+        self._dialect = AlfDialect(options.dialect)
+        self._session: AlfHqRole | None = None
         acceleration, gyro = UNITS[self._dialect]
         self._acceleration = options.acceleration_m_s2 or acceleration
         self._gyro = options.gyro_rad_s or gyro
         self._scanner: ScannerInit | None = None
-        self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is Dialect.BINARY else None)
+        self._clock = DeviceClock(_COUNTER_ENDS if self._dialect is AlfDialect.BINARY else None)
         self._sequence: int | None = None
         self._gaps = metrics.count("sequence_gaps")
         self._duplicates = metrics.count("sequence_duplicates")
@@ -109,15 +109,15 @@ class AlfRobot(Robot):
         self._command = self._neutral()
 
     @property
-    def driving(self) -> HqRole | None:
+    def driving(self) -> AlfHqRole | None:
         return self._session
 
-    def session(self, link: str, peer: str) -> HqRole:
+    def session(self, link: str, peer: str) -> AlfHqRole:
         drives = link == self.link_names[0]
         if drives:
             self._backward = False
             self._command = self._neutral()
-        session = HqRole(
+        session = AlfHqRole(
             self._dialect,
             points=self.options.points,
             points_from_scanner=self.options.points_from_scanner,
@@ -224,7 +224,7 @@ class AlfRobot(Robot):
 
     def _written(self, speed: int, *, backward: bool, steering_deg: int) -> DriveCommand:
         """Make a command. ``steering_deg``: positive to the right."""
-        straight = FULL_LOCK_DEG if self._dialect is Dialect.BINARY else 0
+        straight = FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
         return DriveCommand(speed, _BACKWARD if backward else _FORWARD, straight + steering_deg, self._light)
 
     def _send(self, command: DriveCommand, now: float, *, urgent: bool = False) -> None:

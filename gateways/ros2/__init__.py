@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateways.ros2.options import Options
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import (
     Codec,
     KeyedSample,
@@ -50,7 +50,7 @@ shared = false                          # true: another node (Nav2) drives it to
 """
 
 
-def _robot(options: Options, links: int, metrics: Metrics) -> Robot:
+def _robot(options: RosOptions, links: int, metrics: Metrics) -> Robot:
     from gateways.ros2.translate import RosRobot  # loads numpy
 
     return RosRobot(options, links, metrics)
@@ -66,7 +66,7 @@ SIMULATED: dict[str, Any] = {"speed_full_mps": 1.0, "turn_full_radps": 2.0}
 PROTOCOL = Protocol(
     name="ros2",
     summary="ROS 2 robots over rmw_zenoh, without ROS",
-    options=Options,
+    options=RosOptions,
     links=1,
     robot=_robot,
     simulate=_simulate,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
-from gateways.ros2.messages import HEARD, KEPT, TWIST, TWIST_STAMPED, Command, Heard
-from gateways.ros2.options import Options
+from gateways.ros2.messages import RECEIVED, TRANSIENT_LOCAL, TWIST, TWIST_STAMPED, Received, TwistCommand
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import ProtocolError
 from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
 
@@ -17,7 +17,7 @@ class Wanted(msgspec.Struct, frozen=True):
     """One topic that is read. kept: the last message from before is wanted too."""
 
     name: str
-    heard: type[Heard]
+    heard: type[Received]
     types: tuple[str, ...]
     kept: bool
 
@@ -25,17 +25,17 @@ class Wanted(msgspec.Struct, frozen=True):
 class Graph:
     """The endpoints of one robot's topics."""
 
-    def __init__(self, options: Options, types: Types) -> None:
+    def __init__(self, options: RosOptions, types: Types) -> None:
         self._domain = options.domain
         self._types = types
         self.command_topic = options.topic("cmd_vel")
-        topics = ((option, options.topic(option)) for option in HEARD)
+        topics = ((option, options.topic(option)) for option in RECEIVED)
         self._wanted = {
-            name: Wanted(name, HEARD[option][0], (HEARD[option][1],), option in KEPT)
+            name: Wanted(name, RECEIVED[option][0], (RECEIVED[option][1],), option in TRANSIENT_LOCAL)
             for option, name in topics
             if name is not None
         }
-        self._command = Wanted(self.command_topic or "", Command, (TWIST, TWIST_STAMPED), kept=False)
+        self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), kept=False)
         self.publishers: dict[str, Endpoint] = {}
         """By their tokens, as the next two."""
         self.takers: dict[str, Endpoint] = {}

@@ -16,13 +16,13 @@ TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStampe
 _NS_PER_S = 1_000_000_000
 
 
-class Event(msgspec.Struct, frozen=True):
+class LinkEvent(msgspec.Struct, frozen=True):
     """What the link tells about itself: it is open, a token appeared or is gone, samples were dropped."""
 
     sample: KeyedSample
 
 
-class Heard(msgspec.Struct, frozen=True):
+class Received(msgspec.Struct, frozen=True):
     """One message of a topic. body: of rosbags; ``stamp_ns`` of its header."""
 
     body: Any
@@ -34,31 +34,31 @@ class Heard(msgspec.Struct, frozen=True):
         return int(stamp.sec) * _NS_PER_S + int(stamp.nanosec)
 
 
-class LaserScan(Heard, frozen=True):
+class LaserScan(Received, frozen=True):
     """sensor_msgs/msg/LaserScan."""
 
 
-class Odometry(Heard, frozen=True):
+class Odometry(Received, frozen=True):
     """nav_msgs/msg/Odometry."""
 
 
-class OccupancyGrid(Heard, frozen=True):
+class OccupancyGrid(Received, frozen=True):
     """nav_msgs/msg/OccupancyGrid."""
 
 
-class Imu(Heard, frozen=True):
+class Imu(Received, frozen=True):
     """sensor_msgs/msg/Imu."""
 
 
-class BatteryState(Heard, frozen=True):
+class BatteryState(Received, frozen=True):
     """sensor_msgs/msg/BatteryState."""
 
 
-class CompressedImage(Heard, frozen=True):
+class CompressedImage(Received, frozen=True):
     """sensor_msgs/msg/CompressedImage."""
 
 
-class Command(Heard, frozen=True):
+class TwistCommand(Received, frozen=True):
     """What another node wrote to the topic of commands: geometry_msgs/msg/Twist or TwistStamped."""
 
 
@@ -66,7 +66,7 @@ class Ignored(msgspec.Struct, frozen=True):
     """A sample of our own that came back."""
 
 
-HEARD: dict[str, tuple[type[Heard], str]] = {
+RECEIVED: dict[str, tuple[type[Received], str]] = {
     "scan": (LaserScan, "sensor_msgs/msg/LaserScan"),
     "odom": (Odometry, "nav_msgs/msg/Odometry"),
     "map": (OccupancyGrid, "nav_msgs/msg/OccupancyGrid"),
@@ -75,7 +75,7 @@ HEARD: dict[str, tuple[type[Heard], str]] = {
     "image": (CompressedImage, "sensor_msgs/msg/CompressedImage"),
 }
 """For each option that names a topic: the class of its messages, and their type."""
-KEPT = frozenset({"map"})
+TRANSIENT_LOCAL = frozenset({"map"})
 """Topics whose last message comes to who is late."""
 LIVE = (LaserScan, Odometry, Imu)
 """Messages that are sent as soon as they are measured: their stamps tell the robot's clock."""
@@ -89,7 +89,7 @@ class Velocity(msgspec.Struct, frozen=True):
     turn: float = 0.0
 
 
-REST = Velocity()
+STOPPED = Velocity()
 
 
 def write_twist(types: Types, type_name: str, velocity: Velocity) -> bytes:

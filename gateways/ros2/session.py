@@ -16,8 +16,8 @@ import struct
 from typing import Any
 
 from gateways.ros2.graph import Graph
-from gateways.ros2.messages import LIVE, REST, TWIST_STAMPED, Command, Event, Ignored, Velocity, write_twist
-from gateways.ros2.options import Options
+from gateways.ros2.messages import LIVE, STOPPED, TWIST_STAMPED, Ignored, LinkEvent, TwistCommand, Velocity, write_twist
+from gateways.ros2.options import RosOptions
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Count,
@@ -64,9 +64,9 @@ class RosRole(Session[Any]):
 
     role = Role.HQ
     frame_end = staticmethod(sample_end)
-    handled = frozenset({Event, Command, Ignored})
+    handled = frozenset({LinkEvent, TwistCommand, Ignored})
 
-    def __init__(self, options: Options, types: Types, overruled: Count) -> None:
+    def __init__(self, options: RosOptions, types: Types, overruled: Count) -> None:
         super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=HANDSHAKE_S))
         self.transport = "zenoh"
         self.outbox = _Dated(self)
@@ -83,7 +83,7 @@ class RosRole(Session[Any]):
         self._numbers: dict[str, int] = {}
         self._lost, self._lost_at = "", -math.inf
         """Why the session will end, and since when that is known."""
-        self._velocity = REST
+        self._velocity = STOPPED
         self._now = self._heard_at = -math.inf
         self._time: tuple[int, float] = (0, 0.0)
         """Unix time of the last frame, and when it came on the session's own time line."""
@@ -105,7 +105,7 @@ class RosRole(Session[Any]):
         sample = read_sample(frame)
         self._time = sample.stamp_ns, self._now
         if sample.kind is not SampleKind.SAMPLE:
-            return Event(sample)
+            return LinkEvent(sample)
         found = self.graph.keys.get(sample.key)
         if found is None:
             raise ProtocolError(f"{sample.key[:200]}: nothing of this robot")
@@ -113,10 +113,10 @@ class RosRole(Session[Any]):
         gid = read_attachment(sample.attachment).gid
         if gid == self._gids.get(sample.key):
             return Ignored()
-        if gid not in self.graph.gids and wanted.heard is not Command:  # robots obey whoever writes
+        if gid not in self.graph.gids and wanted.heard is not TwistCommand:  # robots obey whoever writes
             raise ProtocolError(f"{wanted.name}: from no publisher that has a token")
         message = wanted.heard(self._types.decode(type_name, sample.payload))
-        if wanted.heard is not Command:
+        if wanted.heard is not TwistCommand:
             self._heard_at = self._now
             if self._lost and self.graph.publishers:
                 self._lost = ""
@@ -126,10 +126,10 @@ class RosRole(Session[Any]):
         return message
 
     def accept(self, message: Any, now: float) -> bool:
-        if isinstance(message, Event):
+        if isinstance(message, LinkEvent):
             self._on_event(message.sample)
             return False
-        if isinstance(message, Command):
+        if isinstance(message, TwistCommand):
             self._answer(now)
             return False
         if isinstance(message, Ignored):
@@ -183,7 +183,7 @@ class RosRole(Session[Any]):
         wanted = self.graph.of_topic(endpoint.name)
         if endpoint.kind is Kind.SUBSCRIBER:
             self._show(endpoint, Kind.PUBLISHER)
-        if wanted.heard is not Command or not self._options.shared:
+        if wanted.heard is not TwistCommand or not self._options.shared:
             self._show(endpoint, Kind.SUBSCRIBER, kept=wanted.kept)
             self.send_first(subscription(endpoint.key, kept=wanted.kept))
 
@@ -230,13 +230,13 @@ class RosRole(Session[Any]):
         """Take no drives and repeat zeros; end after :data:`LAST_S`: one frame alone may be lost on the way."""
         self._lost, self._lost_at = reason, now
         if self.graph.takers and not (self._options.shared and not self.moving):
-            self.drive(REST, now, urgent=True)
+            self.drive(STOPPED, now, urgent=True)
         self._look()
 
     def close(self, reason: str, now: float) -> None:
         """Tell the robot to stand still, and end."""
         if self.state is State.ESTABLISHED and self.graph.takers and not (self._options.shared and not self.moving):
-            self.drive(REST, now, until=now, urgent=True)
+            self.drive(STOPPED, now, until=now, urgent=True)
         super().close(reason, now)
 
     # Commands
@@ -244,7 +244,7 @@ class RosRole(Session[Any]):
     @property
     def moving(self) -> bool:
         """Whether the robot was told to move last."""
-        return self._velocity != REST
+        return self._velocity != STOPPED
 
     def drive(self, velocity: Velocity, now: float, *, until: float | None = None, urgent: bool = False) -> None:
         """Say how to move at once, then again at ``cmd_vel_hz``; zeros until ``until``, or for :data:`REST_S`.
@@ -254,7 +254,7 @@ class RosRole(Session[Any]):
         frames = self._commands(velocity)
         if not frames:
             raise NotReady(self.graph.idle_drive or "nobody takes commands")
-        if velocity != REST:
+        if velocity != STOPPED:
             until = math.inf
         elif until is None:
             until = now + REST_S

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gateways.ros2.messages import TWIST, TWIST_STAMPED, Event
+from gateways.ros2.messages import TWIST, TWIST_STAMPED, LinkEvent
 from zbridge.protocol import (
     SAMPLE_BYTES,
     Address,
@@ -79,7 +79,7 @@ class NodeRole(Session[Any]):
 
     role = Role.ROBOT
     frame_end = staticmethod(sample_end)
-    handled = frozenset({Event})
+    handled = frozenset({LinkEvent})
 
     def __init__(self, types: Types, command_type: str, *, domain: int = 0, namespace: str = "/") -> None:
         super().__init__(Limits(frame_bytes=SAMPLE_BYTES, handshake_s=5.0))
@@ -94,13 +94,13 @@ class NodeRole(Session[Any]):
     def decode(self, frame: bytes) -> Any:
         sample = read_sample(frame)
         if sample.kind is not SampleKind.SAMPLE:
-            return Event(sample)
+            return LinkEvent(sample)
         read_attachment(sample.attachment)
         command = self._types.decode(self._command_type, sample.payload)
         return command.twist if self._command_type == TWIST_STAMPED else command
 
     def accept(self, message: Any, now: float) -> bool:
-        if isinstance(message, Event) and message.sample.kind is SampleKind.OPENED and not self._publishers:
+        if isinstance(message, LinkEvent) and message.sample.kind is SampleKind.OPENED and not self._publishers:
             self._begin(message.sample.payload.decode())
             self.establish(self._types.distro, ())
         return False
@@ -130,7 +130,7 @@ class NodeRole(Session[Any]):
         self.send(KeyedSample(kind, publisher.key, self._types.encode(message), attachment))
 
 
-class Machine:
+class RosMachine:
     """The robot itself: what commands make it do, and what it measures. Knows no Zenoh."""
 
     def __init__(self, seed: int, types: Types) -> None:
@@ -141,7 +141,7 @@ class Machine:
         self._lived_s = self._commanded_s = 0.0
 
     def __repr__(self) -> str:
-        return f"<Machine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
+        return f"<RosMachine {self.body} {self.forward:+.2f} m/s {self.turn:+.2f} rad/s>"
 
     def take(self, twist: Any) -> None:
         """Obey one command."""
@@ -237,11 +237,11 @@ class Machine:
 
 
 _SENT = {
-    "scan": (Machine.scan, "laser", _SCAN_EVERY),
-    "odom": (Machine.odometry, "odom", _ODOM_EVERY),
-    "imu": (Machine.imu, "base_link", _IMU_EVERY),
-    "battery_state": (Machine.battery, "base_link", _SLOW_EVERY),
-    "map": (Machine.map, "map", _SLOW_EVERY),
+    "scan": (RosMachine.scan, "laser", _SCAN_EVERY),
+    "odom": (RosMachine.odometry, "odom", _ODOM_EVERY),
+    "imu": (RosMachine.imu, "base_link", _IMU_EVERY),
+    "battery_state": (RosMachine.battery, "base_link", _SLOW_EVERY),
+    "map": (RosMachine.map, "map", _SLOW_EVERY),
 }
 """For each topic: what is measured, in which frame, and after how many steps."""
 
@@ -257,7 +257,7 @@ async def simulate(simulation: Simulation) -> None:
         raise ConfigError("a ROS 2 robot has one router")
     address = _with_port(simulation.addresses[0])
     types = types_of(distro)
-    machine, session = Machine(simulation.seed, types), NodeRole(types, _DIALECTS[dialect])
+    machine, session = RosMachine(simulation.seed, types), NodeRole(types, _DIALECTS[dialect])
 
     def deliver(twists: list[Any]) -> None:
         for twist in twists:
@@ -280,7 +280,7 @@ def _with_port(address: Address) -> Address:
         return Address(address.host, int(free.getsockname()[1]))
 
 
-async def _live(machine: Machine, session: NodeRole, conversation: Conversation, types: Types) -> None:
+async def _live(machine: RosMachine, session: NodeRole, conversation: Conversation, types: Types) -> None:
     ticker, steps = Ticker(STEP_S, catch_up_s=CATCH_UP_S), 0
     while True:
         await ticker.tick()

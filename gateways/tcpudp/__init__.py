@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from gateways.tcpudp.hq import TcpUdpHq
 from gateways.tcpudp.messages import codecs
-from gateways.tcpudp.options import NAME, HqOptions, Options
+from gateways.tcpudp.options import NAME, TcpUdpHqOptions, TcpUdpOptions
 from gateways.tcpudp.settings import HQ_BLOCKS, VERSIONS
 from gateways.tcpudp.translate import TcpUdpRobot
 from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
@@ -76,7 +76,7 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.tcpudp.conformance.fragile_hq import FragileHq
+    from gateways.tcpudp.conformance.fragile_hq import FragileTcpUdpHq
 
     version, address = simulation.version or "1.3", simulation.address
     if simulation.dialect is not None:
@@ -84,18 +84,18 @@ async def _simulate_hq(simulation: HqSimulation) -> None:
     if version not in HQ_BLOCKS:
         raise ConfigError(f"version {version!r}: expected one of {', '.join(HQ_BLOCKS)}")
     udp = simulation.udp or version == "1.3"  # deployed programs of 1.3 drive by nothing else
-    await FragileHq(version=version, udp=udp).simulate(address.host, address.port, simulation.drive)
+    await FragileTcpUdpHq(version=version, udp=udp).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="TCP/UDP package protocol: joystick, lidar, SLAM map",
-    options=Options,
+    options=TcpUdpOptions,
     links=1,
     robot=TcpUdpRobot,
     simulate=_simulate,
     hq=TcpUdpHq,
-    hq_options=HqOptions,
+    hq_options=TcpUdpHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

@@ -14,12 +14,12 @@ from typing import Any
 
 import msgspec
 
-from gateways.tcpudp.hq_client import HqClient, commands, each_once, newest_of
+from gateways.tcpudp.hq_client import TcpUdpClient, commands, each_once, newest_of
 from gateways.tcpudp.maps import (
     TCP_BYTES,
     UDP_BYTES,
-    Frame,
     Geometry,
+    MapFrame,
     announceable,
     check,
     most_side,
@@ -39,7 +39,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.options import NAME, HqOptions
+from gateways.tcpudp.options import NAME, TcpUdpHqOptions
 from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import ROBOT_BLOCKS, Feature, RobotSettings13, Settings
 from gateways.tcpudp.telemetry import OFF, ON
@@ -63,11 +63,11 @@ class TcpUdpHq(HqSide):
     deadman_s = DEADMAN_S
     follows = ("pose", "map", "text", "lidar", "camera", f"raw/{NAME}")
 
-    def __init__(self, options: HqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: TcpUdpHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
         self.datagrams = options.udp
-        self._display = Display(options, view)
+        self._display = TcpUdpDisplay(options, view)
 
     # Clients
 
@@ -78,12 +78,12 @@ class TcpUdpHq(HqSide):
         """A client drives only after it has sent control mode 2 or 3."""
         return ((topics.CMD_MODE, Mode("none")),)
 
-    def session(self, number: int, bounds: Limits) -> HqClient:
+    def session(self, number: int, bounds: Limits) -> TcpUdpClient:
         geometry = self._display.geometry()
         bounds = msgspec.structs.replace(bounds, gap_s=self.options.gap_s)
-        return HqClient(bounds, self._settings(geometry), number, self.options, geometry)
+        return TcpUdpClient(bounds, self._settings(geometry), number, self.options, geometry)
 
-    def begin(self, session: HqClient, now: float) -> None:
+    def begin(self, session: TcpUdpClient, now: float) -> None:
         known = ROBOT_BLOCKS[newest((session.version or "",), known=ROBOT_BLOCKS) or "1.1"]
         has = self.view.features if self.view.protocol == NAME else None
         session.left_out.update(f"feature {name}" for name in has or () if not hasattr(known, name))
@@ -121,7 +121,7 @@ class TcpUdpHq(HqSide):
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         return self._display.show(topic, message)
 
-    def answer(self, session: HqClient, topic: Topic, message: FleetMessage | None, now: float) -> None:
+    def answer(self, session: TcpUdpClient, topic: Topic, message: FleetMessage | None, now: float) -> None:
         missing = None
         if topic is topics.RPC_MAP:
             grid = message or self.view.map or no_map()
@@ -136,12 +136,12 @@ class TcpUdpHq(HqSide):
         if missing is not None:
             self.tell(session, f"the robot's {missing} is not known", now)
 
-    def tell(self, session: HqClient, text: str, now: float) -> None:
+    def tell(self, session: TcpUdpClient, text: str, now: float) -> None:
         session.send(DebugMessage(ascii_text(text)))
 
     # What is understood
 
-    def take(self, session: HqClient, message: Packet) -> tuple[Telemetry, ...]:
+    def take(self, session: TcpUdpClient, message: Packet) -> tuple[Telemetry, ...]:
         return commands(session, message, self.options)
 
 
@@ -163,10 +163,10 @@ def no_map() -> Map:
     return Map(0, 0, 1.0, (0.0, 0.0), np.zeros((0, 0), np.uint8))
 
 
-class Display:
+class TcpUdpDisplay:
     """Shows one robot to the clients of one listener."""
 
-    def __init__(self, options: HqOptions, view: RobotView) -> None:
+    def __init__(self, options: TcpUdpHqOptions, view: RobotView) -> None:
         self._options = options
         self._view = view
         self._unit_m = options.length_unit_m
@@ -175,7 +175,7 @@ class Display:
         """What was shown last of each path: clients that connect or ask later get the same bytes."""
 
     def __repr__(self) -> str:
-        return f"<Display of {sorted(self._last)}>"
+        return f"<TcpUdpDisplay of {sorted(self._last)}>"
 
     def show(self, topic: Topic, message: FleetMessage) -> Send | None:
         """Encode a message for all clients; None if there is no packet for it. Raises EncodeError."""
@@ -207,7 +207,7 @@ class Display:
         frames: dict[tuple[Geometry | None, int], tuple[bytes, Datagram]] = {}
         larger: set[tuple[Geometry | None, int]] = set()
 
-        def send(session: HqClient, now: float) -> None:
+        def send(session: TcpUdpClient, now: float) -> None:
             most = most_side(UDP_BYTES if session.by_udp else TCP_BYTES)
             announced = session.version in _SIZES and session.geometry.side <= most
             key = (session.geometry if announced else None, most)
@@ -244,8 +244,8 @@ class Display:
         return resampled(grid, side, cell_m, frame.begin(grid, side * cell_m)), to_scale
 
     @property
-    def _frame(self) -> Frame:
-        return Frame(own=self._view.protocol in (NAME, None), origin=self._options.map_origin)
+    def _frame(self) -> MapFrame:
+        return MapFrame(own=self._view.protocol in (NAME, None), origin=self._options.map_origin)
 
     def _lidar(self, message: Switch) -> Send:
         return newest_of("lidar", ServerLidarStatus(ON if message.on else OFF))
@@ -271,7 +271,7 @@ def ascii_text(text: str) -> str:
     return text.encode("ascii", "backslashreplace").decode()[:TEXT_CHARACTERS]
 
 
-def _request(session: HqClient, now: float) -> None:
+def _request(session: TcpUdpClient, now: float) -> None:
     """Ask a client that announced simulated lidar data for it."""
     if Feature.LIDAR_SIM in (session.client.features if session.client is not None else ()):
         session.show("request", ServerGetSimulatedLidarData.spec.id, _REQUEST, now)
@@ -280,11 +280,11 @@ def _request(session: HqClient, now: float) -> None:
 
 
 _REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotRole.sender_id)
-_SHOWN: dict[str, Callable[[Display, Any], Send | None]] = {
-    topics.POSE.path: Display._pose,
-    topics.MAP.path: Display._map,
-    topics.LIDAR.path: Display._lidar,
-    topics.CAMERA.path: Display._camera,
-    topics.TEXT.path: Display._text,
-    topics.RAW(NAME).path: Display._raw,
+_SHOWN: dict[str, Callable[[TcpUdpDisplay, Any], Send | None]] = {
+    topics.POSE.path: TcpUdpDisplay._pose,
+    topics.MAP.path: TcpUdpDisplay._map,
+    topics.LIDAR.path: TcpUdpDisplay._lidar,
+    topics.CAMERA.path: TcpUdpDisplay._camera,
+    topics.TEXT.path: TcpUdpDisplay._text,
+    topics.RAW(NAME).path: TcpUdpDisplay._raw,
 }

@@ -28,7 +28,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     encode_packet,
 )
-from gateways.tcpudp.options import NAME, HqOptions
+from gateways.tcpudp.options import NAME, TcpUdpHqOptions
 from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
 from gateways.tcpudp.telemetry import OFF, ON
@@ -41,12 +41,14 @@ _ASKING = ("1.1",)
 _ON_REQUEST = frozenset({ServerSLAMMap.spec.id, ServerPosition.spec.id})
 
 
-class HqClient(RobotRole):
+class TcpUdpClient(RobotRole):
     """One program: the geometry of the map that it was announced, and the packets that it knows."""
 
     kept: ClassVar[dict[str, Any]] = {"geometry": Geometry, "_asked": set[int]}
 
-    def __init__(self, bounds: Limits, settings: Settings, number: int, options: HqOptions, geometry: Geometry) -> None:
+    def __init__(
+        self, bounds: Limits, settings: Settings, number: int, options: TcpUdpHqOptions, geometry: Geometry
+    ) -> None:
         self.geometry = geometry
         super().__init__(
             bounds,
@@ -94,7 +96,7 @@ def newest_of(slot: str, packet: Packet) -> Send:
     frame = encode_packet(packet, RobotRole.sender_id)
     datagram = Datagram(frame) if packet.spec.carrier.value == "udp*" else frame
 
-    def send(session: HqClient, now: float) -> None:
+    def send(session: TcpUdpClient, now: float) -> None:
         session.show(slot, packet.spec.id, datagram if session.by_udp else frame, now)
 
     return send
@@ -110,7 +112,7 @@ def each_once(packet: Packet) -> Send:
         raise EncodeError(f"packet of {len(frame)} bytes, HQ programs take {TCP_BYTES} by TCP")
     packet_id = frame[5]
 
-    def send(session: HqClient, now: float) -> None:
+    def send(session: TcpUdpClient, now: float) -> None:
         if packet_id in session.known:
             session.outbox.put(frame)
         else:
@@ -129,13 +131,13 @@ def _without_map_flag(settings: Settings) -> bytes:
 Commands = tuple[Telemetry, ...]
 
 
-def commands(client: HqClient, packet: Packet, options: HqOptions) -> Commands:
+def commands(client: TcpUdpClient, packet: Packet, options: TcpUdpHqOptions) -> Commands:
     """Translate a packet of a client; raise ProtocolError if it has no meaning."""
     translate = _TRANSLATE.get(type(packet))
     return translate(client, packet, options) if translate is not None else _raw(packet)
 
 
-def _move(client: HqClient, packet: ClientJoystickMove, options: HqOptions) -> Commands:
+def _move(client: TcpUdpClient, packet: ClientJoystickMove, options: TcpUdpHqOptions) -> Commands:
     speed = packet.speed / options.speed_full
     forward, left = packet.y * speed, 0.0 - packet.x * speed
     if not math.isfinite(forward + left):
@@ -144,34 +146,34 @@ def _move(client: HqClient, packet: ClientJoystickMove, options: HqOptions) -> C
     return ((topics.CMD_DRIVE, Drive(forward=forward / scale, left=left / scale)),)
 
 
-def _rotate(client: HqClient, packet: ClientJoystickRotate, options: HqOptions) -> Commands:
+def _rotate(client: TcpUdpClient, packet: ClientJoystickRotate, options: TcpUdpHqOptions) -> Commands:
     if not math.isfinite(packet.speed):
         raise ProtocolError(f"clientJoystickRotate at {packet.speed:g}")
     turn = max(-1.0, min(1.0, 0.0 - packet.speed / options.turn_full))
     return ((topics.CMD_DRIVE, Drive(turn=turn)),)
 
 
-def _stop(client: HqClient, packet: ClientJoystickStop, options: HqOptions) -> Commands:
+def _stop(client: TcpUdpClient, packet: ClientJoystickStop, options: TcpUdpHqOptions) -> Commands:
     return ((topics.CMD_DRIVE, Drive()),)
 
 
-def _mode(client: HqClient, packet: ClientControllMode, options: HqOptions) -> Commands:
+def _mode(client: TcpUdpClient, packet: ClientControllMode, options: TcpUdpHqOptions) -> Commands:
     if packet.mode not in _MODES:
         raise ProtocolError(f"control mode {packet.mode}, expected 1 (none), 2 (joystick) or 3 (AI)")
     return ((topics.CMD_MODE, _MODES[packet.mode]),)
 
 
-def _lidar(client: HqClient, packet: ClientLidarMode, options: HqOptions) -> Commands:
+def _lidar(client: TcpUdpClient, packet: ClientLidarMode, options: TcpUdpHqOptions) -> Commands:
     if packet.mode not in (ON, OFF):
         raise ProtocolError(f"lidar mode {packet.mode}, expected {ON} (on) or {OFF} (off)")
     return ((topics.CMD_LIDAR, Switch(packet.mode == ON)),)
 
 
-def _text(client: HqClient, packet: DebugMessage, options: HqOptions) -> Commands:
+def _text(client: TcpUdpClient, packet: DebugMessage, options: TcpUdpHqOptions) -> Commands:
     return ((topics.CMD_TEXT, Text(packet.text, sender=client.name)),) if packet.text else ()
 
 
-def _scan(client: HqClient, packet: ClientSimulatedLidarData, options: HqOptions) -> Commands:
+def _scan(client: TcpUdpClient, packet: ClientSimulatedLidarData, options: TcpUdpHqOptions) -> Commands:
     """Translate simulated lidar data: one turn of ranges counter-clockwise from straight ahead, 0 = no measurement."""
     count = len(packet.ranges)
     if not count:
@@ -185,12 +187,12 @@ def _scan(client: HqClient, packet: ClientSimulatedLidarData, options: HqOptions
     return ((topics.CMD_SCAN, Scan(0.0, 2 * math.pi / count, 0.0, most_m, ranges_m)),)
 
 
-def _ask_map(client: HqClient, packet: ClientGetSLAMMap, options: HqOptions) -> Commands:
+def _ask_map(client: TcpUdpClient, packet: ClientGetSLAMMap, options: TcpUdpHqOptions) -> Commands:
     client.asks(ServerSLAMMap.spec.id)
     return ((topics.RPC_MAP, Query()),)
 
 
-def _ask_pose(client: HqClient, packet: ClientGetPosition, options: HqOptions) -> Commands:
+def _ask_pose(client: TcpUdpClient, packet: ClientGetPosition, options: TcpUdpHqOptions) -> Commands:
     client.asks(ServerPosition.spec.id)
     return ((topics.RPC_POSE, Query()),)
 
@@ -204,7 +206,7 @@ def _raw(packet: Packet) -> Commands:
 
 
 _MODES = {1: Mode("none"), 2: Mode("manual"), 3: Mode("autonomous")}
-_TRANSLATE: dict[type[Packet], Callable[[HqClient, Any, HqOptions], Commands]] = {
+_TRANSLATE: dict[type[Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOptions], Commands]] = {
     ClientJoystickMove: _move,
     ClientJoystickRotate: _rotate,
     ClientJoystickStop: _stop,

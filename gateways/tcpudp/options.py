@@ -19,7 +19,7 @@ Angle = Annotated[float, msgspec.Meta(ge=-7, le=7)]
 Length = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TcpUdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     udp: bool = True
@@ -38,7 +38,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 VersionName = Literal["1.1", "1.2", "1.3", "1.4"]
 
 
-class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TcpUdpHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     versions: Annotated[tuple[VersionName, ...], msgspec.Meta(min_length=1)] = ("1.1", "1.2", "1.3")

@@ -22,7 +22,7 @@ from gateways.tcpudp.messages import (
     ServerSLAMMap,
     ServerSLAMMapPart,
 )
-from gateways.tcpudp.options import NAME, Options
+from gateways.tcpudp.options import NAME, TcpUdpOptions
 from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import RobotSettings13, Settings
 from zbridge.fleet import topics
@@ -46,7 +46,7 @@ class TelemetryTranslator(Kept):
         "_map_awaited": bool,
     }
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: TcpUdpOptions) -> None:
         self._options = options
         self._session: HqRole | None = None
         self._parts: bytearray | None = None

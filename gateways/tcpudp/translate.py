@@ -35,7 +35,7 @@ from gateways.tcpudp.messages import (
     OpaquePacket,
     Packet,
 )
-from gateways.tcpudp.options import NAME, Options
+from gateways.tcpudp.options import NAME, TcpUdpOptions
 from gateways.tcpudp.session import limits
 from gateways.tcpudp.session.hq_role import HqRole
 from gateways.tcpudp.settings import Feature
@@ -82,7 +82,7 @@ class TcpUdpRobot(Robot):
         "_telemetry": TelemetryTranslator,
     }
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: TcpUdpOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         self.options = options
         self.link_names = ("robot",)
         self._force = tuple(Feature(entry) if isinstance(entry, str) else entry for entry in options.force)

@@ -9,8 +9,8 @@ with the rest.
 from __future__ import annotations
 
 from gateways.wc2ec.hq import Wc2EcHq
-from gateways.wc2ec.messages import Dialect, codecs
-from gateways.wc2ec.options import HqOptions, Options
+from gateways.wc2ec.messages import Wc2EcDialect, codecs
+from gateways.wc2ec.options import Wc2EcHqOptions, Wc2EcOptions
 from gateways.wc2ec.translate import NAME, Wc2EcRobot
 from zbridge.protocol import ConfigError, HqSimulation, Protocol, Simulation
 
@@ -72,11 +72,11 @@ SIMULATED = {
 }
 
 
-def _dialect(name: str | None) -> Dialect:
+def _dialect(name: str | None) -> Wc2EcDialect:
     try:
-        return Dialect(name or "deployed")
+        return Wc2EcDialect(name or "deployed")
     except ValueError:
-        names = ", ".join(dialect.value for dialect in Dialect)
+        names = ", ".join(dialect.value for dialect in Wc2EcDialect)
         raise ConfigError(f"dialect {name!r}: expected one of {names}") from None
 
 
@@ -87,9 +87,9 @@ async def _simulate(simulation: Simulation) -> None:
         raise ConfigError("a Webots robot has one link")
     dialect = _dialect(simulation.dialect)
     if simulation.fragile:
-        from gateways.wc2ec.conformance.fragile_robot import FragileController
+        from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 
-        await FragileController(dialect.value, seed=simulation.seed).simulate(simulation)
+        await FragileWebotsController(dialect.value, seed=simulation.seed).simulate(simulation)
     else:
         from gateways.wc2ec.simulator import simulate
 
@@ -97,24 +97,24 @@ async def _simulate(simulation: Simulation) -> None:
 
 
 async def _simulate_hq(simulation: HqSimulation) -> None:
-    from gateways.wc2ec.conformance.fragile_hq import FragileController
+    from gateways.wc2ec.conformance.fragile_hq import FragileExternalController
 
     if simulation.version is not None or simulation.udp:
         raise ConfigError("external controllers have no versions and no datagrams")
     dialect, address = _dialect(simulation.dialect), simulation.address
-    await FragileController(dialect=dialect.value).simulate(address.host, address.port, simulation.drive)
+    await FragileExternalController(dialect=dialect.value).simulate(address.host, address.port, simulation.drive)
 
 
 PROTOCOL = Protocol(
     name=NAME,
     summary="WC2EC: Webots robots, by their controller program",
-    options=Options,
+    options=Wc2EcOptions,
     links=1,
     robot=Wc2EcRobot,
     simulate=_simulate,
     simulated=SIMULATED,
     hq=Wc2EcHq,
-    hq_options=HqOptions,
+    hq_options=Wc2EcHqOptions,
     simulate_hq=_simulate_hq,
     template=TEMPLATE,
     codecs=codecs(),

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 import msgspec
 
 from gateways.wc2ec.devices import DISTANCE, LINEAR, ROTATIONAL
-from gateways.wc2ec.messages import Dialect, RegisterSensor, write
-from gateways.wc2ec.options import HqOptions
+from gateways.wc2ec.messages import RegisterSensor, Wc2EcDialect, write
+from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.translate import NAME
 from zbridge.fleet.messages import Device, Scan, Scanner
 from zbridge.fleet.view import RobotView
@@ -80,7 +80,7 @@ class DeviceTable(Kept):
 
     def __init__(
         self,
-        options: HqOptions,
+        options: Wc2EcHqOptions,
         view: RobotView,
         sectors: SectorSensors,
         registered: Callable[[], set[int]],
@@ -95,8 +95,8 @@ class DeviceTable(Kept):
         self._sectors = sectors
         self._registered = registered
         self._unregistered = unregistered
-        self._dialect = Dialect(options.dialect)
-        self._draft = self._dialect is Dialect.DRAFT
+        self._dialect = Wc2EcDialect(options.dialect)
+        self._draft = self._dialect is Wc2EcDialect.DRAFT
         for device in options.devices:
             self._enter(device.name, device.number, device.kind)
 

@@ -32,7 +32,7 @@ class WebotsDevice(msgspec.Struct, frozen=True):
         return self.kind in (ROTATIONAL, LINEAR)
 
 
-class Table(Kept):
+class RegisteredDevices(Kept):
     """The devices of one session, by number and by name."""
 
     kept: ClassVar[dict[str, Any]] = {
@@ -46,7 +46,7 @@ class Table(Kept):
         self._by_name: dict[str, WebotsDevice] = {}
 
     def __repr__(self) -> str:
-        return f"<Table of {len(self._by_number)} devices>"
+        return f"<RegisteredDevices of {len(self._by_number)}>"
 
     def restore(self, state: Exported) -> None:
         super().restore(state)

@@ -14,14 +14,14 @@ from gateways.wc2ec.device_table import LEFT, RIGHT, DeviceTable, ShownDevice
 from gateways.wc2ec.devices import LINEAR, ROTATIONAL
 from gateways.wc2ec.messages import (
     ChangeSensor,
-    Dialect,
     DisableSensor,
     EnableSensor,
     SetSensor,
     SetValue,
+    Wc2EcDialect,
     Wc2EcMessage,
 )
-from gateways.wc2ec.options import HqOptions
+from gateways.wc2ec.options import Wc2EcHqOptions
 from gateways.wc2ec.session import ControllerRole
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, Motor, SensorSetting
@@ -29,7 +29,7 @@ from zbridge.fleet.view import RobotView
 from zbridge.protocol import Limits, ProtocolError, Telemetry
 
 
-class HqClient(ControllerRole):
+class Wc2EcClient(ControllerRole):
     """One controller: which devices it was told, which it enabled (draft), and how it set the two wheels."""
 
     kept: ClassVar[dict[str, Any]] = {
@@ -42,7 +42,7 @@ class HqClient(ControllerRole):
     }
     handled = frozenset({SetValue})
 
-    def __init__(self, dialect: Dialect, *, values: int, bounds: Limits) -> None:
+    def __init__(self, dialect: Wc2EcDialect, *, values: int, bounds: Limits) -> None:
         super().__init__(dialect, values=values, bounds=bounds)
         self.registered: set[int] = set()
         self.enabled: set[int] = set()
@@ -62,29 +62,29 @@ class HqClient(ControllerRole):
 _MOST = 1e9
 
 
-class Commands:
+class ControllerCommands:
     """Translates what the controllers of one listener say."""
 
-    def __init__(self, options: HqOptions, view: RobotView, table: DeviceTable) -> None:
+    def __init__(self, options: Wc2EcHqOptions, view: RobotView, table: DeviceTable) -> None:
         self._options = options
         self._view = view
         self._table = table
 
     def __repr__(self) -> str:
-        return f"<Commands to {self._table!r}>"
+        return f"<ControllerCommands to {self._table!r}>"
 
-    def take(self, session: HqClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
+    def take(self, session: Wc2EcClient, message: Wc2EcMessage) -> tuple[Telemetry, ...]:
         """Translate a message; raise ProtocolError if it has no meaning."""
         device = self._table.by_number.get(message.number)
         if device is None:
             raise ProtocolError(f"device {message.number} is not registered")
-        return _TAKEN[type(message)](self, session, device, message)
+        return _TRANSLATE[type(message)](self, session, device, message)
 
-    def expire(self, session: HqClient, now: float) -> tuple[Telemetry, ...]:
+    def expire(self, session: Wc2EcClient, now: float) -> tuple[Telemetry, ...]:
         """Drive with the wheels as they are set, if ``join_s`` is over."""
         return self._joined(session) if now >= session.joined_at else ()
 
-    def _set(self, session: HqClient, device: ShownDevice, message: SetValue) -> tuple[Telemetry, ...]:
+    def _set(self, session: Wc2EcClient, device: ShownDevice, message: SetValue) -> tuple[Telemetry, ...]:
         if not device.motor:
             raise ProtocolError(f"device {device.number} ({device.name!r}) is no motor")
         if not abs(message.value) <= _MOST:
@@ -100,7 +100,7 @@ class Commands:
         session.joined_at = min(session.joined_at, session.said_at + self._options.join_s)
         return self.expire(session, session.said_at)
 
-    def _joined(self, session: HqClient) -> tuple[Telemetry, ...]:
+    def _joined(self, session: Wc2EcClient) -> tuple[Telemetry, ...]:
         session.fresh.clear()
         session.joined_at = math.inf
         return () if self._has_motors else ((topics.CMD_DRIVE, self._drive(**session.wheels)),)
@@ -116,19 +116,19 @@ class Commands:
         wheels = self._options.wheels
         return wheels.drive(wheels.wheel_radius_m * left, wheels.wheel_radius_m * right)
 
-    def _enable(self, session: HqClient, device: ShownDevice, message: EnableSensor) -> tuple[Telemetry, ...]:
+    def _enable(self, session: Wc2EcClient, device: ShownDevice, message: EnableSensor) -> tuple[Telemetry, ...]:
         session.enabled.add(device.number)
         return ()
 
-    def _disable(self, session: HqClient, device: ShownDevice, message: DisableSensor) -> tuple[Telemetry, ...]:
+    def _disable(self, session: Wc2EcClient, device: ShownDevice, message: DisableSensor) -> tuple[Telemetry, ...]:
         session.enabled.discard(device.number)
         session.outbox.clear(f"sensor {device.number}")
         return ()
 
-    def _change(self, session: HqClient, device: ShownDevice, message: ChangeSensor) -> tuple[Telemetry, ...]:
+    def _change(self, session: Wc2EcClient, device: ShownDevice, message: ChangeSensor) -> tuple[Telemetry, ...]:
         return _setting(device, SensorSetting(index=message.index, value=message.value), message.value)
 
-    def _configure(self, session: HqClient, device: ShownDevice, message: SetSensor) -> tuple[Telemetry, ...]:
+    def _configure(self, session: Wc2EcClient, device: ShownDevice, message: SetSensor) -> tuple[Telemetry, ...]:
         values = tuple(message.values.tolist())
         return _setting(device, SensorSetting(values=values), *values)
 
@@ -139,10 +139,11 @@ def _setting(device: ShownDevice, setting: SensorSetting, *values: float) -> tup
     return ((topics.CMD_SENSOR(device.name), setting),)
 
 
-_TAKEN: dict[type[Wc2EcMessage], Callable[[Commands, HqClient, ShownDevice, Any], tuple[Telemetry, ...]]] = {
-    SetValue: Commands._set,
-    EnableSensor: Commands._enable,
-    DisableSensor: Commands._disable,
-    ChangeSensor: Commands._change,
-    SetSensor: Commands._configure,
+_Translate = Callable[[ControllerCommands, Wc2EcClient, ShownDevice, Any], tuple[Telemetry, ...]]
+_TRANSLATE: dict[type[Wc2EcMessage], _Translate] = {
+    SetValue: ControllerCommands._set,
+    EnableSensor: ControllerCommands._enable,
+    DisableSensor: ControllerCommands._disable,
+    ChangeSensor: ControllerCommands._change,
+    SetSensor: ControllerCommands._configure,
 }

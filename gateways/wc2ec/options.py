@@ -49,7 +49,7 @@ class MotorNames(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     linear: tuple[str, ...] = ()
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Wc2EcOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[device.options]``; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["deployed", "draft"] = "deployed"
@@ -102,7 +102,7 @@ class Wheels(Differential, frozen=True, forbid_unknown_fields=True, kw_only=True
     track_m: Positive = 0.3
 
 
-class HqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Wc2EcHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``[[hq]] options`` of this protocol; the template of ``zbridge init`` explains each."""
 
     dialect: Literal["deployed", "draft"] = "deployed"

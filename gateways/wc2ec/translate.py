@@ -16,7 +16,7 @@ from gateways.wc2ec.devices import (
     LIGHT,
     LINEAR,
     ROTATIONAL,
-    Table,
+    RegisteredDevices,
     WebotsDevice,
     kind_of,
     registered,
@@ -24,7 +24,6 @@ from gateways.wc2ec.devices import (
 )
 from gateways.wc2ec.messages import (
     ChangeSensor,
-    Dialect,
     DisableSensor,
     EnableSensor,
     Error,
@@ -32,9 +31,10 @@ from gateways.wc2ec.messages import (
     SensorData,
     SetSensor,
     SetValue,
+    Wc2EcDialect,
     Wc2EcMessage,
 )
-from gateways.wc2ec.options import Options
+from gateways.wc2ec.options import Wc2EcOptions
 from gateways.wc2ec.session import ExternalRole
 from zbridge.fleet import topics
 from zbridge.fleet.messages import Drive, FleetMessage, Motor, Reading, SensorSetting, Text
@@ -68,16 +68,16 @@ class Wc2EcRobot(Robot):
     """One Webots robot, seen from its external controller."""
 
     hands_over = True
-    kept: ClassVar[dict[str, Any]] = {"_table": Table, "_ring": BearingScan | None}
+    kept: ClassVar[dict[str, Any]] = {"_table": RegisteredDevices, "_ring": BearingScan | None}
     link_names = ("robot",)
 
-    def __init__(self, options: Options, links: int = 1, metrics: Metrics | None = None) -> None:
+    def __init__(self, options: Wc2EcOptions, links: int = 1, metrics: Metrics | None = None) -> None:
         metrics = metrics or Metrics()
         self.options = options
         self.dialect = options.dialect  # type: ignore[misc]
-        self._dialect = Dialect(options.dialect)
+        self._dialect = Wc2EcDialect(options.dialect)
         self._session: ExternalRole | None = None
-        self._table = Table()
+        self._table = RegisteredDevices()
         self._listened: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
         self._tables = {name: _interpolation(table) for name, table in options.tables.items()}
@@ -93,15 +93,15 @@ class Wc2EcRobot(Robot):
     @property
     def on_demand(self) -> tuple[Topic, ...]:
         """Sensors of the draft: they measure while somebody listens."""
-        if self._dialect is Dialect.DEPLOYED:
+        if self._dialect is Wc2EcDialect.DEPLOYED:
             return ()
         return tuple(topics.SENSOR(device.name) for device in self.options.devices)
 
     def session(self, link: str, peer: str) -> ExternalRole:
         self._session = ExternalRole(self._dialect)
-        self._table = Table()
+        self._table = RegisteredDevices()
         self._ring = self._new_ring()
-        for option in self.options.devices if self._dialect is Dialect.DRAFT else ():
+        for option in self.options.devices if self._dialect is Wc2EcDialect.DRAFT else ():
             self._table.add(WebotsDevice(option.name, option.name, option.number, 0, option.kind))
         return self._session
 
@@ -110,7 +110,7 @@ class Wc2EcRobot(Robot):
         return BearingScan(options.bearings_deg, options.scan_range_m) if options.bearings_deg else None
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        if self._dialect is Dialect.DRAFT:
+        if self._dialect is Wc2EcDialect.DRAFT:
             session = self._connected()
             devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
             frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
@@ -154,7 +154,7 @@ class Wc2EcRobot(Robot):
         device = self._table.numbered(message.number)
         if device is None:
             self._unregistered.value += 1
-            kind = LIGHT if self._dialect is Dialect.DRAFT else kind_of(message.kind, self._motor_types)
+            kind = LIGHT if self._dialect is Wc2EcDialect.DRAFT else kind_of(message.kind, self._motor_types)
             device = unnamed(message.number, message.kind, kind)
         options, name = self.options, device.name
         value = message.value
@@ -189,14 +189,14 @@ class Wc2EcRobot(Robot):
 
     def stop(self, now: float, until: float) -> None:
         """Set every rotational motor to 0. Linear motors keep their position: values that wait for them are dropped."""
-        if self._dialect is Dialect.DEPLOYED:
+        if self._dialect is Wc2EcDialect.DEPLOYED:
             for device in self._table.motors(LINEAR):
                 self._connected().outbox.clear(_slot(device))
             for device in self._table.motors(ROTATIONAL):
                 self._set_motor(device, 0.0, now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def stop_frames(self) -> tuple[bytes, ...]:
-        if self._dialect is not Dialect.DEPLOYED:
+        if self._dialect is not Wc2EcDialect.DEPLOYED:
             return ()
         session, motors = self._connected(), self._table.motors(ROTATIONAL)
         return tuple(session.encode(SetValue(device.type, device.number, 0.0)) for device in motors)
@@ -238,7 +238,7 @@ class Wc2EcRobot(Robot):
         urgent: bool = False,
     ) -> None:
         """Set a motor to a value; a newer value of the same motor replaces one that still waits."""
-        if self._dialect is not Dialect.DEPLOYED:
+        if self._dialect is not Wc2EcDialect.DEPLOYED:
             raise Unsupported("the draft dialect has no motors")
         if not math.isfinite(value):
             raise Malformed(f"{device.shown}: {value} is no value of a motor")
@@ -256,7 +256,7 @@ class Wc2EcRobot(Robot):
         device = self._table.named(name)
         if device is None:
             raise Unsupported(f"no sensor is named {name!r}")
-        if self._dialect is not Dialect.DRAFT:
+        if self._dialect is not Wc2EcDialect.DRAFT:
             raise Unsupported("only the draft dialect has settings of sensors")
         header = device.type, device.number
         messages: list[Wc2EcMessage] = []

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Unpack
 
 from gateways.alf.conformance import parser as wire
-from gateways.alf.conformance.machine import Machine
-from gateways.alf.conformance.parser import Dialect, Fields, Message, Phase, Repeats, Times, show
+from gateways.alf.conformance.machine import JudgedVehicle
+from gateways.alf.conformance.parser import AlfTimes, Dialect, Fields, ParsedAlfMessage, Phase, Repeats, show
 from zbridge.simulation.fragile import FragileServer, Work, log_violations
 from zbridge.simulation.judge import Bounds, Chances
 from zbridge.simulation.sockets import drain, reset_on_close
@@ -18,7 +18,7 @@ from zbridge.simulation.timing import Ticker
 
 _MOST_MOVE_S = 0.1
 """Longest time for which the vehicle moves in one cycle, however late it is."""
-_DEPLOYED = Times()
+_DEPLOYED = AlfTimes()
 
 
 class FragileVehicle(FragileServer):
@@ -40,8 +40,8 @@ class FragileVehicle(FragileServer):
         drive: bool,
         points: int = wire.POINTS,
         seed: int = 1,
-        times: Times = _DEPLOYED,
-        machine: Machine | None = None,
+        times: AlfTimes = _DEPLOYED,
+        machine: JudgedVehicle | None = None,
         **bounds: Unpack[Bounds],
     ) -> None:
         if not (laser or drive) or dialect not in ("text", "binary"):
@@ -50,7 +50,7 @@ class FragileVehicle(FragileServer):
         self.dialect: Dialect = dialect
         self.laser, self.drive = laser, drive
         chance = Chances(seed)
-        self.machine = machine or Machine(chance["machine"], points)
+        self.machine = machine or JudgedVehicle(chance["machine"], points)
         self._times, self._repeats = times, Repeats(times)
         self._reader = wire.reader(dialect, {wire.DRIVE, wire.END} if drive else {wire.END}, wire.FULL_PERCENT)
         self._phase = Phase.WAITING
@@ -140,7 +140,7 @@ class FragileVehicle(FragileServer):
 
     # Messages of the HQ
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedAlfMessage) -> None:
         self.received.append((time.monotonic(), message.kind, message.fields))
         raw = show(message.raw, self.dialect)
         if self._phase is Phase.CLOSING:
@@ -154,7 +154,7 @@ class FragileVehicle(FragileServer):
             self._violate(f"a message {self._waited_s:.2f} s after the vehicle's END: {raw}")
         return None
 
-    def _obey(self, message: Message) -> None:
+    def _obey(self, message: ParsedAlfMessage) -> None:
         """Take a command; apply the last one again on any message ("The gateway as HQ": stale commands)."""
         if message.kind == wire.DRIVE and self._reader.whole(message):
             speed = message.fields[0]
@@ -232,7 +232,7 @@ class FragileVehicle(FragileServer):
                     self._finish(f"the HQ read nothing for {self._times.send_s:g} s")
 
 
-def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: Times = _DEPLOYED) -> list[FragileVehicle]:
+def fragile_vehicle(dialect: Dialect, *, servers: int, seed: int, times: AlfTimes = _DEPLOYED) -> list[FragileVehicle]:
     """Make the servers of one vehicle: one for everything, or one that drives and one that measures ("Roles")."""
     server = partial(FragileVehicle, dialect, seed=seed, times=times)
     if servers == 1:

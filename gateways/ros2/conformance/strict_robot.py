@@ -42,7 +42,7 @@ SKIPS = 5
 """Numbers that may go up at once: Zenoh drops commands between ROS nodes too, where a router is late by 20 ms."""
 
 
-class Command(NamedTuple):
+class JudgedCommand(NamedTuple):
     """One command: when it came, from which gid, m/s forward and to the left, rad/s."""
 
     at: float
@@ -79,7 +79,7 @@ class StrictRobot(Judge):
     def __init__(self, router: str, *, namespace: str = "", stamped: bool = False, domain: int = 0) -> None:
         super().__init__()
         self.session = zenoh.open(config(router))
-        self.told: list[Command] = []
+        self.told: list[JudgedCommand] = []
         self.velocity = (0.0, 0.0, 0.0)
         self.x = self.y = self.heading = 0.0
         self.clock_ns = time.time_ns
@@ -154,7 +154,7 @@ class StrictRobot(Judge):
         if up or roll or pitch or not all(map(math.isfinite, values)):
             self._violate(f"twist {values}")
         self.velocity = (forward, left, turn)
-        self.told.append(Command(at, gid, forward, left, turn))
+        self.told.append(JudgedCommand(at, gid, forward, left, turn))
 
     def _judge(self, attachment: bytes) -> bytes:
         if len(attachment) != 33 or attachment[16] != 16:

@@ -13,8 +13,8 @@ from collections.abc import Collection, Iterable
 from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.machine import Machine
-from gateways.tcpudp.conformance.parser import Channel, Feature, Loss, Packet, Times
+from gateways.tcpudp.conformance.machine import JudgedRobot
+from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, Loss, ParsedPacket, RobotTimes
 from zbridge.simulation.fragile import FragileServer, Work
 from zbridge.simulation.judge import Bounds, Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
@@ -26,7 +26,7 @@ _LOOK_S = 0.006
 """Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
 
 
-class _Phase(enum.Enum):
+class _RobotPhase(enum.Enum):
     LISTENING = enum.auto()
     GREETED = enum.auto()
     ASLEEP = enum.auto()
@@ -35,11 +35,11 @@ class _Phase(enum.Enum):
     FROZEN = enum.auto()
 
 
-_DEPLOYED = Times()
+_DEPLOYED = RobotTimes()
 _EXPECTED = {
-    _Phase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
-    _Phase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
-    _Phase.WOKEN: {wire.UDP_PROBE, wire.UDP_STATUS},
+    _RobotPhase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
+    _RobotPhase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
+    _RobotPhase.WOKEN: {wire.UDP_PROBE, wire.UDP_STATUS},
 }
 
 
@@ -54,7 +54,7 @@ class FragileRobot(FragileServer):
     of the lists like it: monotonic seconds, channel, id, body.
     """
 
-    _phase: _Phase
+    _phase: _RobotPhase
     _polling: PollingReader
 
     def __init__(
@@ -63,10 +63,10 @@ class FragileRobot(FragileServer):
         version: str,
         udp: bool,
         seed: int,
-        features: Collection[Feature] | None = None,
-        obeys: Collection[Feature] = (),
+        features: Collection[FeatureFlag] | None = None,
+        obeys: Collection[FeatureFlag] = (),
         client_id: int | None = None,
-        times: Times = _DEPLOYED,
+        times: RobotTimes = _DEPLOYED,
         loss: Loss = Loss.NOTHING,
         parts: int = 4096,
         side: int = wire.SIDE,
@@ -88,8 +88,8 @@ class FragileRobot(FragileServer):
         self._times, self._loss, self._parts, self._side = times, loss, parts, side
         self._chance, self._misnamed, self._misread = Chances(seed), misnamed, misread
         self._again, self._poor = again, False
-        self.machine = Machine(self._chance["talk"], side)
-        self._phase = _Phase.LISTENING
+        self.machine = JudgedRobot(self._chance["talk"], side)
+        self._phase = _RobotPhase.LISTENING
         self._udp: socket.socket | None = None
         self._wake_at = self._closed_s = self._awake_s = 0.0
         """This process's own time, which stands still while the process is late: it judges what was in flight."""
@@ -100,7 +100,7 @@ class FragileRobot(FragileServer):
         self._reads = wire.Reads()
         self._ignores_next = False
         self._awake = asyncio.Event()
-        self._hq_features: frozenset[Feature] = frozenset()
+        self._hq_features: frozenset[FeatureFlag] = frozenset()
         self._source: tuple[str, int] | None = None
         self._probes = 0
         self._offered = self._answered = self._asked_map = False
@@ -126,10 +126,10 @@ class FragileRobot(FragileServer):
 
     def _begin(self, conn: socket.socket) -> None:
         """Begin with an HQ; a connection after the first is a poor one."""
-        if self._phase is not _Phase.LISTENING:
+        if self._phase is not _RobotPhase.LISTENING:
             self._poor, self.client_id, self._broken = True, max(2, self.client_id) % 255 + 1, ""
             self._forget()
-        self._phase = _Phase.GREETED
+        self._phase = _RobotPhase.GREETED
         self._start(self._converse(conn))
 
     def cut(self) -> None:
@@ -150,7 +150,7 @@ class FragileRobot(FragileServer):
             self._event(f"the connection broke: {error!r}")
         finally:
             self._shut()
-            self._phase, self._conn, self._closed_s = _Phase.FROZEN, None, self._awake_s
+            self._phase, self._conn, self._closed_s = _RobotPhase.FROZEN, None, self._awake_s
             self._awake.set()
 
     async def _read_packet(self, data: bytes) -> None:
@@ -177,7 +177,7 @@ class FragileRobot(FragileServer):
     async def _send(self, kind: int, body: bytes = b"") -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
         data = wire.packet(kind, body)
-        if self._phase is _Phase.ESTABLISHED and self._loses():
+        if self._phase is _RobotPhase.ESTABLISHED and self._loses():
             return
         if kind in wire.BY_UDP and self._status:
             self._send_datagram(data)
@@ -204,12 +204,12 @@ class FragileRobot(FragileServer):
         """Take one datagram ("The gateway as HQ": no UDP before TCP, no wrong length field)."""
         if self._loses():
             return
-        if self._phase is _Phase.FROZEN:
+        if self._phase is _RobotPhase.FROZEN:
             if self._awake_s - self._closed_s > self._times.flight_s:
                 self._violate(f"a datagram after the TCP connection ended: {show(data)}")
             return
         if not self._offered:
-            before = "TCP" if self._phase is _Phase.LISTENING else "the robot sent 4"
+            before = "TCP" if self._phase is _RobotPhase.LISTENING else "the robot sent 4"
             self._die(f"a datagram before {before}: {show(data)}")
         received = wire.datagram(data)
         if received is None:
@@ -235,7 +235,7 @@ class FragileRobot(FragileServer):
         self._probes += 1
         if self._probes > 1:
             self._violate(f"{self._probes} probes 5 by UDP instead of one")
-        elif self._phase is not _Phase.ASLEEP:
+        elif self._phase is not _RobotPhase.ASLEEP:
             self._violate(f"the probe 5 came later than {self._times.probe_s:g} s after the 4")
         elif self._loss is Loss.NOTHING and not self._loses():
             self._answered = True
@@ -243,17 +243,17 @@ class FragileRobot(FragileServer):
 
     # Packets
 
-    async def _judge(self, received: Packet, channel: Channel) -> None:
+    async def _judge(self, received: ParsedPacket, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
-        if self._phase is _Phase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._misread:
+        if self._phase is _RobotPhase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._misread:
             return self.misread.append((time.monotonic(), channel, kind, body))
-        if self._phase is _Phase.ESTABLISHED and channel == "tcp" and self._loses():
+        if self._phase is _RobotPhase.ESTABLISHED and channel == "tcp" and self._loses():
             return None
         self.received.append((time.monotonic(), channel, kind, body))
         if kind not in self._registered:
             self._die(f"unregistered packet id {kind} for a robot {self.version} with these flags: {raw}")
-        senders = {0, self.client_id} if self._phase is _Phase.GREETED else {self.client_id}
+        senders = {0, self.client_id} if self._phase is _RobotPhase.GREETED else {self.client_id}
         if received.sender not in senders:
             self._violate(f"id byte {received.sender} instead of {self.client_id}: {raw}")
         if kind == wire.DEBUG and body == bytes(4):
@@ -297,7 +297,7 @@ class FragileRobot(FragileServer):
 
     async def _settle(self, body: bytes) -> None:
         """Take the HQ's settings; judge its version string ("Settings and version negotiation")."""
-        if self._phase is not _Phase.GREETED:
+        if self._phase is not _RobotPhase.GREETED:
             return self._violate(f"a second clientSettings: {show(body)}")
         settings = wire.client_settings(body)
         if wire.deadly(self.version, settings):
@@ -307,20 +307,20 @@ class FragileRobot(FragileServer):
         else:
             self._violate(f"versions {settings.versions!r} to a robot that understands {safe!r} only: {show(body)}")
         self._report(settings.problem, show(body))
-        if Feature.UDP in self.features & self._hq_features:
+        if FeatureFlag.UDP in self.features & self._hq_features:
             return await self._offer_udp()
         return self._establish()
 
     async def _offer_udp(self) -> None:
         """Send 4, sleep, then take in one read what came meanwhile: the single 7 ("Handshake" 3 to 6)."""
-        self._offered, self._phase = True, _Phase.ASLEEP
+        self._offered, self._phase = True, _RobotPhase.ASLEEP
         self._wake_at = time.monotonic() + self._times.probe_s
         self._quiet_until = time.monotonic() + self._times.silence_s
         await self._send(wire.START_UDP)
         self._start(self._miss_status())
         await asyncio.sleep(self._times.probe_s)
         late_s = time.monotonic() - self._wake_at
-        self._phase = _Phase.WOKEN
+        self._phase = _RobotPhase.WOKEN
         self._awake.set()
         data = self._polling.poll()
         if data == b"":
@@ -353,12 +353,12 @@ class FragileRobot(FragileServer):
         return self._establish()
 
     def _establish(self) -> None:
-        self._phase = _Phase.ESTABLISHED
+        self._phase = _RobotPhase.ESTABLISHED
         if self._poor:
             return
         if self._times.unasked_s:
             self._start(self._chatter(self._conn))
-        if self.version == "1.4" and Feature.LIDAR_SIM in self._hq_features:
+        if self.version == "1.4" and FeatureFlag.LIDAR_SIM in self._hq_features:
             self._start(self._send_parts(self._conn))
 
     def _loses(self) -> bool:

@@ -10,7 +10,7 @@ from random import Random
 import numpy as np
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.parser import CELL_CM, SIDE, Feature, packet, string
+from gateways.tcpudp.conformance.parser import CELL_CM, SIDE, FeatureFlag, packet, string
 from zbridge.simulation.world import Body, Grid, cast
 
 _SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
@@ -19,7 +19,7 @@ _PROGRAM = (0.2, 0.0, 0.3)
 """How the robot's own program drives: m/s forward and left, rad/s."""
 
 
-class Machine:
+class JudgedRobot:
     """One robot; ``random`` seeds what it says. ``side``: cells along a side of its map."""
 
     def __init__(self, random: Random, side: int = SIDE) -> None:
@@ -84,18 +84,20 @@ class Machine:
             yield struct.pack("<ii", start, start + size) + self._map[start : start + size].ljust(size, b"\0")
 
     def unasked(
-        self, version: str, features: Collection[Feature], hq_features: Collection[Feature]
+        self, version: str, features: Collection[FeatureFlag], hq_features: Collection[FeatureFlag]
     ) -> Iterator[tuple[int, bytes]]:
         """Give what the robot says unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
 
         An empty body: ask :meth:`body` for it when it is sent.
         """
         due = [(wire.DEBUG, packet(wire.DEBUG, string("two headers")))]
-        kinds = [wire.DEBUG] + [wire.CAMERA] * (Feature.CAM in features) + [wire.CHAT] * (Feature.CHAT in features)
-        kinds += [wire.LIDAR_STATUS] * (Feature.LIDAR in features)
+        kinds = (
+            [wire.DEBUG] + [wire.CAMERA] * (FeatureFlag.CAM in features) + [wire.CHAT] * (FeatureFlag.CHAT in features)
+        )
+        kinds += [wire.LIDAR_STATUS] * (FeatureFlag.LIDAR in features)
         if wire.maps(version, features):
             kinds += [wire.POSITION] + [wire.MAP] * (version != "1.4")
-        kinds += [wire.GET_SCAN] * (Feature.LIDAR_SIM in features and Feature.LIDAR_SIM in hq_features)
+        kinds += [wire.GET_SCAN] * (FeatureFlag.LIDAR_SIM in features and FeatureFlag.LIDAR_SIM in hq_features)
         while True:
             due += [(kind, b"") for kind in kinds]
             self._random.shuffle(due)

@@ -12,7 +12,7 @@ from zbridge.simulation.hq_program import HqProgram
 from zbridge.simulation.judge import Bounds
 
 
-class Operator(HqProgram):
+class OperatorProgram(HqProgram):
     """The sticks and buttons of an HQ program."""
 
     def __init__(self, **bounds: Unpack[Bounds]) -> None:

@@ -31,7 +31,7 @@ SIDE, CELL_CM = 100, 10
 _TAIL_BYTES = 1 << 20
 
 
-class Feature(enum.IntEnum):
+class FeatureFlag(enum.IntEnum):
     """A feature flag; the value is its place in the settings ("Settings and version negotiation")."""
 
     UDP = 0
@@ -64,7 +64,7 @@ IGNORE_ONE = frozenset({"1.1", "1.2"})
 """Versions of robots that ignore the first packet read alone after a stall ("The gateway as robot")."""
 
 
-class Times(msgspec.Struct, frozen=True, kw_only=True):
+class RobotTimes(msgspec.Struct, frozen=True, kw_only=True):
     """The robot's times in seconds; the defaults are those of the deployed robots."""
 
     read_s: float = 0.005
@@ -104,7 +104,7 @@ class Loss(enum.Enum):
     ANSWER = enum.auto()
 
 
-class Packet(msgspec.Struct, frozen=True):
+class ParsedPacket(msgspec.Struct, frozen=True):
     """One packet as it was read."""
 
     sender: int
@@ -112,16 +112,16 @@ class Packet(msgspec.Struct, frozen=True):
     body: bytes
 
 
-class Settings(msgspec.Struct, frozen=True):
+class HqAnnouncement(msgspec.Struct, frozen=True):
     """What an HQ says about itself in packet 3."""
 
     versions: str
-    features: frozenset[Feature]
+    features: frozenset[FeatureFlag]
     problem: str = ""
     readable: bool = True
 
 
-class Announced(msgspec.Struct, frozen=True):
+class RobotAnnouncement(msgspec.Struct, frozen=True):
     """What a robot says about itself in packet 2, as one HQ reads it."""
 
     client: int
@@ -129,7 +129,7 @@ class Announced(msgspec.Struct, frozen=True):
     block: bytes
     understood: str = ""
     """The version whose block the HQ read; empty: it keeps its old flags."""
-    features: frozenset[Feature] = frozenset()
+    features: frozenset[FeatureFlag] = frozenset()
     map_size: int = 0
     map_interval: int = 0
 
@@ -151,16 +151,16 @@ class Announced(msgspec.Struct, frozen=True):
         return max(size // interval, 0) if interval else 0
 
 
-def cut(data: bytes) -> tuple[list[Packet], bytes, bool]:
+def cut(data: bytes) -> tuple[list[ParsedPacket], bytes, bool]:
     """Cut packets off the front ("Framing"); give them, what is left, and whether that is hopeless."""
-    packets: list[Packet] = []
+    packets: list[ParsedPacket] = []
     while len(data) >= 4:
         (length,) = struct.unpack_from("<i", data)
         if not 2 <= length <= _TAIL_BYTES:
             return packets, data, True
         if len(data) < 4 + length:
             break
-        packets.append(Packet(data[4], data[5], data[6 : 4 + length]))
+        packets.append(ParsedPacket(data[4], data[5], data[6 : 4 + length]))
         data = data[4 + length :]
     return packets, data, False
 
@@ -169,14 +169,14 @@ class Reads:
     """The reads of one TCP connection: each must be exactly one packet ("The gateway as HQ")."""
 
     def __init__(self, most: int = READ_BYTES) -> None:
-        self.joined: list[Packet] = []
+        self.joined: list[ParsedPacket] = []
         """The packets of the last read if they were several and whole."""
         self.hopeless = False
         """The last read had a wrong length field."""
         self._tail = b""
         self._most = most
 
-    def take(self, data: bytes) -> tuple[Packet | None, str]:
+    def take(self, data: bytes) -> tuple[ParsedPacket | None, str]:
         """Give the packet that one read is, or what is wrong with it; neither for the rest of a split packet."""
         late = bool(self._tail)
         packets, self._tail, self.hopeless = cut(self._tail + data)
@@ -204,7 +204,7 @@ class Reads:
         return f"a packet of {size} bytes, over {self._most}: {show(data)}"
 
 
-def datagram(data: bytes) -> Packet | None:
+def datagram(data: bytes) -> ParsedPacket | None:
     """Read a datagram as exactly one packet; none where its length field is wrong ("Framing")."""
     packets, rest, _ = cut(data)
     return packets[0] if len(packets) == 1 and not rest else None
@@ -220,37 +220,37 @@ def string(text: str) -> bytes:
     return struct.pack("<i", len(text)) + text.encode("ascii")
 
 
-def server_settings(version: str, client: int, features: Collection[Feature], side: int = SIDE) -> bytes:
+def server_settings(version: str, client: int, features: Collection[FeatureFlag], side: int = SIDE) -> bytes:
     """Write the body of packet 2 as a robot of ``version`` does ("Settings and version negotiation")."""
-    flags = bytes(flag in features for flag in list(Feature)[: FLAGS[version]])
+    flags = bytes(flag in features for flag in list(FeatureFlag)[: FLAGS[version]])
     sizes = struct.pack("<ii", side * CELL_CM, CELL_CM) if FLAGS[version] == 7 else b""
     return bytes([client]) + string(SENT[version]) + flags + sizes
 
 
-def announcement(version: str, features: Collection[Feature] | None, *, udp: bool) -> frozenset[Feature]:
+def announcement(version: str, features: Collection[FeatureFlag] | None, *, udp: bool) -> frozenset[FeatureFlag]:
     """Give the flags that a robot announces, all of its version by default; raise ValueError for others."""
-    known = frozenset(list(Feature)[: FLAGS[version]])
+    known = frozenset(list(FeatureFlag)[: FLAGS[version]])
     others = known if features is None else frozenset(features)
     if not others <= known:
         raise ValueError(f"a robot of version {version} has no {sorted(flag.name for flag in others - known)}")
-    return (others - {Feature.UDP}) | ({Feature.UDP} if udp else frozenset())
+    return (others - {FeatureFlag.UDP}) | ({FeatureFlag.UDP} if udp else frozenset())
 
 
-def client_settings(body: bytes) -> Settings:
+def client_settings(body: bytes) -> HqAnnouncement:
     """Read the body of packet 3 ("Settings and version negotiation")."""
-    nothing: frozenset[Feature] = frozenset()
+    nothing: frozenset[FeatureFlag] = frozenset()
     count = struct.unpack_from("<i", body)[0] if len(body) >= 4 else -1
     if not 0 <= count <= len(body) - 4 or not body[4 : 4 + count].isascii():
-        return Settings("", nothing, "no version string", readable=False)
+        return HqAnnouncement("", nothing, "no version string", readable=False)
     versions, flags = body[4 : 4 + count].decode("ascii"), body[4 + count :]
     expected = FLAGS.get(max(versions.split(",")), 0)
     problem = (
         "" if len(flags) == expected else f"{len(flags)} flags for the versions {versions!r} instead of {expected}"
     )
-    return Settings(versions, frozenset(flag for flag in Feature if any(flags[flag : flag + 1])), problem)
+    return HqAnnouncement(versions, frozenset(flag for flag in FeatureFlag if any(flags[flag : flag + 1])), problem)
 
 
-def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Announced:
+def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> RobotAnnouncement:
     """Read the body of packet 2 as an HQ of ``version`` does; ValueError for what cripples it.
 
     ``skips_map_flag``: it looks for the map's size where the SLAMMap flag is ("The gateway as robot").
@@ -258,7 +258,7 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Ann
     count = struct.unpack_from("<i", body, 1)[0] if len(body) >= 5 else -1
     if not 0 <= count <= len(body) - 5 or not body[5 : 5 + count].isascii():
         raise ValueError("no version string")
-    settings = Announced(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
+    settings = RobotAnnouncement(body[0], body[5 : 5 + count].decode("ascii"), body[5 + count :])
     understood = _understood(version, settings.versions)
     if not understood:
         return settings
@@ -268,11 +268,11 @@ def announced(body: bytes, version: str, *, skips_map_flag: bool = False) -> Ann
     if len(settings.block) < size:
         count = len(settings.block)
         raise ValueError(f"{count} bytes of settings for the versions {settings.versions!r} instead of {size}")
-    features = frozenset(flag for flag in list(Feature)[:flags] if settings.block[flag])
+    features = frozenset(flag for flag in list(FeatureFlag)[:flags] if settings.block[flag])
     length, interval = struct.unpack_from("<ii", settings.block, flags) if sized else (0, 0)
     if sized and not interval:
         raise ValueError("SLAMMapIntervall 0, a division by zero")
-    return Announced(settings.client, settings.versions, settings.block, understood, features, length, interval)
+    return RobotAnnouncement(settings.client, settings.versions, settings.block, understood, features, length, interval)
 
 
 def _understood(version: str, versions: str) -> str:
@@ -282,7 +282,7 @@ def _understood(version: str, versions: str) -> str:
     return next((known for known in ("1.3", "1.2", "1.1") if known in versions.split(",")), "")
 
 
-def announced_problem(settings: Announced, *, skips_map_flag: bool = False) -> str:
+def announced_problem(settings: RobotAnnouncement, *, skips_map_flag: bool = False) -> str:
     """Tell what is wrong with packet 2 without crippling an HQ ("Settings and version negotiation")."""
     newest = max((known for known in settings.versions.split(",") if known in FLAGS), default="")
     size = FLAGS[newest] + 8 * (FLAGS[newest] == 7) if newest else len(settings.block)
@@ -291,32 +291,32 @@ def announced_problem(settings: Announced, *, skips_map_flag: bool = False) -> s
     return f"client id {settings.client}" if settings.client < 2 else ""
 
 
-def deadly(version: str, settings: Settings) -> bool:
+def deadly(version: str, settings: HqAnnouncement) -> bool:
     """Tell whether a version list crashes a robot ("Settings and version negotiation")."""
     return "," in SENT[version] and settings.readable and len(settings.versions.split(",")) in DEADLY_ENTRIES
 
 
-def registered(version: str, features: Collection[Feature]) -> frozenset[int]:
+def registered(version: str, features: Collection[FeatureFlag]) -> frozenset[int]:
     """Tell which packet ids from the HQ do not crash a robot ("Packets", "The gateway as HQ")."""
     ids = {DEBUG, CLIENT_SETTINGS}
-    if Feature.UDP in features:
+    if FeatureFlag.UDP in features:
         ids |= {UDP_PROBE, UDP_STATUS}
-    if Feature.JOYSTICK in features:
+    if FeatureFlag.JOYSTICK in features:
         ids |= {MODE, MOVE, ROTATE, STOP, MOVE_AI}
-    if Feature.CHAT in features:
+    if FeatureFlag.CHAT in features:
         ids |= {CHAT}
-    if Feature.LIDAR in features:
+    if FeatureFlag.LIDAR in features:
         ids |= {LIDAR_MODE}
     if maps(version, features):
         ids |= {GET_MAP, GET_POSITION}
-    if Feature.LIDAR_SIM in features and FLAGS[version] > Feature.LIDAR_SIM:
+    if FeatureFlag.LIDAR_SIM in features and FLAGS[version] > FeatureFlag.LIDAR_SIM:
         ids |= {SCAN}
     return frozenset(ids)
 
 
-def maps(version: str, features: Collection[Feature]) -> bool:
+def maps(version: str, features: Collection[FeatureFlag]) -> bool:
     """Tell whether a robot knows map and position: SLAMMap where the version has that flag, else Lidar."""
-    return (Feature.SLAM_MAP if FLAGS[version] > Feature.SLAM_MAP else Feature.LIDAR) in features
+    return (FeatureFlag.SLAM_MAP if FLAGS[version] > FeatureFlag.SLAM_MAP else FeatureFlag.LIDAR) in features
 
 
 def body_problem(kind: int, body: bytes) -> str:

@@ -15,7 +15,7 @@ from gateways.tcpudp.messages import (
     DebugMessage,
     OpaquePacket,
     Packet,
-    Sender,
+    PacketSender,
     decoder,
     encode_packet,
     frame_end,
@@ -24,7 +24,7 @@ from zbridge.protocol import Datagram, Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
 _QUOTED = 80
-_OWN = {Role.HQ: Sender.HQ, Role.ROBOT: Sender.ROBOT}
+_OWN = {Role.HQ: PacketSender.HQ, Role.ROBOT: PacketSender.ROBOT}
 
 Decode = Callable[[bytes, int], Packet]
 

@@ -3,9 +3,9 @@
 Source: "Handshake", "Settings and version negotiation" and "The gateway as HQ" of the protocol page; for the signs "One
 usable connection per start".
 
-Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
-:class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
-steps STREAM, GIVEN_UP and DONE on. A robot that sent 4 sleeps 2 s and then takes one read as one packet, so for
+Theory of operation. The handshake is the table at the foot of this file: :class:`HqStep` says what the session waits
+for, :class:`HqEvent` what can happen, and every row names the action that is taken. The session is ``established`` from
+the steps STREAM, GIVEN_UP and DONE on. A robot that sent 4 sleeps 2 s and then takes one read as one packet, so for
 :data:`SILENCE_S` nothing leaves by TCP but one 7: before the handshake ends, and in the LATE steps, where commands are
 refused with :data:`LATE_START`.
 """
@@ -112,7 +112,7 @@ _FROM_ROBOT = {bytes((SERVER_ID, packet_id)): decode for packet_id, decode in de
 """How to read what a robot may send, by ``id`` byte and packet id."""
 
 
-class Step(Enum):
+class HqStep(Enum):
     """What the handshake waits for."""
 
     GREETING = "waits for 2"
@@ -126,7 +126,7 @@ class Step(Enum):
     DONE = "established after a 4"
 
 
-class Event(Enum):
+class HqEvent(Enum):
     """What can happen in a handshake."""
 
     SETTINGS_UDP = "2, and both set the UDP flag"
@@ -166,8 +166,8 @@ class HqHandshake(PacketSession):
         self._announce = frozenset(announce)
         self._udp = udp and Feature.UDP in self._announce
         self._agreed = ""
-        within_s = {Step.OFFERED: PROBE_S, Step.PROBING: PROBE_S, Step.LATE_PROBING: PROBE_S}
-        self._handshake = Handshake(self, TABLE, Step.GREETING, timeout=Event.TIMEOUT, within_s=within_s)
+        within_s = {HqStep.OFFERED: PROBE_S, HqStep.PROBING: PROBE_S, HqStep.LATE_PROBING: PROBE_S}
+        self._handshake = Handshake(self, TABLE, HqStep.GREETING, timeout=HqEvent.TIMEOUT, within_s=within_s)
         self._silent_until = math.inf
         self._answered: bool | None = None
         """True if the robot got our 5 and we its 6; None if no 5 was sent."""
@@ -206,7 +206,7 @@ class HqHandshake(PacketSession):
         elif self.settings is None:
             raise ProtocolError(f"{type(message).__name__} before serverSettings")
         elif isinstance(message, ServerStartUDP):
-            if not self._handshake.fire(Event.START, now):
+            if not self._handshake.fire(HqEvent.START, now):
                 raise ProtocolError("serverStartUDP a second time")
         else:
             self._others += isinstance(message, DebugMessage)
@@ -230,11 +230,11 @@ class HqHandshake(PacketSession):
         answer = VERSIONS[agreed].answer or message.versions
         features = self._announce if udp else self._announce - {Feature.UDP}
         self.send_first(ClientSettings(answer, announced(answer, features)))
-        self._handshake.fire(Event.SETTINGS_UDP if udp else Event.SETTINGS_TCP, now)
+        self._handshake.fire(HqEvent.SETTINGS_UDP if udp else HqEvent.SETTINGS_TCP, now)
 
     def _take_answer(self, *, works: bool, now: float) -> None:
         self._answered = self._answered or works
-        if not self._handshake.fire(Event.WORKS if works else Event.FAILS, now):
+        if not self._handshake.fire(HqEvent.WORKS if works else HqEvent.FAILS, now):
             raise ProtocolError("serverUDPConnection was not due")
 
     # Actions of the table
@@ -291,7 +291,7 @@ class HqHandshake(PacketSession):
         self._handshake.expire(now)
         if now >= self._silent_until:
             self._silent_until = math.inf
-            self._handshake.fire(Event.SILENCE_OVER, now)
+            self._handshake.fire(HqEvent.SILENCE_OVER, now)
         if now >= self._look_at:
             self._signs.look(self._heard, unanswered=self._answered is False)
             self._doubt()
@@ -311,28 +311,28 @@ class HqHandshake(PacketSession):
         self.doubts = self._signs.gather(self.sender_id, self.traffic)
 
 
-TABLE: dict[Step, dict[Event, tuple[Callable[[HqHandshake, float], None], Step]]] = {
-    Step.GREETING: {
-        Event.SETTINGS_UDP: (HqHandshake._await_start, Step.OFFERED),
-        Event.SETTINGS_TCP: (HqHandshake._finish, Step.STREAM),
+TABLE: dict[HqStep, dict[HqEvent, tuple[Callable[[HqHandshake, float], None], HqStep]]] = {
+    HqStep.GREETING: {
+        HqEvent.SETTINGS_UDP: (HqHandshake._await_start, HqStep.OFFERED),
+        HqEvent.SETTINGS_TCP: (HqHandshake._finish, HqStep.STREAM),
     },
-    Step.OFFERED: {
-        Event.START: (HqHandshake._probe, Step.PROBING),
-        Event.TIMEOUT: (HqHandshake._finish, Step.GIVEN_UP),
+    HqStep.OFFERED: {
+        HqEvent.START: (HqHandshake._probe, HqStep.PROBING),
+        HqEvent.TIMEOUT: (HqHandshake._finish, HqStep.GIVEN_UP),
     },
-    Step.PROBING: {
-        Event.WORKS: (HqHandshake._report_works, Step.SILENT),
-        Event.FAILS: (HqHandshake._report_fails, Step.SILENT),
-        Event.TIMEOUT: (HqHandshake._report_fails, Step.SILENT),
+    HqStep.PROBING: {
+        HqEvent.WORKS: (HqHandshake._report_works, HqStep.SILENT),
+        HqEvent.FAILS: (HqHandshake._report_fails, HqStep.SILENT),
+        HqEvent.TIMEOUT: (HqHandshake._report_fails, HqStep.SILENT),
     },
-    Step.SILENT: {Event.SILENCE_OVER: (HqHandshake._finish, Step.DONE)},
-    Step.STREAM: {Event.START: (HqHandshake._fall_silent_late, Step.LATE_PROBING)},
-    Step.GIVEN_UP: {Event.START: (HqHandshake._probe_late, Step.LATE_PROBING)},
-    Step.LATE_PROBING: {
-        Event.WORKS: (HqHandshake._report_works, Step.LATE_SILENT),
-        Event.FAILS: (HqHandshake._report_fails, Step.LATE_SILENT),
-        Event.TIMEOUT: (HqHandshake._report_fails, Step.LATE_SILENT),
+    HqStep.SILENT: {HqEvent.SILENCE_OVER: (HqHandshake._finish, HqStep.DONE)},
+    HqStep.STREAM: {HqEvent.START: (HqHandshake._fall_silent_late, HqStep.LATE_PROBING)},
+    HqStep.GIVEN_UP: {HqEvent.START: (HqHandshake._probe_late, HqStep.LATE_PROBING)},
+    HqStep.LATE_PROBING: {
+        HqEvent.WORKS: (HqHandshake._report_works, HqStep.LATE_SILENT),
+        HqEvent.FAILS: (HqHandshake._report_fails, HqStep.LATE_SILENT),
+        HqEvent.TIMEOUT: (HqHandshake._report_fails, HqStep.LATE_SILENT),
     },
-    Step.LATE_SILENT: {Event.SILENCE_OVER: (HqHandshake._take_commands, Step.DONE)},
-    Step.DONE: {},
+    HqStep.LATE_SILENT: {HqEvent.SILENCE_OVER: (HqHandshake._take_commands, HqStep.DONE)},
+    HqStep.DONE: {},
 }

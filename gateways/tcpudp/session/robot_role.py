@@ -2,12 +2,12 @@
 
 Source: "Handshake", "Settings and version negotiation" and "The gateway as robot" of the protocol page.
 
-Theory of operation. The handshake is the table at the foot of this file: :class:`Step` says what the session waits for,
-:class:`Event` what can happen, and every row names the action that is taken. The session is ``established`` from the
-steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only. The client's 7 never makes
-a source: 7(false) is reliable, 7(true) is not, as programs of 1.3 always send it. A program that gets a 6 sends its 7
-at once. So a 7 later than :data:`PROBE_S` after the 4 tells that the program got no 6: the 5 may have been somebody
-else's, and the source is dropped.
+Theory of operation. The handshake is the table at the foot of this file: :class:`RobotStep` says what the session waits
+for, :class:`RobotEvent` what can happen, and every row names the action that is taken. The session is ``established``
+from the steps STREAM and DONE on. Datagrams are claimed in the steps PROBED, ANSWERED and DONE only. The client's 7
+never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3 always send it. A program that gets a 6
+sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 shows that the program got no 6: the 5 may have been
+somebody else's, and the source is dropped.
 
 Any process of the HQ program's host can send datagrams, and they tell nothing but their source. A port becomes the
 client's source in two ways only:
@@ -141,7 +141,7 @@ _HANDSHAKING, _ESTABLISHED = State.HANDSHAKING, State.ESTABLISHED
 """As plain names: every client of a host is asked about every datagram that has no owner yet."""
 
 
-class Step(Enum):
+class RobotStep(Enum):
     """What the handshake waits for."""
 
     GREETED = "sent 2, waits for 3"
@@ -152,7 +152,7 @@ class Step(Enum):
     DONE = "established after a 4"
 
 
-class Event(Enum):
+class RobotEvent(Enum):
     """What can happen in a handshake."""
 
     SETTINGS_UDP = "3, and both set the UDP flag"
@@ -215,8 +215,8 @@ class RobotRole(PacketSession):
         """Packet 6, once it was queued."""
         self._report_until = -math.inf
         """Until when a 7(true) answers a 6 that was received."""
-        within_s = {Step.PROBED: PROBE_S, Step.ANSWERED: REPORT_S, Step.UNANSWERED: REPORT_S}
-        self._handshake = Handshake(self, TABLE, Step.GREETED, timeout=Event.TIMEOUT, within_s=within_s)
+        within_s = {RobotStep.PROBED: PROBE_S, RobotStep.ANSWERED: REPORT_S, RobotStep.UNANSWERED: REPORT_S}
+        self._handshake = Handshake(self, TABLE, RobotStep.GREETED, timeout=RobotEvent.TIMEOUT, within_s=within_s)
 
     def restore(self, state: Exported) -> None:
         super().restore(state)
@@ -245,7 +245,7 @@ class RobotRole(PacketSession):
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         elif isinstance(message, ClientUDPConnectionStatus):
             heard = message.connected and now < self._report_until
-            self._fire(Event.REPORT_TRUE if heard else Event.REPORT_FALSE, now)
+            self._fire(RobotEvent.REPORT_TRUE if heard else RobotEvent.REPORT_FALSE, now)
         elif isinstance(message, ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
@@ -263,7 +263,7 @@ class RobotRole(PacketSession):
         self._agreed = agreed
         row = newest((agreed,), known=VERSIONS)
         self.known = self._also_known | (VERSIONS[row].known_to_hq if row is not None else frozenset())
-        self._fire(Event.SETTINGS_UDP if self.settings.udp and self.client.udp else Event.SETTINGS_TCP, now)
+        self._fire(RobotEvent.SETTINGS_UDP if self.settings.udp and self.client.udp else RobotEvent.SETTINGS_TCP, now)
 
     # Datagrams
 
@@ -271,8 +271,8 @@ class RobotRole(PacketSession):
         """Claim a 5 between our 4 and its 7; later a packet with the client's id from its port."""
         step = self._handshake.step
         if self.state is _ESTABLISHED:
-            return step is Step.DONE and self._source.claims_late(datagram, port)
-        probed = self.state is _HANDSHAKING and (step is Step.PROBED or step is Step.ANSWERED)
+            return step is RobotStep.DONE and self._source.claims_late(datagram, port)
+        probed = self.state is _HANDSHAKING and (step is RobotStep.PROBED or step is RobotStep.ANSWERED)
         return probed and self._source.claims_probe(datagram, port)
 
     def rivalled(self, now: float) -> None:
@@ -282,7 +282,7 @@ class RobotRole(PacketSession):
         self._source.lose(for_good=established)
         self.transport = "tcp"
         if not established:
-            self._handshake.fire(Event.RIVAL, now)
+            self._handshake.fire(RobotEvent.RIVAL, now)
 
     def stray(self, datagram: bytes) -> None:
         """Count a datagram with this client's id from an unknown port; raise NotReady with what to tell the client."""
@@ -302,7 +302,7 @@ class RobotRole(PacketSession):
 
     def accept_datagram(self, message: Packet, now: float) -> bool:
         if isinstance(message, ClientUDPConnection):
-            self._fire(Event.PROBE, now)
+            self._fire(RobotEvent.PROBE, now)
             return False
         if self.state is not State.ESTABLISHED:  # until the 7 the source may be somebody else's
             raise ProtocolError(f"{type(message).__name__} by UDP before the handshake is over")
@@ -318,7 +318,7 @@ class RobotRole(PacketSession):
 
     # Actions of the table
 
-    def _fire(self, event: Event, now: float) -> None:
+    def _fire(self, event: RobotEvent, now: float) -> None:
         """Take a message of the handshake; raise ProtocolError if it is not due."""
         if not self._handshake.fire(event, now):
             raise ProtocolError(f"{_MESSAGES[event]} was not due")
@@ -359,34 +359,34 @@ class RobotRole(PacketSession):
 
 
 _MESSAGES = {
-    Event.PROBE: "clientUDPConnection",
-    Event.REPORT_TRUE: "clientUDPConnectionStatus",
-    Event.REPORT_FALSE: "clientUDPConnectionStatus",
+    RobotEvent.PROBE: "clientUDPConnection",
+    RobotEvent.REPORT_TRUE: "clientUDPConnectionStatus",
+    RobotEvent.REPORT_FALSE: "clientUDPConnectionStatus",
 }
-TABLE: dict[Step, dict[Event, tuple[Callable[[RobotRole, float], None], Step]]] = {
-    Step.GREETED: {
-        Event.SETTINGS_UDP: (RobotRole._offer_udp, Step.PROBED),
-        Event.SETTINGS_TCP: (RobotRole._finish, Step.STREAM),
+TABLE: dict[RobotStep, dict[RobotEvent, tuple[Callable[[RobotRole, float], None], RobotStep]]] = {
+    RobotStep.GREETED: {
+        RobotEvent.SETTINGS_UDP: (RobotRole._offer_udp, RobotStep.PROBED),
+        RobotEvent.SETTINGS_TCP: (RobotRole._finish, RobotStep.STREAM),
     },
-    Step.PROBED: {
-        Event.PROBE: (RobotRole._answer_probe, Step.ANSWERED),
-        Event.TIMEOUT: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
+    RobotStep.PROBED: {
+        RobotEvent.PROBE: (RobotRole._answer_probe, RobotStep.ANSWERED),
+        RobotEvent.TIMEOUT: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.RIVAL: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.ANSWERED: {
-        Event.RIVAL: (RobotRole._reject_both, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
-        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    RobotStep.ANSWERED: {
+        RobotEvent.RIVAL: (RobotRole._reject_both, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
+        RobotEvent.TIMEOUT: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.UNANSWERED: {
-        Event.RIVAL: (RobotRole._send_no_answer, Step.UNANSWERED),
-        Event.REPORT_TRUE: (RobotRole._finish, Step.DONE),
-        Event.REPORT_FALSE: (RobotRole._drop_source, Step.DONE),
-        Event.TIMEOUT: (RobotRole._drop_source, Step.DONE),
+    RobotStep.UNANSWERED: {
+        RobotEvent.RIVAL: (RobotRole._send_no_answer, RobotStep.UNANSWERED),
+        RobotEvent.REPORT_TRUE: (RobotRole._finish, RobotStep.DONE),
+        RobotEvent.REPORT_FALSE: (RobotRole._drop_source, RobotStep.DONE),
+        RobotEvent.TIMEOUT: (RobotRole._drop_source, RobotStep.DONE),
     },
-    Step.STREAM: {},
-    Step.DONE: {},
+    RobotStep.STREAM: {},
+    RobotStep.DONE: {},
 }

@@ -9,8 +9,15 @@ from collections.abc import Sequence
 from typing import NoReturn, Unpack
 
 from gateways.wc2ec.conformance import parser as wire
-from gateways.wc2ec.conformance.machine import Motor, Robot
-from gateways.wc2ec.conformance.parser import DEFAULT, Device, Dialect, Message, Reader, Times
+from gateways.wc2ec.conformance.machine import JudgedMotor, JudgedWebots
+from gateways.wc2ec.conformance.parser import (
+    DEFAULT,
+    Dialect,
+    ExternalReader,
+    ParsedWc2EcMessage,
+    SimulatedDevice,
+    Wc2EcTimes,
+)
 from zbridge.simulation.fragile import FragileServer
 from zbridge.simulation.judge import Bounds, Chances, Ended, show
 from zbridge.simulation.sockets import drain, reset_on_close
@@ -18,10 +25,10 @@ from zbridge.simulation.timing import Ticker
 
 _MOST_MOVE_S = 0.1
 """Longest time for which the robot moves in one step, however late it is."""
-_DEPLOYED = Times()
+_DEPLOYED = Wc2EcTimes()
 
 
-class FragileController(FragileServer):
+class FragileWebotsController(FragileServer):
     """One start of a simulation: serves one external controller, records every violation, dies of the deadly ones.
 
     It ends when its external controller leaves ("Roles"). ``devices``: default those of ``DEFAULT``; ``values``:
@@ -30,16 +37,16 @@ class FragileController(FragileServer):
     """
 
     KEEP = 100_000
-    _reader: Reader
+    _reader: ExternalReader
 
     def __init__(
         self,
         dialect: Dialect,
         *,
-        devices: Sequence[Device] | None = None,
+        devices: Sequence[SimulatedDevice] | None = None,
         seed: int = 1,
         values: int = 3,
-        times: Times = _DEPLOYED,
+        times: Wc2EcTimes = _DEPLOYED,
         **bounds: Unpack[Bounds],
     ) -> None:
         if dialect not in DEFAULT:
@@ -49,10 +56,10 @@ class FragileController(FragileServer):
         self.devices = tuple(DEFAULT[dialect] if devices is None else devices)
         wire.check(dialect, self.devices)
         chance = Chances(seed)
-        self.robot = Robot(self.devices, chance["robot"], values)
+        self.robot = JudgedWebots(self.devices, chance["robot"], values)
         self.registered = dialect == "draft"
         """Whether the last registration was sent."""
-        self._reader = Reader(dialect, self.devices, values)
+        self._reader = ExternalReader(dialect, self.devices, values)
         self._times, self._cuts = times, chance["cuts"]
         self._part_s, self._part_noted = 0.0, False
 
@@ -60,7 +67,7 @@ class FragileController(FragileServer):
         return "OVER" if self._over.is_set() else "LISTENING" if self._conn is None else "CONNECTED"
 
     @property
-    def motors(self) -> dict[str, Motor]:
+    def motors(self) -> dict[str, JudgedMotor]:
         """The motors by name, as they are now."""
         return self.robot.motors
 
@@ -139,7 +146,7 @@ class FragileController(FragileServer):
             self._part_noted = True
             self._violate(f"part of a command, and no more for {self._part_s:.2f} s: {show(self._reader.rest)}")
 
-    def _receive(self, message: Message) -> None:
+    def _receive(self, message: ParsedWc2EcMessage) -> None:
         self.received.append((time.monotonic(), message.command, message.node_type, message.number, message.value))
         raw = show(message.raw)
         if not self.registered and not message.deadly:

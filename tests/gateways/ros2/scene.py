@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from gateways.ros2.options import Options
+from gateways.ros2.options import RosOptions
 from gateways.ros2.translate import RosRobot
 from tests.gateways.rig import drained
 from zbridge.metrics import Metrics
@@ -46,7 +46,7 @@ class RosScene:
 
     def __init__(self, **options: Any) -> None:
         self.metrics = Metrics()
-        self.robot = RosRobot(Options(**options), 1, self.metrics)
+        self.robot = RosRobot(RosOptions(**options), 1, self.metrics)
         self.session = self.robot.session("router", "tcp://h:1")
         self.now = 100.0
         self.written: list[KeyedSample] = []

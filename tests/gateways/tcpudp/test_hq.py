@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from gateways.tcpudp import hq as display
 from gateways.tcpudp import hq_client as client_module
 from gateways.tcpudp.hq import TcpUdpHq
-from gateways.tcpudp.hq_client import HqClient
+from gateways.tcpudp.hq_client import TcpUdpClient
 from gateways.tcpudp.messages import Packet, encode_packet
-from gateways.tcpudp.options import HqOptions
+from gateways.tcpudp.options import TcpUdpHqOptions
 from tests.gateways.tcpudp import frames as f
 from zbridge.errors import EncodeError, ProtocolError
 from zbridge.fleet import payload as codec
@@ -63,13 +63,13 @@ def knowing(grid: Map | None = None, pose: Pose | None = None, view: RobotView |
 
 
 def side(view: RobotView | None = None, **options: Any) -> TcpUdpHq:
-    return TcpUdpHq(HqOptions(**options), view or RobotView())
+    return TcpUdpHq(TcpUdpHqOptions(**options), view or RobotView())
 
 
 class Client(f.Timed):
     """A client of a listener; every act gives the frames that left because of it within a second."""
 
-    session: HqClient
+    session: TcpUdpClient
 
     def __init__(self, listener: TcpUdpHq, number: int = 2) -> None:
         self.listener = listener
@@ -221,7 +221,7 @@ def test_clients_have_ids_of_their_own_a_deadman_and_no_right_to_drive_at_first_
     assert listener.deadman_s == 1.3
     assert listener.initial_commands() == ((topics.CMD_MODE, Mode("none")),)
     with pytest.raises(msgspec.ValidationError, match="slam_map_size is smaller than slam_map_interval"):
-        msgspec.convert({"slam_map_size": 5, "slam_map_interval": 10}, HqOptions)
+        msgspec.convert({"slam_map_size": 5, "slam_map_interval": 10}, TcpUdpHqOptions)
 
 
 # What clients are shown

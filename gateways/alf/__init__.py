@@ -34,7 +34,7 @@ listen = "tcp://127.0.0.1:6667"
 [hq.options]
 dialect = "text"                        # what programs in the field speak; "binary": the document's packed fields
 serve = "auto"                          # 1 and 2 until a client sends its first 3, from then on 4 and no 1; or always
-                                        # "drive", "laser", "both": no deployed program bears both kinds
+                                        # "drive", "laser", "both": no deployed program tolerates both
 points = 769                            # points of a measurement; scans of another number are resampled by angle
 # acceleration_m_s2 = 9.80665           # one unit of acceleration; left out: 1 g in text, 0.001 g in binary
 # gyro_rad_s = 0.017453292519943295     # one unit of gyro; left out: 1 degree/s in text, 0.1 in binary

@@ -81,7 +81,7 @@ class AlfClient(VehicleRole):
         if self.scanner is not None:
             self.outbox.withdraw(self.scanner)
 
-    def know(self, scanner: bytes | None) -> None:
+    def send_scanner(self, scanner: bytes | None) -> None:
         """Send a scanner init that the client does not have yet, before any measurement that needs it."""
         if scanner is not None and scanner != self.scanner and self.laser:
             self.outbox.clear("scan")
@@ -176,7 +176,7 @@ class AlfHq(HqSide):
         scan = self.view.scan
         known = scan if scan is not None and len(scan.ranges) else self.view.scanner
         if session.laser and known is not None:
-            session.know(self._sweep_of(known).init)
+            session.send_scanner(self._sweep_of(known).init)
 
     # What is shown
 
@@ -185,7 +185,7 @@ class AlfHq(HqSide):
             return self._measurement(message) if len(message.ranges) else None
         if isinstance(message, Scanner):
             init = self._sweep_of(message).init
-            return lambda session, now: session.know(init)
+            return lambda session, now: session.send_scanner(init)
         return self._info(message) if isinstance(message, Motion) else None
 
     def _sweep_of(self, known: Scan | Scanner) -> Sweep:
@@ -201,7 +201,7 @@ class AlfHq(HqSide):
 
         def send(session: AlfClient, now: float) -> None:
             if session.laser:
-                session.know(sweep.init)
+                session.send_scanner(sweep.init)
                 session.outbox.set("scan", (frame,), now)
 
         return send

@@ -1,7 +1,7 @@
 """The five messages of ALF, each declared once for both dialects, and their framing.
 
 Source: the message table, "Dialect `binary`" and "Dialect `text`" of the protocol page. A field's type is its
-binary form; a comment tells where the text form is a different number. Sans-IO.
+binary form; a comment marks a field whose text form differs. Sans-IO.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def binary_size(message_id: int, points: int) -> int:
 
 
 def binary_frame_end(ids: frozenset[int], points: Callable[[], int]) -> FrameEnd:
-    """Make the framing function of the binary dialect: the id tells the length; ``points()``, that of a measurement.
+    """Make the framing function of the binary dialect: the id sets the length, ``points()`` that of a measurement.
 
     Bytes that begin no message make a frame of their own, up to the next byte that might.
     """

@@ -58,7 +58,7 @@ UNITS = {
     AlfDialect.TEXT: (STANDARD_GRAVITY, math.radians(1.0)),
     AlfDialect.BINARY: (STANDARD_GRAVITY / 1000, math.radians(0.1)),
 }
-"""One unit of acceleration (m/s2) and of gyro (rad/s), unless the options tell another."""
+"""One unit of acceleration (m/s2) and of gyro (rad/s), unless the options set another."""
 
 Ints = npt.NDArray[np.int64]
 Scale = Annotated[float, msgspec.Meta(gt=0, le=1e6)]

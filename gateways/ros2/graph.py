@@ -1,4 +1,4 @@
-"""Who publishes a robot's topics and who takes its commands, as the liveliness tokens of ROS nodes tell. Sans-IO."""
+"""Who publishes a robot's topics and who subscribes to its commands, by the liveliness tokens of ROS nodes. Sans-IO."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from zbridge.protocol import ProtocolError
 from zbridge.ros2 import NO_HASH, Endpoint, Kind, Types, endpoints_of, read_token
 
 ENDPOINTS = 64
-"""Publishers of the robot, takers of its commands, and other drivers that are known, each; more are not looked at."""
+"""Most known publishers of the robot, subscribers to its commands, and other drivers, each; the rest is ignored."""
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """One topic that is read. kept: the last message from before is wanted too."""
+    """One topic that is read. latched: a late subscriber gets the last message."""
 
     name: str
-    heard: type[Received]
+    received: type[Received]
     types: tuple[str, ...]
-    kept: bool
+    latched: bool
 
 
 class Graph:
@@ -35,10 +35,10 @@ class Graph:
             for option, name in topics
             if name is not None
         }
-        self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), kept=False)
+        self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), latched=False)
         self.publishers: dict[str, Endpoint] = {}
         """By their tokens, as the next two."""
-        self.takers: dict[str, Endpoint] = {}
+        self.subscribers: dict[str, Endpoint] = {}
         self.drivers: dict[str, Endpoint] = {}
         """Other nodes that publish on the topic of commands."""
         self.wrong: dict[str, str] = {}
@@ -48,7 +48,9 @@ class Graph:
         """For each key that is read: what it is, and the type of its messages."""
 
     def __repr__(self) -> str:
-        return f"<Graph of {len(self.publishers)} publishers, {len(self.takers)} takers, {len(self.drivers)} drivers>"
+        return (
+            f"<Graph publishers={len(self.publishers)} subscribers={len(self.subscribers)} drivers={len(self.drivers)}>"
+        )
 
     def watched(self) -> list[str]:
         """List the expressions of the tokens that matter."""
@@ -80,14 +82,14 @@ class Graph:
         return endpoint
 
     def knows(self, token: str) -> bool:
-        """Tell whether a token is one of those that were looked at."""
-        return any(token in table for table in (self.publishers, self.takers, self.drivers, self.wrong))
+        """Return whether a token was read before."""
+        return any(token in table for table in (self.publishers, self.subscribers, self.drivers, self.wrong))
 
     def gone(self, token: str) -> bool:
         """Forget an endpoint; False if it was not known."""
         if self.wrong.pop(token, None) is not None:
             return True
-        for table in (self.publishers, self.takers, self.drivers):
+        for table in (self.publishers, self.subscribers, self.drivers):
             endpoint = table.pop(token, None)
             if endpoint is not None:
                 for gid in endpoint.gids():
@@ -109,9 +111,9 @@ class Graph:
         return f"nobody publishes {', '.join(self._wanted)}"
 
     @property
-    def idle_drive(self) -> str | None:
+    def drive_problem(self) -> str | None:
         """Say why the robot cannot be driven; None if it can."""
-        if self.takers:
+        if self.subscribers:
             return None
         if self.command_topic is None:
             return "cmd_vel is turned off"
@@ -121,7 +123,7 @@ class Graph:
     def _place(self, endpoint: Endpoint) -> tuple[dict[str, Endpoint], Wanted]:
         if endpoint.name == self.command_topic:
             if endpoint.kind is Kind.SUBSCRIBER:
-                return self.takers, self._command
+                return self.subscribers, self._command
             if endpoint.kind is Kind.PUBLISHER:
                 return self.drivers, self._command
         wanted = self._wanted.get(endpoint.name)

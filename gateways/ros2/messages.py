@@ -17,7 +17,7 @@ _NS_PER_S = 1_000_000_000
 
 
 class LinkEvent(msgspec.Struct, frozen=True):
-    """What the link tells about itself: it is open, a token appeared or is gone, samples were dropped."""
+    """News of the link: it is open, a token appeared or is gone, samples were dropped."""
 
     sample: KeyedSample
 
@@ -76,13 +76,13 @@ RECEIVED: dict[str, tuple[type[Received], str]] = {
 }
 """For each option that names a topic: the class of its messages, and their type."""
 TRANSIENT_LOCAL = frozenset({"map"})
-"""Topics whose last message comes to who is late."""
+"""Topics with the durability of the name: a late subscriber gets the last message."""
 LIVE = (LaserScan, Odometry, Imu)
-"""Messages that are sent as soon as they are measured: their stamps tell the robot's clock."""
+"""Messages that robots send as soon as they measure: their stamps are the robot's clock."""
 
 
 class Velocity(msgspec.Struct, frozen=True):
-    """What a Twist says: m/s forward and to the left, rad/s counter-clockwise."""
+    """The content of a Twist: m/s forward and to the left, rad/s counter-clockwise."""
 
     forward: float = 0.0
     left: float = 0.0

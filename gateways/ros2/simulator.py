@@ -1,7 +1,7 @@
 """A simulated ROS 2 robot: two wheels, a lidar, an IMU, a battery and a map it makes, and ROS's router beside it.
 
-Its node does on Zenoh what nodes with rmw_zenoh do. Deterministic with a seed. Like ROS's own controllers it stands
-still when no command came for :data:`TIMEOUT_S`.
+Its node does on Zenoh what nodes with rmw_zenoh do. Deterministic with a seed. Like ROS's own controllers it stops
+when no command came for :data:`TIMEOUT_S`.
 """
 
 from __future__ import annotations
@@ -108,15 +108,19 @@ class NodeRole(Session[Any]):
     def _begin(self, zid: str) -> None:
         node = Node(self._domain, zid, 0, self._namespace, "robot")
         prefix, types = self._namespace.rstrip("/"), self._types
-        taker = Endpoint(
+        subscriber = Endpoint(
             node, 1, Kind.SUBSCRIBER, f"{prefix}/cmd_vel", self._command_type, types.hash(self._command_type)
         )
         for number, (name, (type_name, qos)) in enumerate(_TOPICS.items(), 2):
             self._publishers[name] = Endpoint(
                 node, number, Kind.PUBLISHER, f"{prefix}/{name}", type_name, types.hash(type_name), qos
             )
-        self.send_first(subscription(taker.key))
-        for token in (node.token(), taker.token(), *(publisher.token() for publisher in self._publishers.values())):
+        self.send_first(subscription(subscriber.key))
+        for token in (
+            node.token(),
+            subscriber.token(),
+            *(publisher.token() for publisher in self._publishers.values()),
+        ):
             self.send_first(KeyedSample(SampleKind.ANNOUNCE, token))
 
     def publish(self, name: str, message: Any) -> None:
@@ -273,7 +277,7 @@ async def simulate(simulation: Simulation) -> None:
 
 
 def _with_port(address: Address) -> Address:
-    """Find a free port where none is told: Zenoh does not say which one it takes."""
+    """Find a free port where none is set: Zenoh does not report the one it binds."""
     if address.port:
         return address
     with socket.create_server((address.host, 0)) as free:

@@ -108,11 +108,11 @@ class RosRobot(Robot):
             ranges[~((ranges >= low) & (ranges <= high))] = np.nan
         stamp, device_ms = self._stamps(message, stamp_ns)
         scan = Scan(first, increment, low, high, ranges, stamp_ns=stamp, device_ms=device_ms)
-        told = (first, first + increment * (count - 1), increment, float(body.time_increment), low, high, count)
-        if self._scanner is not None and self._scanner_fields(self._scanner) == told:
+        geometry = (first, first + increment * (count - 1), increment, float(body.time_increment), low, high, count)
+        if self._scanner is not None and self._scanner_fields(self._scanner) == geometry:
             return ((topics.SCAN, scan),)
-        _require(math.isfinite(told[3]), "scan with a time increment that is no number")
-        self._scanner = Scanner(*told, stamp_ns=stamp)
+        _require(math.isfinite(geometry[3]), "scan with a time increment that is no number")
+        self._scanner = Scanner(*geometry, stamp_ns=stamp)
         return ((topics.SCANNER, self._scanner), (topics.SCAN, scan))
 
     @staticmethod

@@ -25,7 +25,7 @@ udp = true                              # use datagrams where the robot offers t
 gap_s = 0.01                            # least time between two packets: robots take one read as one packet
 force = []                              # features to use although the robot does not announce them, for
                                         # example ["joystick", "lidar"], and ids of raw packets it knows
-announce = ["udp", "lidar_sim"]         # features the gateway says it has; without "lidar_sim" a 1.4 robot sends no map
+announce = ["udp", "lidar_sim"]         # features the gateway announces; without "lidar_sim" a 1.4 robot sends no map
 combine = "exclusive"                   # drive that moves and turns: "exclusive" sends the larger, "both" both
 speed_full = 1.0                        # packet speed at full scale
 turn_full = 1.0                         # packet turn speed at full scale
@@ -36,12 +36,12 @@ map_cell_m = 0.01                       # side of a map cell where the robot doe
 """
 HQ_TEMPLATE = """\
 protocol = "tcpudp"
-listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and hear datagrams from this address and port
+listen = "tcp://127.0.0.1:11002"        # clients bind UDP 11000, and receive datagrams from this address and port only
 [hq.options]
 versions = ["1.1", "1.2", "1.3"]        # sent to the letter; programs of 1.1 or 1.2 understand only ["1.1"] or ["1.2"]
 udp = true                              # offer datagrams: 1.3 programs drive by nothing else
-client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is heard from
-                                        # there alone; 0: from nowhere
+client_port = 11000                     # the UDP port that programs bind: one whose packet 5 was lost is accepted
+                                        # from there alone; 0: from nowhere
 gap_s = 0.01                            # least time between two packets: programs take one read as one packet
 quiet_s = 2.0                           # before a client's id is given again
 known = []                              # packet ids that these programs know besides those of their version

@@ -259,7 +259,7 @@ class TcpUdpDisplay:
         return each_once(DebugMessage(ascii_text(message.text))) if message.text else None
 
     def _raw(self, message: Raw) -> Send | None:
-        """Pass on what the robot said in packets that no fleet message holds."""
+        """Pass on packets of the robot that no fleet message holds."""
         spec = PACKETS.get(message.id)
         if spec is not None and spec.packet is ChatMessage:
             return each_once(ChatMessage(message.body))

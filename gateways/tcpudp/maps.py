@@ -47,7 +47,7 @@ def most_side(packet_bytes: int) -> int:
 
 
 class MapFrame(msgspec.Struct, frozen=True):
-    """Where HQ programs assume a square grid to lie; the protocol does not say.
+    """Where HQ programs assume a square grid to lie; the protocol does not define it.
 
     own: the map is of a robot of this protocol, whose programs expect its zero at the same fraction of the grid as
     before; else the grid is centred on zero. origin: x, y of the first cell, metres; it overrides both.

@@ -19,7 +19,7 @@ from zbridge.protocol import Codec, EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64
-"""Bytes of the longest packet that is taken: a map of 2048 x 2048 with its header."""
+"""Bytes of the longest packet that is accepted: a map of 2048 x 2048 with its header."""
 HEADER = struct.Struct("<iBB")
 _HEADER_SIZE = HEADER.size
 _LENGTH = struct.Struct("<i").unpack_from
@@ -119,7 +119,7 @@ class ServerStartUDP(Packet, frozen=True):
 
 @packet(5, "clientUDPConnection", PacketSender.HQ, Carrier.UDP)
 class ClientUDPConnection(Packet, frozen=True):
-    """The datagram that tells the robot where the HQ's socket is."""
+    """The datagram that shows the robot the address of the HQ's socket."""
 
 
 @packet(6, "serverUDPConnection", PacketSender.ROBOT, Carrier.UDP)

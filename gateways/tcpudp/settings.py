@@ -69,18 +69,18 @@ class RobotSettings13(Settings13, frozen=True):
 _CODECS = {block: BinaryCodec(block) for block in (Settings, Settings12, Settings13, RobotSettings13)}
 
 
-def _kept(block: Settings | None) -> list[Any] | None:
+def _write_settings(block: Settings | None) -> list[Any] | None:
     return None if block is None else [type(block).__name__, block.encode()]
 
 
-def _restored(raw: list[Any] | None) -> Settings | None:
+def _read_snapshot(raw: list[Any] | None) -> Settings | None:
     if raw is None:
         return None
     name, block = raw
     return next(codec for kind, codec in _CODECS.items() if kind.__name__ == name).decode(block, 0)
 
 
-SETTINGS = Form(_kept, _restored)
+SETTINGS = Form(_write_settings, _read_snapshot)
 """A settings block of any version, or None, as it is handed on."""
 HQ_BLOCKS: dict[str, type[Settings]] = {"1.1": Settings, "1.2": Settings12, "1.3": Settings13}
 """The settings block an HQ sends, by the newest version it lists."""

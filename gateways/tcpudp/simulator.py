@@ -84,24 +84,24 @@ class Vehicle:
         self.lidar = True
         self._rng = rng
         self._motion = (0.0, 0.0, 0.0)
-        self._silent_s = 0.0
+        self._idle_s = 0.0
 
     def __repr__(self) -> str:
         return f"<Vehicle {self.body} moving {self._motion}>"
 
     @property
     def moving(self) -> bool:
-        """True while it moves as it was told."""
+        """True while it moves as commanded."""
         return any(self._motion)
 
     def step(self, dt: float) -> None:
         """Live for ``dt`` seconds."""
-        self._silent_s += dt
-        if self._silent_s > SILENCE_S:
+        self._idle_s += dt
+        if self._idle_s > SILENCE_S:
             self._motion = (0.0, 0.0, 0.0)
         self.body.step(*self._motion, dt)
 
-    def look(self) -> None:
+    def sweep_lidar(self) -> None:
         """Enter one sweep of its own lidar into the map."""
         angles = self.body.heading + _DEGREES
         ranges = cast(self.body.x, self.body.y, angles, LIDAR_RANGE_M)
@@ -150,7 +150,7 @@ class Vehicle:
         finite = all(math.isfinite(value) for value in (forward, left, turn))
         scale = max(math.hypot(forward, left) / SPEED_M_S, abs(turn) / TURN_RAD_S, 1.0)
         self._motion = (forward / scale, left / scale, turn / scale) if finite else (0.0, 0.0, 0.0)
-        self._silent_s = 0.0
+        self._idle_s = 0.0
 
     def _see(self, message: ClientSimulatedLidarData) -> None:
         ranges = message.ranges.astype(np.float64) * UNIT_M
@@ -166,7 +166,7 @@ class RobotSimulator(Simulator[Packet]):
     def __init__(self, seed: int, version: str = "1.3", *, udp: bool = False) -> None:
         super().__init__(log, datagrams=udp)
         self.vehicle = Vehicle(seed)
-        self.vehicle.look()
+        self.vehicle.sweep_lidar()
         self._versions = VERSIONS[version].listed.split(",")
         self._settings = settings_of(version, udp=udp)
         self._parts = version == "1.4"
@@ -206,9 +206,9 @@ class RobotSimulator(Simulator[Packet]):
             self.tell(self.vehicle.position())
         if steps % _MAP_EVERY == 0:
             if self.vehicle.lidar:
-                self.vehicle.look()
+                self.vehicle.sweep_lidar()
             if self._parts:
-                self._tell_part(steps // _MAP_EVERY)
+                self._send_part(steps // _MAP_EVERY)
             else:
                 self.tell(self.vehicle.map())
         if steps % _ASK_EVERY == _ASK_EVERY // 2:
@@ -217,7 +217,7 @@ class RobotSimulator(Simulator[Packet]):
             self.tell(ServerCamMode(2))
             self.tell(ServerLidarStatus(1))
 
-    def _tell_part(self, number: int) -> None:
+    def _send_part(self, number: int) -> None:
         """Send a part of the map to every HQ that announced LidarSim, as deployed robots do."""
         cells = self.vehicle.grid.cells.tobytes()
         size = -(-len(cells) // PARTS)

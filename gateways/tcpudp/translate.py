@@ -78,7 +78,7 @@ class TcpUdpRobot(Robot):
     hands_over = True
     kept: ClassVar[dict[str, Any]] = {
         "_chosen": str | None,
-        "_rests_until": float,
+        "_stop_until": float,
         "_telemetry": TelemetryTranslator,
     }
 
@@ -91,7 +91,7 @@ class TcpUdpRobot(Robot):
         self._session: HqRole | None = None
         self._chosen: str | None = None
         """The mode that was commanded last."""
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         """How long a stop or a neutral is repeated."""
         self._was_autonomous = False
         """Whether a gateway before this one may have sent mode 3."""
@@ -109,7 +109,7 @@ class TcpUdpRobot(Robot):
             predecessor=self._session,
         )
         self._session.sent_autonomous = self._session.sent_autonomous or self._was_autonomous
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         self._telemetry.begin(self._session)
         return self._session
 
@@ -135,9 +135,9 @@ class TcpUdpRobot(Robot):
         if until > now:
             session.send_nothing_again()
         elif session.misreads:
-            self._rest(now, until=until)
+            self._repeat_stop(now, until=until)
             return
-        self._rest(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
+        self._repeat_stop(now, period_s=STOP_REPEAT_S, until=until, urgent=True)
 
     def was_autonomous(self) -> None:
         """Send the pair of packets from the first stop on ("Stops after mode 3")."""
@@ -155,7 +155,7 @@ class TcpUdpRobot(Robot):
         return _sendable(session, self._stop_packets(paired=session.sent_autonomous or self._chosen == AUTONOMOUS))
 
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
-        """Load numpy for a robot that has maps or takes scans: now, and not when the first one comes while it moves."""
+        """Load numpy for a robot with maps or simulated lidar: now, not with the first one while it moves."""
         session = self._session
         if session is not None and {Feature.SLAM_MAP.value, Feature.LIDAR_SIM.value} & set(session.features):
             import numpy  # noqa: F401
@@ -193,29 +193,29 @@ class TcpUdpRobot(Robot):
         session = self._connected()
         frames = tuple(session.encode(packet) for packet in packets)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
-        self._rests_until = -math.inf
+        self._stop_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
 
     def _neutral(self, session: HqRole, now: float) -> None:
-        """Repeat neutral for a second. Where it is repeated already, at its own times: programs say it all the time."""
+        """Repeat neutral for a second. If it is already repeated, keep its times: programs send it all the time."""
         until = now + NEUTRAL_S
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
         if session.outbox.prolong(_MOTION, frames, period_s=REPEAT_S, until=until):
-            self._rests_until = max(self._rests_until, until)
+            self._stop_until = max(self._stop_until, until)
         else:
-            self._rest(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
+            self._repeat_stop(now, period_s=REPEAT_S, until=until, urgent=session.sent_autonomous)
 
     def _mode(self, command: Mode, now: float) -> None:
         """Send the mode. While a stop is repeated: mode 3 ends it, any other mode replaces that of the pair."""
         session = self._connected()
         session.choose_mode(_MODES[command.mode], now)
         self._chosen = command.mode
-        if now >= self._rests_until:
+        if now >= self._stop_until:
             return
         if command.mode == AUTONOMOUS:
             session.outbox.clear(_MOTION)
         elif session.sent_autonomous:
-            self._rest(now, period_s=STOP_REPEAT_S, until=self._rests_until)
+            self._repeat_stop(now, period_s=STOP_REPEAT_S, until=self._stop_until)
 
     def _switch_lidar(self, command: Switch, now: float) -> None:
         self._connected().switch_lidar(ON if command.on else OFF, now)
@@ -223,12 +223,12 @@ class TcpUdpRobot(Robot):
     def _switch_camera(self, command: Switch, now: float) -> None:
         raise Unsupported("no packet turns a camera on or off")
 
-    def _say(self, command: Text, now: float) -> None:
+    def _send_text(self, command: Text, now: float) -> None:
         if command.kind != "debug":
             raise Unsupported(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
         self._send(DebugMessage(command.text))
 
-    def _feed_scan(self, command: Scan, now: float) -> Outcome:
+    def _send_scan(self, command: Scan, now: float) -> Outcome:
         self._send(ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
         return Outcome(telemetry=((topics.SCAN, command),))
 
@@ -238,7 +238,7 @@ class TcpUdpRobot(Robot):
     def _send(self, message: Packet) -> None:
         self._connected().send(message)
 
-    def _rest(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
+    def _repeat_stop(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
         """Repeat the packets of a stop; raise Refused if the robot may be sent none of them."""
         session, spacing_s = self._connected(), 0.0
         frames = _sendable(session, self._stop_packets(paired=session.sent_autonomous))
@@ -246,7 +246,7 @@ class TcpUdpRobot(Robot):
             spacing_s = IDLE_STOP_S / 2
             period_s = max(period_s, spacing_s)
         session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
-        self._rests_until = until
+        self._stop_until = until
 
     def _stop_packets(self, *, paired: bool) -> tuple[Packet, ...]:
         """Packet 13; ``paired``: after a mode that ends mode 3, the one that the holder wants or none."""
@@ -291,8 +291,8 @@ _COMMANDS: dict[str, Callable[[TcpUdpRobot, Any, float], Outcome | None]] = {
     topics.CMD_MODE.path: TcpUdpRobot._mode,
     topics.CMD_LIDAR.path: TcpUdpRobot._switch_lidar,
     topics.CMD_CAMERA.path: TcpUdpRobot._switch_camera,
-    topics.CMD_TEXT.path: TcpUdpRobot._say,
-    topics.CMD_SCAN.path: TcpUdpRobot._feed_scan,
+    topics.CMD_TEXT.path: TcpUdpRobot._send_text,
+    topics.CMD_SCAN.path: TcpUdpRobot._send_scan,
     topics.CMD_RAW(NAME).path: TcpUdpRobot._send_raw,
 }
 

@@ -26,7 +26,7 @@ motor_types = { rotational = [53], linear = [46] }  # type bytes that are motors
 # bounds_default = [0.0, 1000.0]        # readings outside are faults; these bounds are the deployed application's
 # bounds = { front = [-1.0, 5000.0] }   # others for some sensors
 # tables = { front = [[0.0, 1.0], [1000.0, 0.02]] }  # from a sensor's value to metres (or irradiance), interpolated
-# bearings_deg = { front = 0.0, left = 90.0 }  # where distance sensors look, counter-clockwise: they make a scan
+# bearings_deg = { front = 0.0, left = 90.0 }  # directions of distance sensors, counter-clockwise: they make a scan
 # scan_range_m = [0.0, 10.0]
 # devices = [{ name = "light0", number = 0 }]  # draft only: the devices there are, kind = "light" by default
 # pinned = ["light0"]                   # draft only: sensors that measure though nobody listens

@@ -1,4 +1,4 @@
-"""The devices that external controllers are told a robot has, sectors of its scan among them. Sans-IO.
+"""The devices that external controllers see of a robot, sectors of its scan among them. Sans-IO.
 
 Each device keeps its name and number while any controller knows it: controllers learn each number once. Only when no
 number is left, devices that the robot has no longer and that no controller knows give theirs up.

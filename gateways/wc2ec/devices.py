@@ -37,7 +37,9 @@ class RegisteredDevices(Kept):
 
     kept: ClassVar[dict[str, Any]] = {
         "collisions": list[str],
-        "_by_number": Form(lambda table: [_written(device) for device in table.values()], lambda raw: _read(raw)),
+        "_by_number": Form(
+            lambda table: [_write_device(device) for device in table.values()], lambda raw: _read_devices(raw)
+        ),
     }
 
     def __init__(self) -> None:
@@ -103,14 +105,14 @@ def kind_of(kind_byte: int, motor_types: dict[str, tuple[int, ...]]) -> str:
     return _SENSOR_KINDS.get(kind_byte, f"type{kind_byte}")
 
 
-def _written(device: WebotsDevice) -> list[Any]:
+def _write_device(device: WebotsDevice) -> list[Any]:
     """Write a device as MessagePack holds it: a name may have bytes that are not UTF-8."""
     name = device.name.encode("utf-8", "surrogateescape")
     shown = None if device.shown == device.name else device.shown
     return [name, shown, device.number, device.type, device.kind]
 
 
-def _read(raw: Any) -> dict[int, WebotsDevice]:
+def _read_devices(raw: Any) -> dict[int, WebotsDevice]:
     devices = {}
     for written, shown, number, kind_byte, kind in msgspec.convert(raw, list[tuple[bytes, str | None, int, int, str]]):
         name = written.decode("utf-8", "surrogateescape")

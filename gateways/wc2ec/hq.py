@@ -122,7 +122,7 @@ class Wc2EcDisplay:
         """The value that was encoded last of each device."""
         self._readings_gone: dict[str, Reading] = {}
         self._scan_gone: Scan | None = None
-        """The last readings and scan of a robot that was lost since: they say nothing about it now."""
+        """The last readings and scan of a robot that was lost since: they are out of date now."""
 
     def __repr__(self) -> str:
         return f"<Wc2EcDisplay of {self._table!r}>"

@@ -30,7 +30,7 @@ from zbridge.protocol import Limits, ProtocolError, Telemetry
 
 
 class Wc2EcClient(ControllerRole):
-    """One controller: which devices it was told, which it enabled (draft), and how it set the two wheels."""
+    """One controller: which devices it knows, which it enabled (draft), and how it set the two wheels."""
 
     kept: ClassVar[dict[str, Any]] = {
         "registered": set[int],
@@ -38,7 +38,7 @@ class Wc2EcClient(ControllerRole):
         "wheels": dict[str, float],
         "fresh": set[str],
         "joined_at": float,
-        "said_at": float,
+        "received_at": float,
     }
     handled = frozenset({SetValue})
 
@@ -51,11 +51,11 @@ class Wc2EcClient(ControllerRole):
         """The wheels that were set since the last drive."""
         self.joined_at = math.inf
         """When the values set so far become a drive, at the latest."""
-        self.said_at = -math.inf
+        self.received_at = -math.inf
         """When the last value came."""
 
     def accept(self, message: Wc2EcMessage, now: float) -> bool:
-        self.said_at = now
+        self.received_at = now
         return super().accept(message, now)
 
 
@@ -63,7 +63,7 @@ _MOST = 1e9
 
 
 class ControllerCommands:
-    """Translates what the controllers of one listener say."""
+    """Translates the messages of one listener's controllers."""
 
     def __init__(self, options: Wc2EcHqOptions, view: RobotView, table: DeviceTable) -> None:
         self._options = options
@@ -97,8 +97,8 @@ class ControllerCommands:
         session.fresh.add(device.name)
         if session.fresh == session.wheels.keys() or not any(session.wheels.values()):
             return self._joined(session)
-        session.joined_at = min(session.joined_at, session.said_at + self._options.join_s)
-        return self.expire(session, session.said_at)
+        session.joined_at = min(session.joined_at, session.received_at + self._options.join_s)
+        return self.expire(session, session.received_at)
 
     def _joined(self, session: Wc2EcClient) -> tuple[Telemetry, ...]:
         session.fresh.clear()

@@ -1,7 +1,7 @@
 """The messages of WC2EC, each declared once for all dialects that have it, and their framing.
 
 Source: "Dialect `draft`" and "Dialect `deployed`" of the protocol page. Every message begins with a byte of command,
-one of sensor type and one of sensor number; the command tells how the rest is read. Sans-IO.
+one of sensor type and one of sensor number; the command determines the rest. Sans-IO.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Wc2EcSpec(msgspec.Struct, frozen=True, eq=False):
 
     @property
     def sender(self) -> Wc2EcSender:
-        """Who sends it: the command tells."""
+        """Who sends it, by its command."""
         return Wc2EcSender.WC if self.command in FROM_CONTROLLER else Wc2EcSender.EC
 
 
@@ -135,7 +135,7 @@ class SetValue(Wc2EcMessage, frozen=True):
 def frame_end(dialect: Wc2EcDialect, sender: Wc2EcSender, *, values: int = 0) -> FrameEnd:
     """Make the framing function for what one side sends. ``values``: configuration values of a sensor.
 
-    A command that the side cannot send breaks the stream: nothing tells how long it is.
+    A command that the side cannot send breaks the stream: its length is unknown.
     """
     specs = {command: spec for command, spec in MESSAGES[dialect].items() if spec.sender is sender}
     sizes = {command: 1 + spec.codec.fixed_size for command, spec in specs.items()}

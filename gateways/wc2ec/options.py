@@ -1,6 +1,6 @@
 """Options of WC2EC in a configuration: of a robot, and of a listener for external controllers. Sans-IO.
 
-A robot's options say which devices it has, what their values mean, and its kinematics. Source: the dialects of the
+A robot's options name its devices, the meaning of their values, and its kinematics. Source: the dialects of the
 protocol page; the templates of ``zbridge init`` explain each option.
 """
 

@@ -78,7 +78,7 @@ class Wc2EcRobot(Robot):
         self._dialect = Wc2EcDialect(options.dialect)
         self._session: ExternalRole | None = None
         self._table = RegisteredDevices()
-        self._listened: set[str] = set(options.pinned)
+        self._subscribed: set[str] = set(options.pinned)
         self._ring: BearingScan | None = None
         self._tables = {name: _interpolation(table) for name, table in options.tables.items()}
         self._faults = metrics.count("sensor_faults")
@@ -112,7 +112,7 @@ class Wc2EcRobot(Robot):
     def begun(self, stamp_ns: int) -> tuple[Telemetry, ...]:
         if self._dialect is Wc2EcDialect.DRAFT:
             session = self._connected()
-            devices = [device for device in map(self._table.named, sorted(self._listened)) if device is not None]
+            devices = [device for device in map(self._table.named, sorted(self._subscribed)) if device is not None]
             frames = tuple(session.encode(EnableSensor(device.type, device.number)) for device in devices)
             if frames:
                 session.outbox.set("enable", frames, -math.inf)
@@ -124,9 +124,9 @@ class Wc2EcRobot(Robot):
         if device is None or device.name in self.options.pinned:
             return
         if on:
-            self._listened.add(device.name)
+            self._subscribed.add(device.name)
         else:
-            self._listened.discard(device.name)
+            self._subscribed.discard(device.name)
         if self.ready:
             self._send((EnableSensor if on else DisableSensor)(0, device.number))
 

@@ -58,7 +58,7 @@ class Phase(enum.Enum):
 class AlfTimes(msgspec.Struct, frozen=True, kw_only=True):
     """The vehicle's times in seconds, and how patient the judge is.
 
-    What the judge waits for is timed by its own clock, which stands still while its process is late.
+    What the judge waits for is timed by its own clock, which stops while its process is late.
     """
 
     cycle_s: float = 0.02
@@ -205,7 +205,7 @@ class CommandReader(_AlfReader):
 
 
 class VehicleReader(_AlfReader):
-    """Cuts and judges the stream of a vehicle; ``points``: of a measurement, which nothing on the wire tells."""
+    """Cuts and judges the stream of a vehicle; ``points``: of a measurement, which is not on the wire."""
 
     _unknown = "which no vehicle sends"
 
@@ -271,7 +271,7 @@ def _breaks(number: str, is_float: bool) -> str:
 
 
 class Repeats:
-    """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link stands)."""
+    """The rhythm of the commands ("The gateway as HQ": repeats every 20 ms for as long as the link is up)."""
 
     def __init__(self, times: AlfTimes) -> None:
         self._times, self._limit_s = times, times.first_s

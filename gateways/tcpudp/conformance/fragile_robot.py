@@ -22,8 +22,8 @@ from zbridge.simulation.timing import PollingReader, Ticker
 
 _STEP_S, _MOST_MOVE_S = 0.02, 0.1
 """Seconds between two steps of the robot, and most seconds for which it moves in one."""
-_LOOK_S = 0.006
-"""Seconds between two looks at a connection that brings nothing: less than the spacing that is demanded."""
+_POLL_S = 0.006
+"""Seconds between two polls of a connection that brings nothing: less than the spacing that is demanded."""
 
 
 class _RobotPhase(enum.Enum):
@@ -92,7 +92,7 @@ class FragileRobot(FragileServer):
         self._phase = _RobotPhase.LISTENING
         self._udp: socket.socket | None = None
         self._wake_at = self._closed_s = self._awake_s = 0.0
-        """This process's own time, which stands still while the process is late: it judges what was in flight."""
+        """This process's own time, which stops while the process is late: it judges what was in flight."""
         self._forget()
 
     def _forget(self) -> None:
@@ -142,7 +142,7 @@ class FragileRobot(FragileServer):
             settings = wire.server_settings(self.version, self.client_id, self.features, self._side)
             await self._send(wire.SERVER_SETTINGS, settings)
             self._polling = PollingReader(conn, wire.READ_BYTES)
-            while data := await self._polling.read(_LOOK_S):
+            while data := await self._polling.read(_POLL_S):
                 await self._read_packet(data)
                 await asyncio.sleep(self._chance["sleep"].uniform(0, self._times.read_s))
             self._event(f"the connection broke: {self._broken}" if self._broken else "the HQ closed the connection")
@@ -156,7 +156,7 @@ class FragileRobot(FragileServer):
     async def _read_packet(self, data: bytes) -> None:
         """Take one read as one packet: what piled up while this process was stalled is lost.
 
-        Joined packets are the HQ's fault if they came in less time, since a look found nothing, than correctly spaced
+        Joined packets are the HQ's fault if they came in less time, since a poll found nothing, than correctly spaced
         packets need; the text says how long this process did not read if it may be at fault itself.
         """
         received, problem = self._reads.take(data)

@@ -20,7 +20,7 @@ _PROGRAM = (0.2, 0.0, 0.3)
 
 
 class JudgedRobot:
-    """One robot; ``random`` seeds what it says. ``side``: cells along a side of its map."""
+    """One robot; ``random`` seeds what it sends. ``side``: cells along a side of its map."""
 
     def __init__(self, random: Random, side: int = SIDE) -> None:
         self.place = Body()
@@ -42,7 +42,7 @@ class JudgedRobot:
         self._drive = (y * speed * _SPEED_M_S, -x * speed * _SPEED_M_S, -turn * _TURN_RAD_S)
 
     def choose(self, body: bytes) -> None:
-        """Take the body of 10: in mode 3 the robot's own program drives, whatever 13 says ("Translation").
+        """Take the body of 10: in mode 3 the robot's own program drives, despite any 13 ("Translation").
 
         When it ends, the motors keep running: only a 13 after it stops them.
         """
@@ -86,7 +86,7 @@ class JudgedRobot:
     def unasked(
         self, version: str, features: Collection[FeatureFlag], hq_features: Collection[FeatureFlag]
     ) -> Iterator[tuple[int, bytes]]:
-        """Give what the robot says unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
+        """Yield what the robot sends unasked, forever; once a debugMessage with two headers ("The gateway as HQ").
 
         An empty body: ask :meth:`body` for it when it is sent.
         """

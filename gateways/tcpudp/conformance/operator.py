@@ -1,4 +1,4 @@
-"""What the operator of an HQ program does; the judge says when and how that is sent ("Packets")."""
+"""What the operator of an HQ program does; the judge decides when and how that is sent ("Packets")."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ FLAGS = {"1.1": 5, "1.2": 6, "1.3": 7, "1.4": 7}
 SENT = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3,1.4"}
 """The version string a robot sends."""
 UNDERSTOOD = {"1.1": "1.1", "1.2": "1.2", "1.3": "1.1,1.2,1.3", "1.4": "1.1,1.2,1.3"}
-"""The version string a robot takes without harm."""
+"""The version string a robot accepts without harm."""
 DEADLY_ENTRIES = frozenset({1, 2, 4, 8})
 """Lengths of a version list that crash robots 1.3 and "1.4"."""
 HQ_LOSES_BYTES = 2200
@@ -113,7 +113,7 @@ class ParsedPacket(msgspec.Struct, frozen=True):
 
 
 class HqAnnouncement(msgspec.Struct, frozen=True):
-    """What an HQ says about itself in packet 3."""
+    """What an HQ announces in packet 3."""
 
     versions: str
     features: frozenset[FeatureFlag]
@@ -122,7 +122,7 @@ class HqAnnouncement(msgspec.Struct, frozen=True):
 
 
 class RobotAnnouncement(msgspec.Struct, frozen=True):
-    """What a robot says about itself in packet 2, as one HQ reads it."""
+    """What a robot announces in packet 2, as one HQ reads it."""
 
     client: int
     versions: str

@@ -35,15 +35,15 @@ from zbridge.protocol import Datagram, Handshake, Kept, Limits, ProtocolError, R
 
 FIRST_CLIENT = 2
 """The id that most robots give their first client; a deployed one gave 35."""
-LOOK_S = 5.0
+INSPECT_S = 5.0
 """Seconds after which a silent connection is a sign."""
-LOOK_AGAIN_S = 1.0
+INSPECT_AGAIN_S = 1.0
 MALFORMED, MALFORMED_SHARE = 3, 0.05
 """Malformed packets are a sign from this number and from this share of all packets on."""
 LATER_CLIENT = "another program is connected, or the one usable connection is used up"
 GARBLED = "malformed packets"
-UNANSWERED = f"no telemetry and no answer to the probe within {LOOK_S:g} s"
-MUTE = f"no telemetry within {LOOK_S:g} s, unlike on the connection before"
+UNANSWERED = f"no telemetry and no answer to the probe within {INSPECT_S:g} s"
+MUTE = f"no telemetry within {INSPECT_S:g} s, unlike on the connection before"
 
 
 class Signs(Kept):
@@ -53,42 +53,42 @@ class Signs(Kept):
         "talks": bool,
         "_expected": bool,
         "_talked": bool,
-        "_looked": bool,
+        "_inspected": bool,
         "_asked": int,
         "_silent": str | None,
     }
 
     def __init__(self, before: Signs | None = None) -> None:
         self.talks: bool = before is not None and before.talks
-        """Whether the robot sent telemetry unasked within :data:`LOOK_S`, on this connection or one before."""
+        """Whether the robot sent telemetry unasked within :data:`INSPECT_S`, on this connection or one before."""
         self._expected = self.talks
-        self._talked = self._looked = False
+        self._talked = self._inspected = False
         self._asked = 0
         self._silent: str | None = None
 
     def __repr__(self) -> str:
         return f"<Signs talks={self.talks} {self._silent}>"
 
-    def asked(self, heard: int, questions: int = 1) -> None:
-        """Count queries that were just sent: their answers are no telemetry."""
-        self._listen(heard)
+    def note_queries(self, received: int, questions: int = 1) -> None:
+        """Count queries that were just sent: their answers are not telemetry."""
+        self._note_telemetry(received)
         self._asked += questions
 
-    def look(self, heard: int, *, unanswered: bool) -> None:
-        """Judge whether the robot is silent. Call first at :data:`LOOK_S`; ``unanswered``: a probe got no answer.
+    def inspect(self, received: int, *, unanswered: bool) -> None:
+        """Judge whether the robot is silent. Call first at :data:`INSPECT_S`; ``unanswered``: a probe got no answer.
 
         Some robots send nothing until they are asked: silence is a sign only if the robot sent telemetry on the
         connection before, or did not answer the probe.
         """
-        self._listen(heard)
-        if not self._looked:
-            self._looked, self.talks = True, self.talks or self._talked
+        self._note_telemetry(received)
+        if not self._inspected:
+            self._inspected, self.talks = True, self.talks or self._talked
         if self._expected and not self._talked:
             self._silent = MUTE
         else:
-            self._silent = UNANSWERED if unanswered and not heard else None
+            self._silent = UNANSWERED if unanswered and not received else None
 
-    def gather(self, client_id: int, traffic: Traffic) -> tuple[str, ...]:
+    def listing(self, client_id: int, traffic: Traffic) -> tuple[str, ...]:
         """List the present signs, for people.
 
         A client id above :data:`FIRST_CLIENT` is listed only with another sign: a second HQ program gets such an id
@@ -98,8 +98,8 @@ class Signs(Kept):
         signs = tuple(filter(None, (None if few else GARBLED, self._silent)))
         return (f"client id {client_id}: {LATER_CLIENT}", *signs) if signs and client_id > FIRST_CLIENT else signs
 
-    def _listen(self, heard: int) -> None:
-        self._talked = self._talked or heard > self._asked
+    def _note_telemetry(self, received: int) -> None:
+        self._talked = self._talked or received > self._asked
 
 
 PROBE_S = 2.0
@@ -152,7 +152,7 @@ class HqHandshake(PacketSession):
         "_silent_until": float,
         "_answered": bool | None,
         "_signs": Signs,
-        "_look_at": float,
+        "_inspect_at": float,
         "_others": int,
     }
     role = Role.HQ
@@ -172,7 +172,7 @@ class HqHandshake(PacketSession):
         self._answered: bool | None = None
         """True if the robot got our 5 and we its 6; None if no 5 was sent."""
         self._signs: Signs = Signs(signs)
-        self._look_at = math.inf
+        self._inspect_at = math.inf
         self._others = 0
         """Packets received that are no telemetry."""
 
@@ -218,7 +218,7 @@ class HqHandshake(PacketSession):
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
         self.sender_id = message.client_id
-        self._doubt()
+        self._update_doubts()
         listed = parse_versions(message.versions)
         agreed = agree(VERSIONS, listed)
         if agreed is None:
@@ -276,7 +276,7 @@ class HqHandshake(PacketSession):
         """Establish the session."""
         assert self.settings is not None
         self.establish(self._agreed, tuple(feature.value for feature in self.settings.features))
-        self._look_at = now + LOOK_S
+        self._inspect_at = now + INSPECT_S
 
     def _take_commands(self, now: float) -> None:
         """Take commands again."""
@@ -285,30 +285,30 @@ class HqHandshake(PacketSession):
     # Timers
 
     def timers(self) -> float:
-        return min(self._handshake.deadline, self._silent_until, self._look_at)
+        return min(self._handshake.deadline, self._silent_until, self._inspect_at)
 
     def on_timer(self, now: float) -> None:
         self._handshake.expire(now)
         if now >= self._silent_until:
             self._silent_until = math.inf
             self._handshake.fire(HqEvent.SILENCE_OVER, now)
-        if now >= self._look_at:
-            self._signs.look(self._heard, unanswered=self._answered is False)
-            self._doubt()
-            self._look_at = now + LOOK_AGAIN_S
+        if now >= self._inspect_at:
+            self._signs.inspect(self._telemetry_in, unanswered=self._answered is False)
+            self._update_doubts()
+            self._inspect_at = now + INSPECT_AGAIN_S
 
     # Signs of a connection that is not the robot's one usable connection
 
     def malformed(self, what: str) -> None:
         super().malformed(what)
-        self._doubt()
+        self._update_doubts()
 
     @property
-    def _heard(self) -> int:
+    def _telemetry_in(self) -> int:
         return self.traffic.frames_in - self.traffic.malformed - self._others
 
-    def _doubt(self) -> None:
-        self.doubts = self._signs.gather(self.sender_id, self.traffic)
+    def _update_doubts(self) -> None:
+        self.doubts = self._signs.listing(self.sender_id, self.traffic)
 
 
 TABLE: dict[HqStep, dict[HqEvent, tuple[Callable[[HqHandshake, float], None], HqStep]]] = {

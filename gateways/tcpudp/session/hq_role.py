@@ -117,13 +117,13 @@ class HqRole(HqHandshake):
     def choose_mode(self, mode: int, now: float) -> None:
         """Send a control mode that was commanded; raise Refused."""
         frame = _Chosen(self.encode(ClientControllMode(mode)))
-        self._send_surely(frame, _MODE_AGAIN, now)
+        self._send_reliably(frame, _MODE_AGAIN, now)
         self._chosen = frame
 
     def switch_lidar(self, mode: int, now: float) -> None:
         """Send a lidar mode; raise Refused."""
-        self._send_surely(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
-        self._signs.asked(self._heard, 1 + self.outbox.is_set(_LIDAR_AGAIN))
+        self._send_reliably(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
+        self._signs.note_queries(self._telemetry_in, 1 + self.outbox.is_set(_LIDAR_AGAIN))
 
     def send_nothing_again(self) -> None:
         """Cancel all repetitions: the robot is stopped."""
@@ -152,7 +152,7 @@ class HqRole(HqHandshake):
     def send(self, message: Packet) -> None:
         super().send(message)
         if isinstance(message, _ANSWERED):
-            self._signs.asked(self._heard)
+            self._signs.note_queries(self._telemetry_in)
 
     def outgoing(self, now: float) -> bytes | None:
         frame = super().outgoing(now)
@@ -160,7 +160,7 @@ class HqRole(HqHandshake):
             self.sent_autonomous = True
         return frame
 
-    def _send_surely(self, frame: bytes, again: str, now: float) -> None:
+    def _send_reliably(self, frame: bytes, again: str, now: float) -> None:
         """Send a packet, to robots that misread some again; a newer one replaces the repetition of an older one."""
         self.outbox.put(frame)
         if self.misreads:

@@ -9,14 +9,14 @@ never makes a source: 7(false) is reliable, 7(true) is not, as programs of 1.3 a
 sends its 7 at once. So a 7 later than :data:`PROBE_S` after the 4 shows that the program got no 6: the 5 may have been
 somebody else's, and the source is dropped.
 
-Any process of the HQ program's host can send datagrams, and they tell nothing but their source. A port becomes the
+Any process of the HQ program's host can send datagrams, and only their source identifies them. A port becomes the
 client's source in two ways only:
 
-- by a 5 between our 4 and its 7 (:meth:`ClientSource.claims_probe`). If a second port sends a 5 too, the session takes
-  datagrams of neither;
+- by a 5 between our 4 and its 7 (:meth:`ClientSource.claims_probe`). If a second port sends a 5 too, the session
+  accepts datagrams of neither;
 - after the handshake, while the client has no source, by a packet with its id from the port that deployed programs bind
   (:meth:`ClientSource.claims_late`): a program of 1.3 whose 5 was lost sends 11, 12 and 61 by UDP all the same. If it
-  has another source then, one of the two is not the client, and the session takes datagrams of neither any more.
+  has another source then, one of the two is not the client, and the session no longer accepts datagrams of either.
 
 The session calls :meth:`ClientSource.bind` with the first datagram that it is given, and :meth:`ClientSource.lose` when
 a rival shows up.
@@ -78,11 +78,11 @@ class ClientSource(Kept):
     def __init__(self, client_id: int, client_port: int) -> None:
         self.client_port = client_port
         self.bound = False
-        """True while datagrams come from a port that is taken for the client's."""
+        """True while datagrams come from a port that counts as the client's."""
         self._client_id = client_id
         self._port = 0
         self._contested = False
-        """True once two ports were taken for the client's after the handshake."""
+        """True once two ports claimed to be the client's after the handshake."""
 
     def __repr__(self) -> str:
         return f"<ClientSource of {self._client_id}: {self._port if self.bound else 'none'}>"
@@ -113,7 +113,7 @@ class ClientSource(Kept):
         """Give the ``id`` byte of a datagram; -1 if it is no packet."""
         return _header(datagram)[0]
 
-    def may_bear(self, sender_id: int) -> bool:
+    def accepts_sender(self, sender_id: int) -> bool:
         """True for the ``id`` bytes of the client's datagrams, and for -1, which decoding will refuse."""
         return sender_id in (_NO_HEADER[0], self._client_id, *_UNASSIGNED)
 
@@ -244,8 +244,8 @@ class RobotRole(PacketSession):
         elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
         elif isinstance(message, ClientUDPConnectionStatus):
-            heard = message.connected and now < self._report_until
-            self._fire(RobotEvent.REPORT_TRUE if heard else RobotEvent.REPORT_FALSE, now)
+            confirmed = message.connected and now < self._report_until
+            self._fire(RobotEvent.REPORT_TRUE if confirmed else RobotEvent.REPORT_FALSE, now)
         elif isinstance(message, ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
@@ -285,17 +285,17 @@ class RobotRole(PacketSession):
             self._handshake.fire(RobotEvent.RIVAL, now)
 
     def stray(self, datagram: bytes) -> None:
-        """Count a datagram with this client's id from an unknown port; raise NotReady with what to tell the client."""
+        """Count a datagram with this client's id from an unknown port; raise NotReady with a text for the client."""
         if self.state is State.ESTABLISHED and self._source.sender_of(datagram) == self.client_id:
             self.traffic.foreign += 1
             text = "packets by UDP from another port than this client's are not taken"
             raise NotReady(f"{text} (client_port = {self._source.client_port})")
 
     def receive_datagram(self, datagram: bytes, now: float) -> list[Packet]:
-        """Take one datagram of the client's source, unless it bears the id of another client."""
+        """Take one datagram of the client's source, unless it has the id of another client."""
         self._source.bind()
         sender_id = self._source.sender_of(datagram)
-        if self._source.may_bear(sender_id):
+        if self._source.accepts_sender(sender_id):
             return super().receive_datagram(datagram, now)
         self.malformed(f"datagram with id {sender_id}, which is another client's")
         return []

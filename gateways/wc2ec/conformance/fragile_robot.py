@@ -73,7 +73,7 @@ class FragileWebotsController(FragileServer):
 
     @property
     def stuck(self) -> bool:
-        """Whether it takes no command any more, because of a 130 to no motor."""
+        """Whether it obeys no more commands, because of a 130 to no motor."""
         return self._reader.blocked
 
     async def cut(self) -> None:

@@ -80,7 +80,7 @@ class JudgedWebots:
         self._numbers[message.number].set(message.value)
 
     def set_sensor(self, message: ParsedWc2EcMessage) -> str:
-        """Obey a command of the draft that is all right; tell what it does without need, empty if nothing."""
+        """Obey a command of the draft that is all right; return what it does without need, empty if nothing."""
         number, had = message.number, message.number in self.enabled
         if message.command == ENABLE:
             self.enabled.add(number)

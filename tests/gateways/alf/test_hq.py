@@ -311,7 +311,7 @@ def test_a_turn_without_speed_sets_the_wheels_and_is_no_motion() -> None:
     ],
 )
 def test_a_listener_serves_what_it_was_told_to_and_one_of_the_laser_takes_no_drives(options, kinds, driving) -> None:
-    """By default the laser until a client drives, from then on drive info: no deployed program bears both."""
+    """By default the laser until a client drives, from then on drive info: no deployed program tolerates both."""
     scene = Scene(clients=0)
     scene.side = AlfHq(AlfHqOptions(**options), scene.view)
     scene.tell(SCANNER, SCAN)

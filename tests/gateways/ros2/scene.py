@@ -60,9 +60,9 @@ class RosScene:
 
     def feed(self, sample: KeyedSample) -> list[Any]:
         """Let the link bring something; give what the session hands on."""
-        heard = self.session.receive(write_sample(sample), self.now)
+        received = self.session.receive(write_sample(sample), self.now)
         self.write()
-        return heard
+        return received
 
     def write(self) -> list[KeyedSample]:
         """Take what the session writes now."""
@@ -93,8 +93,8 @@ class RosScene:
 
     def hears(self, topic: str, by: str, **fields: Any) -> dict[str, Any]:
         """Let a publisher put a message; give the telemetry it makes, by path."""
-        heard = self.says(topic, by, TYPES.encode(TYPES.message(KINDS[topic], **fields)))
-        return {path.path: message for one in heard for path, message in self.robot.telemetry(one, self.time_ns)}
+        received = self.says(topic, by, TYPES.encode(TYPES.message(KINDS[topic], **fields)))
+        return {path.path: message for one in received for path, message in self.robot.telemetry(one, self.time_ns)}
 
     def establish(self, kind: str = TWIST) -> str:
         """Bring up a robot with odometry and a base; give the publisher's token."""

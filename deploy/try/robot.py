@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Quirks
 
 
 class Telling(FragileRobot):
@@ -20,7 +21,13 @@ class Telling(FragileRobot):
 
     def __init__(self, account: Path) -> None:
         self._account, self._known = account.open("w", buffering=1), 0.0
-        super().__init__(version="1.3", udp=False, seed=1, client_id=2, note=lambda text: self.tell("violation:", text))
+        super().__init__(
+            version="1.3",
+            udp=False,
+            seed=1,
+            quirks=Quirks(client_id=2),
+            note=lambda text: self.tell("violation:", text),
+        )
         steer = self.machine.steer
 
         def obey(body: bytes) -> None:

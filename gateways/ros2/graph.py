@@ -36,6 +36,8 @@ class Graph:
             if name is not None
         }
         self._command = Wanted(self.command_topic or "", TwistCommand, (TWIST, TWIST_STAMPED), latched=False)
+        self.own_zid: str | None = None
+        """The Zenoh id of our own node."""
         self.publishers: dict[str, Endpoint] = {}
         """By their tokens, as the next two."""
         self.subscribers: dict[str, Endpoint] = {}
@@ -82,8 +84,9 @@ class Graph:
         return endpoint
 
     def knows(self, token: str) -> bool:
-        """Return whether a token was read before."""
-        return any(token in table for table in (self.publishers, self.subscribers, self.drivers, self.wrong))
+        """Return whether a token is our own, or was read before."""
+        tables = (self.publishers, self.subscribers, self.drivers, self.wrong)
+        return token.split("/", 3)[2:3] == [self.own_zid] or any(token in table for table in tables)
 
     def gone(self, token: str) -> bool:
         """Forget an endpoint; False if it was not known."""
@@ -100,6 +103,11 @@ class Graph:
     def of_topic(self, name: str) -> Wanted:
         """Return what is wanted of a topic."""
         return self._wanted.get(name, self._command)
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """The names of the topics that the robot publishes."""
+        return tuple(sorted({endpoint.name for endpoint in self.publishers.values()}))
 
     @property
     def waiting_for(self) -> str:

@@ -135,7 +135,7 @@ class RosRole(Session[Any]):
         if isinstance(message, Ignored):
             return False
         if self.state is State.HANDSHAKING:
-            self.establish("", self._features())
+            self.establish("", self.graph.features)
             self._update_status()
         return True
 
@@ -151,7 +151,7 @@ class RosRole(Session[Any]):
             self._begin(sample.payload.decode("ascii", "replace"))
         elif sample.kind is SampleKind.OPENED:
             self._watch_again()
-        elif sample.kind is SampleKind.APPEARED and not self._is_own(sample.key) and not self.graph.knows(sample.key):
+        elif sample.kind is SampleKind.APPEARED and not self.graph.knows(sample.key):
             try:
                 self._appeared(self.graph.appeared(sample.key))
             finally:
@@ -162,6 +162,7 @@ class RosRole(Session[Any]):
                 self._lose("its publishers are gone", self._now)
 
     def _begin(self, zid: str) -> None:
+        self.graph.own_zid = zid
         self._node = Node(self._options.domain, zid, 0, self._options.full_namespace, "zbridge")
         self.send_first(KeyedSample(SampleKind.ANNOUNCE, self._node.token()))
         for expression in self.graph.watched():
@@ -174,9 +175,6 @@ class RosRole(Session[Any]):
             self._watch_at = self._now + WATCH_S
             for expression in self.graph.watched():
                 self.send_first(KeyedSample(SampleKind.WATCH, expression))
-
-    def _is_own(self, token: str) -> bool:
-        return self._node is not None and token.split("/", 3)[2:3] == [self._node.zid]
 
     def _appeared(self, endpoint: Endpoint) -> None:
         """Read or write the key of a new endpoint, unless that is done already; show that by a token of our own."""
@@ -198,15 +196,12 @@ class RosRole(Session[Any]):
             self._gids[endpoint.key] = own.gid()
         self.send_first(KeyedSample(SampleKind.ANNOUNCE, own.token()))
 
-    def _features(self) -> tuple[str, ...]:
-        return tuple(sorted({endpoint.name for endpoint in self.graph.publishers.values()}))
-
     def _update_status(self) -> None:
         """Update ``busy`` (what is missing) and ``doubts`` (who else drives)."""
         if self.over:
             return
         if self.state is State.ESTABLISHED:
-            self.busy, self.features = self._lost or self.graph.drive_problem, self._features()
+            self.busy, self.features = self._lost or self.graph.drive_problem, self.graph.features
             nodes = sorted({driver.node.full_name[:_SHOWN] for driver in self.graph.drivers.values()})
             others = f"{', '.join(nodes[:3])} {'publish' if len(nodes) > 1 else 'publishes'} {self.graph.command_topic}"
             self.doubts = (f"{others} too, and is overruled",) if nodes and not self._options.shared else ()
@@ -294,7 +289,7 @@ class RosRole(Session[Any]):
         gid = self._gids[sample.key]
         number = self._numbers[sample.key] = self._numbers.get(sample.key, 0) + 1
         sent_ns = self._time[0] + round((now - self._time[1]) * _NS_PER_S)
-        payload = self._stamped(sample, self._robot_stamp(now))
+        payload = self._stamped(sample, _robot_stamp(self._robot_time, now))
         attachment = Attachment(number, max(0, sent_ns), gid).encode()
         return write_sample(KeyedSample(SampleKind.PUT, sample.key, payload, attachment))
 
@@ -313,13 +308,14 @@ class RosRole(Session[Any]):
     def overdue(self) -> str:
         return self.graph.waiting_for
 
-    def _robot_stamp(self, now: float) -> bytes:
-        """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
-        if self._robot_time is None:
-            return _STAMP.pack(0, 0)
-        stamp_ns, received_at = self._robot_time
-        seconds, ns = divmod(stamp_ns + round((now - received_at) * _NS_PER_S), _NS_PER_S)
-        return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
+
+def _robot_stamp(robot_time: tuple[int, float] | None, now: float) -> bytes:
+    """Write the time on the robot's clock, be it simulated or wrong: controllers drop what is old there."""
+    if robot_time is None:
+        return _STAMP.pack(0, 0)
+    stamp_ns, received_at = robot_time
+    seconds, ns = divmod(stamp_ns + round((now - received_at) * _NS_PER_S), _NS_PER_S)
+    return _STAMP.pack(seconds, ns) if 0 <= seconds < 2**31 else _STAMP.pack(0, 0)
 
 
 class _Dated(Outbox):

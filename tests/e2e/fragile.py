@@ -24,6 +24,7 @@ from gateways.alf.conformance import parser as alf_wire
 from gateways.alf.conformance.fragile_robot import FragileVehicle
 from gateways.tcpudp.conformance import parser as tcpudp_wire
 from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Quirks
 from gateways.wc2ec.conformance import parser as wc2ec_wire
 from gateways.wc2ec.conformance.fragile_robot import FragileWebotsController
 from tests.e2e.processes import Part, module
@@ -72,7 +73,8 @@ def package(version: str, udp: bool) -> Kind:
 
     def make(tells: bool, times: dict[str, float], **options: Any) -> FragileRobot:
         times = {"send_s": SEND_S} if tells else {"part_s": 0.2, **times}
-        robot = FragileRobot(version=version, udp=udp, times=tcpudp_wire.RobotTimes(**times), **options)
+        quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
+        robot = FragileRobot(version=version, udp=udp, times=tcpudp_wire.RobotTimes(**times), quirks=quirks, **options)
         followed(robot.machine, "steer", told)
         return robot
 

@@ -13,9 +13,11 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Unpack
 
+import msgspec
+
 from gateways.tcpudp.conformance import parser as wire
 from gateways.tcpudp.conformance.operator import OperatorProgram
-from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, HqTimes, ParsedPacket
+from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket
 from zbridge.simulation.fragile import Work
 from zbridge.simulation.judge import Bounds, Ended, show
 from zbridge.simulation.timing import STAMPED, Read, ReadingThread
@@ -33,6 +35,17 @@ class _HqPhase(enum.Enum):
     PROBING = enum.auto()
     ESTABLISHED = enum.auto()
     ENDED = enum.auto()
+
+
+class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
+    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
+
+    answer_s: float = 0.015
+    """From packet 2 to the answer 3 (as captured)."""
+    probe_s: float = 2.0
+    """How long it waits for 4 and, after its 5, for 6."""
+    gap_s: float = 0.01
+    """Spacing of the robot's packets that exculpates it where this process read later than that."""
 
 
 _DEPLOYED = HqTimes()
@@ -230,19 +243,14 @@ class FragileTcpUdpHq(OperatorProgram):
             self._die(f"{problem}: {raw}")
         if packet.sender != wire.SERVER_ID:
             self._violate(f"id byte {packet.sender} instead of {wire.SERVER_ID}: {raw}")
-        if (due := self._channel(kind, body)) not in (channel, None):
+        if (due := wire.due_channel(kind, body, offered=self._udp is not None, works=self._works)) not in (
+            channel,
+            None,
+        ):
             self._violate(f"packet {kind} by {channel.upper()} instead of {due.upper()}: {raw}")
         if not self._report(self._untimely(kind), raw):
             self._report(wire.value_problem(kind, body, self.settings.side if self.settings else 0), raw)
             self._obey(kind, body)
-
-    def _channel(self, kind: int, body: bytes) -> Channel | None:
-        """Tell what must carry a packet ("Packets"); None: either, as without a 6 nothing was agreed."""
-        if kind == wire.UDP_ANSWER:
-            return "udp" if any(body) else "tcp"  # 6(false) is a violation by itself
-        if kind in wire.BY_UDP and self._udp is not None:
-            return None if self._works is None else "udp" if self._works else "tcp"
-        return "tcp"
 
     def _untimely(self, kind: int) -> str:
         """Tell why a packet is not due, empty if it is ("Handshake", "Translation")."""
@@ -318,20 +326,17 @@ class FragileTcpUdpHq(OperatorProgram):
         self._phase = _HqPhase.PROBING
         self._udp = socket.socket(self._tcp.family, socket.SOCK_DGRAM)
         self._udp.setblocking(False)
-        self._bind(self._udp, self._tcp.getsockname()[0])
+        host, port = self._tcp.getsockname()[0], DEPLOYED_PORT if self._udp_port is None else self._udp_port
+        try:
+            self._udp.bind((host, port))
+        except OSError as error:  # several programs of one machine cannot all have the deployed port
+            if self._udp_port is not None or error.errno != errno.EADDRINUSE:
+                raise
+            self._udp.bind((host, 0))
+            self._event(f"UDP port {port} is taken, {self._udp.getsockname()[1]} instead")
         asyncio.get_running_loop().add_reader(self._udp.fileno(), self._read_datagrams)
         self._send_datagram(wire.UDP_PROBE)
         self._start(self._wait())
-
-    def _bind(self, sock: socket.socket, host: str) -> None:
-        """Bind the UDP port; several programs of one machine cannot all have the deployed one."""
-        try:
-            sock.bind((host, DEPLOYED_PORT if self._udp_port is None else self._udp_port))
-        except OSError as error:
-            if self._udp_port is not None or error.errno != errno.EADDRINUSE:
-                raise
-            sock.bind((host, 0))
-            self._event(f"UDP port {DEPLOYED_PORT} is taken, {sock.getsockname()[1]} instead")
 
     async def _wait(self) -> None:
         await asyncio.sleep(self._times.probe_s)

@@ -13,8 +13,8 @@ from collections.abc import Collection, Iterable
 from typing import Unpack
 
 from gateways.tcpudp.conformance import parser as wire
-from gateways.tcpudp.conformance.machine import JudgedRobot
-from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, Loss, ParsedPacket, RobotTimes
+from gateways.tcpudp.conformance.machine import JudgedRobot, Loss, Quirks
+from gateways.tcpudp.conformance.parser import Channel, FeatureFlag, ParsedPacket, RobotTimes
 from zbridge.simulation.fragile import FragileServer, Work
 from zbridge.simulation.judge import Bounds, Chances, show
 from zbridge.simulation.sockets import bind_tcp_and_udp, readable
@@ -35,7 +35,7 @@ class _RobotPhase(enum.Enum):
     FROZEN = enum.auto()
 
 
-_DEPLOYED = RobotTimes()
+_DEPLOYED, _NO_QUIRKS = RobotTimes(), Quirks()
 _EXPECTED = {
     _RobotPhase.GREETED: {wire.DEBUG, wire.CLIENT_SETTINGS},
     _RobotPhase.ASLEEP: {wire.UDP_PROBE, wire.UDP_STATUS},
@@ -46,12 +46,8 @@ _EXPECTED = {
 class FragileRobot(FragileServer):
     """A robot of one version: serves one connection, records every violation and dies of the deadly ones.
 
-    ``features``: flags announced besides UDP, default all of the version; ``obeys``: packets registered though not
-    announced (``options.force``); ``client_id``: default seeded; ``parts``: of a "1.4" map; ``side``: cells along a
-    side of the map; ``misnamed``: the fraction of positions sent as id 53; ``misread``: the fraction of packets dropped
-    after the handshake, chosen for each packet id by itself; ``again``: serve a connection after the first, which loses
-    half of all packets in both directions and gets no telemetry ("One usable connection"). A row of ``received`` and
-    of the lists like it: monotonic seconds, channel, id, body.
+    ``features``: flags announced besides UDP, default all of the version. A row of ``received`` and of the lists like
+    it: monotonic seconds, channel, id, body.
     """
 
     _phase: _RobotPhase
@@ -64,31 +60,24 @@ class FragileRobot(FragileServer):
         udp: bool,
         seed: int,
         features: Collection[FeatureFlag] | None = None,
-        obeys: Collection[FeatureFlag] = (),
-        client_id: int | None = None,
         times: RobotTimes = _DEPLOYED,
-        loss: Loss = Loss.NOTHING,
-        parts: int = 4096,
-        side: int = wire.SIDE,
-        misnamed: float = 0.25,
-        misread: float = 0.0,
-        again: bool = False,
+        quirks: Quirks = _NO_QUIRKS,
         **bounds: Unpack[Bounds],
     ) -> None:
         super().__init__(**bounds)
         self.version = version
         self.features = wire.announcement(version, features, udp=udp)
-        self.client_id = client_id or random.Random(seed).randint(1, 255)
+        self.client_id = quirks.client_id or random.Random(seed).randint(1, 255)
         self.misread = self._rows()
         self.piled = self._rows()
         """What was lost in a read that this process itself joined, because it was late."""
         self.ignored = self._rows()
         """What robots of 1.1 and 1.2 ignored: the first packet read alone after they lost what had piled up."""
-        self._registered = wire.registered(version, self.features | frozenset(obeys))
-        self._times, self._loss, self._parts, self._side = times, loss, parts, side
-        self._chance, self._misnamed, self._misread = Chances(seed), misnamed, misread
-        self._again, self._poor = again, False
-        self.machine = JudgedRobot(self._chance["talk"], side)
+        self._registered = wire.registered(version, self.features | frozenset(quirks.obeys))
+        self._times, self._quirks, self._chance = times, quirks, Chances(seed)
+        self._poor = False
+        """True for a connection after the first."""
+        self.machine = JudgedRobot(self._chance["talk"], quirks.side)
         self._phase = _RobotPhase.LISTENING
         self._udp: socket.socket | None = None
         self._wake_at = self._closed_s = self._awake_s = 0.0
@@ -122,7 +111,7 @@ class FragileRobot(FragileServer):
 
     def _free(self) -> bool:
         """True with ``again`` once the connection before has ended ("One usable connection per start")."""
-        return self._again and self._conn is None
+        return self._quirks.again and self._conn is None
 
     def _begin(self, conn: socket.socket) -> None:
         """Begin with an HQ; a connection after the first is a poor one."""
@@ -139,7 +128,7 @@ class FragileRobot(FragileServer):
     async def _converse(self, conn: socket.socket) -> None:
         """Speak first, then take one packet per read with a short sleep in between ("Handshake")."""
         try:
-            settings = wire.server_settings(self.version, self.client_id, self.features, self._side)
+            settings = wire.server_settings(self.version, self.client_id, self.features, self._quirks.side)
             await self._send(wire.SERVER_SETTINGS, settings)
             self._polling = PollingReader(conn, wire.READ_BYTES)
             while data := await self._polling.read(_POLL_S):
@@ -174,13 +163,15 @@ class FragileRobot(FragileServer):
         elif received is not None:
             await self._judge(received, "tcp")
 
-    async def _send(self, kind: int, body: bytes = b"") -> None:
+    async def _send(self, kind: int, body: bytes = b"", *, by_udp: bool = False) -> None:
         """Send by UDP what the table marks UDP* when that was agreed, all else by TCP ("Packets")."""
         data = wire.packet(kind, body)
         if self._phase is _RobotPhase.ESTABLISHED and self._loses():
             return
-        if kind in wire.BY_UDP and self._status:
-            self._send_datagram(data)
+        if by_udp or (kind in wire.BY_UDP and self._status):
+            if self._udp is not None and self._source is not None:
+                with contextlib.suppress(OSError):
+                    self._udp.sendto(data, self._source)
         elif self._conn is not None:
             try:
                 async with asyncio.timeout(self._times.send_s), self._sending:
@@ -225,28 +216,23 @@ class FragileRobot(FragileServer):
         else:
             await self._judge(received, "udp")
 
-    def _send_datagram(self, data: bytes) -> None:
-        if self._udp is not None and self._source is not None:
-            with contextlib.suppress(OSError):
-                self._udp.sendto(data, self._source)
-
-    def _probe(self) -> None:
+    async def _probe(self) -> None:
         """Answer the first 5 with 6(true) from the TCP port's number, to where it came from ("Handshake" 5)."""
         self._probes += 1
         if self._probes > 1:
             self._violate(f"{self._probes} probes 5 by UDP instead of one")
         elif self._phase is not _RobotPhase.ASLEEP:
             self._violate(f"the probe 5 came later than {self._times.probe_s:g} s after the 4")
-        elif self._loss is Loss.NOTHING and not self._loses():
+        elif self._quirks.loss is Loss.NOTHING and not self._loses():
             self._answered = True
-            self._send_datagram(wire.packet(wire.UDP_ANSWER, b"\x01"))
+            await self._send(wire.UDP_ANSWER, b"\x01", by_udp=True)
 
     # Packets
 
     async def _judge(self, received: ParsedPacket, channel: Channel) -> None:
         kind, body = received.kind, received.body
         raw = f"{channel} packet {kind}, body {show(body)}"
-        if self._phase is _RobotPhase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._misread:
+        if self._phase is _RobotPhase.ESTABLISHED and self._chance[f"misread {kind}"].random() < self._quirks.misread:
             return self.misread.append((time.monotonic(), channel, kind, body))
         if self._phase is _RobotPhase.ESTABLISHED and channel == "tcp" and self._loses():
             return None
@@ -260,7 +246,7 @@ class FragileRobot(FragileServer):
             self._die(f"a debugMessage with an empty text: {raw}")
         if self._report(self._problem(kind, body, channel), raw):
             return None
-        return self._probe() if kind == wire.UDP_PROBE else await self._obey(kind, body)
+        return await self._obey(kind, body)
 
     def _problem(self, kind: int, body: bytes, channel: Channel) -> str:
         by_udp = kind == wire.UDP_PROBE or (kind in wire.BY_UDP and bool(self._status))
@@ -276,7 +262,9 @@ class FragileRobot(FragileServer):
         return wire.body_problem(kind, body)
 
     async def _obey(self, kind: int, body: bytes) -> None:
-        if kind == wire.CLIENT_SETTINGS:
+        if kind == wire.UDP_PROBE:
+            await self._probe()
+        elif kind == wire.CLIENT_SETTINGS:
             await self._settle(body)
         elif kind == wire.UDP_STATUS:
             self._conclude(any(body))
@@ -288,10 +276,13 @@ class FragileRobot(FragileServer):
             self.machine.lidar_on = body[0] == 1
             await self._send(wire.LIDAR_STATUS, self.machine.body(wire.LIDAR_STATUS))
         elif kind == wire.GET_POSITION:
-            misnamed = self._chance["answer"].random() < self._misnamed
+            misnamed = self._chance["answer"].random() < self._quirks.misnamed
             await self._send(wire.MAP if misnamed else wire.POSITION, self.machine.body(wire.POSITION))
-        elif kind == wire.GET_MAP:
-            await self._send_map()
+        elif kind == wire.GET_MAP:  # the first answer of a 1.1 robot is no map yet, the handler of a "1.4" is empty
+            first, self._asked_map = not self._asked_map, True
+            if self.version != "1.4":
+                none_yet = first and self.version == "1.1"
+                await self._send(wire.MAP, b"" if none_yet else self.machine.body(wire.MAP))
 
     # Handshake
 
@@ -325,7 +316,7 @@ class FragileRobot(FragileServer):
         data = self._polling.poll()
         if data == b"":
             return
-        if not self._answered and self._loss is not Loss.ANSWER:
+        if not self._answered and self._quirks.loss is not Loss.ANSWER:
             await self._send(wire.UDP_ANSWER, b"\x00")
         if not self._probes:
             self._violate(f"no 5 by UDP within {self._times.probe_s:g} s of the 4")
@@ -375,18 +366,10 @@ class FragileRobot(FragileServer):
             self._awake_s += min(ticker.passed_s, _STEP_S)
             self.machine.step(min(ticker.passed_s, _MOST_MOVE_S))
 
-    async def _send_map(self) -> None:
-        """Answer 52; the first answer of a 1.1 robot says no map yet, the handler of a "1.4" is empty ("Packets")."""
-        if self.version == "1.1" and not self._asked_map:
-            await self._send(wire.MAP)
-        elif self.version != "1.4":
-            await self._send(wire.MAP, self.machine.body(wire.MAP))
-        self._asked_map = True
-
     async def _send_parts(self, conn: socket.socket | None) -> None:
         """Send the map in parts again and again; TCP is read meanwhile ("The gateway as HQ")."""
         while True:
-            for body in self.machine.parts(self._parts):
+            for body in self.machine.parts(self._quirks.parts):
                 if self._conn is not conn:
                     return
                 await self._send(wire.MAP_PART, body)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import enum
 import math
 import struct
 from collections.abc import Collection, Iterator
 from random import Random
 
+import msgspec
 import numpy as np
 
 from gateways.tcpudp.conformance import parser as wire
@@ -17,6 +19,35 @@ _SPEED_M_S, _TURN_RAD_S = 0.5, 1.0
 _RANGE_M = 8.0
 _PROGRAM = (0.2, 0.0, 0.3)
 """How the robot's own program drives: m/s forward and left, rad/s."""
+
+
+class Loss(enum.Enum):
+    """Which datagram of the UDP probe gets lost."""
+
+    NOTHING = enum.auto()
+    PROBE = enum.auto()
+    ANSWER = enum.auto()
+
+
+class Quirks(msgspec.Struct, frozen=True, kw_only=True):
+    """What one robot does otherwise than the others of its version."""
+
+    client_id: int | None = None
+    """The id that it gives its first HQ; None: seeded."""
+    obeys: Collection[FeatureFlag] = ()
+    """Features whose packets it has registered without announcing them (``options.force``)."""
+    loss: Loss = Loss.NOTHING
+    parts: int = 4096
+    """Parts of a "1.4" map."""
+    side: int = SIDE
+    """Cells along a side of the map."""
+    misnamed: float = 0.25
+    """The fraction of positions sent as id 53."""
+    misread: float = 0.0
+    """The fraction of packets dropped after the handshake, chosen for each packet id by itself."""
+    again: bool = False
+    """It serves a connection after the first, which loses half of all packets in both directions and gets no telemetry
+    ("One usable connection")."""
 
 
 class JudgedRobot:

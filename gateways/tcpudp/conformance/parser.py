@@ -85,25 +85,6 @@ class RobotTimes(msgspec.Struct, frozen=True, kw_only=True):
     """Longest wait for its own send."""
 
 
-class HqTimes(msgspec.Struct, frozen=True, kw_only=True):
-    """The HQ's times in seconds; the defaults are those of the deployed HQ programs."""
-
-    answer_s: float = 0.015
-    """From packet 2 to the answer 3 (as captured)."""
-    probe_s: float = 2.0
-    """How long it waits for 4 and, after its 5, for 6."""
-    gap_s: float = 0.01
-    """Spacing of the robot's packets that exculpates it where this process read later than that."""
-
-
-class Loss(enum.Enum):
-    """Which datagram of the UDP probe gets lost."""
-
-    NOTHING = enum.auto()
-    PROBE = enum.auto()
-    ANSWER = enum.auto()
-
-
 class ParsedPacket(msgspec.Struct, frozen=True):
     """One packet as it was read."""
 
@@ -202,6 +183,18 @@ class Reads:
 
     def _large(self, size: int, data: bytes) -> str:
         return f"a packet of {size} bytes, over {self._most}: {show(data)}"
+
+
+def due_channel(kind: int, body: bytes, *, offered: bool, works: bool | None) -> Channel | None:
+    """Tell what must carry a packet of the robot ("Packets"); None: either, as without a 6 nothing was agreed.
+
+    ``offered``: the robot sent 4; ``works``: whether UDP was agreed, None until a 6 came.
+    """
+    if kind == UDP_ANSWER:
+        return "udp" if any(body) else "tcp"  # 6(false) is a violation by itself
+    if kind in BY_UDP and offered:
+        return None if works is None else "udp" if works else "tcp"
+    return "tcp"
 
 
 def datagram(data: bytes) -> ParsedPacket | None:

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from gateways.tcpudp.conformance.fragile_robot import FragileRobot, Loss
+from gateways.tcpudp.conformance.fragile_robot import FragileRobot
+from gateways.tcpudp.conformance.machine import Loss, Quirks
 from gateways.tcpudp.conformance.parser import FeatureFlag, RobotTimes
 from tests import captures
 from tests.conformance.scene import LONG_S, Peer, serving, table, until
@@ -120,7 +121,9 @@ async def facing(robot: FragileRobot) -> AsyncIterator[Hq]:
 
 
 def quick(version: str = "1.3", udp: bool = False, **options: Any) -> FragileRobot:
-    return FragileRobot(version=version, udp=udp, seed=1, **{"client_id": CLIENT, "times": QUICK, **options})
+    options = {"client_id": CLIENT, "times": QUICK, **options}
+    quirks = Quirks(**{name: options.pop(name) for name in Quirks.__struct_fields__ if name in options})
+    return FragileRobot(version=version, udp=udp, seed=1, quirks=quirks, **options)
 
 
 ROBOTS: dict[str, dict[str, Any]] = {

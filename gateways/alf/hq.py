@@ -13,18 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from gateways.alf.messages import (
-    MOST_POINTS,
-    POINTS,
-    AlfDialect,
-    AlfMessage,
-    DriveCommand,
-    DriveInfo,
-    Measurement,
-    ScannerInit,
-    write_binary,
-    write_text,
-)
+from gateways.alf import messages
 from gateways.alf.session import VehicleRole
 from gateways.alf.translate import FULL_LOCK_DEG, NAME, UNITS, Scale
 from zbridge.fleet import topics
@@ -39,7 +28,7 @@ COUNTER_ENDS = 2**31
 """One more than the largest integer that deployed receivers can read."""
 FULL_INFO = 100
 """The speed of drive info at full scale."""
-_FULL_SPEED = {AlfDialect.TEXT: 255, AlfDialect.BINARY: 100}
+_FULL_SPEED = {messages.AlfDialect.TEXT: 255, messages.AlfDialect.BINARY: 100}
 """The speed that HQ programs send at full scale."""
 _MM_PER_M = 1000
 _RAW_16 = 32767
@@ -52,7 +41,7 @@ class AlfHqOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     dialect: Literal["text", "binary"] = "text"
     serve: Literal["auto", "drive", "laser", "both"] = "auto"
-    points: Annotated[int, msgspec.Meta(ge=2, le=MOST_POINTS)] = POINTS
+    points: Annotated[int, msgspec.Meta(ge=2, le=messages.MOST_POINTS)] = messages.POINTS
     acceleration_m_s2: Scale | None = None
     gyro_rad_s: Scale | None = None
     gap_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
@@ -121,7 +110,7 @@ class Sweep:
         if not all(map(math.isfinite, map(math.degrees, angles))):  # receivers cannot read NaN
             raise EncodeError(f"scanner with angles {angles}")
         self.init = write(
-            ScannerInit(
+            messages.ScannerInit(
                 math.degrees(angle_min),
                 math.degrees(angle_max),
                 math.degrees(increment),
@@ -131,7 +120,7 @@ class Sweep:
             )
         )
 
-    def measurement(self, scan: Scan, sequence: int) -> Measurement:
+    def measurement(self, scan: Scan, sequence: int) -> messages.Measurement:
         """Return a measurement: ranges in mm, 0 = not measured; valid indices: of the first and last range."""
         ranges = scan.ranges if self._places is None else scan.ranges[self._places]
         with np.errstate(invalid="ignore"):
@@ -141,7 +130,7 @@ class Sweep:
         points[valid] = points_mm[valid]
         first, last = (int(valid[0]), int(valid[-1])) if valid.size else (0, 0)
         stamp_ms = scan.device_ms if isinstance(scan.device_ms, int) else _stamp_ms(scan)
-        return Measurement(sequence % COUNTER_ENDS, stamp_ms % COUNTER_ENDS, points, first, last)
+        return messages.Measurement(sequence % COUNTER_ENDS, stamp_ms % COUNTER_ENDS, points, first, last)
 
 
 class AlfHq(HqSide):
@@ -155,8 +144,8 @@ class AlfHq(HqSide):
     def __init__(self, options: AlfHqOptions, view: RobotView, metrics: Metrics | None = None) -> None:
         self.options = options
         self.view = view
-        self._dialect = AlfDialect(options.dialect)
-        self._write = write_text if self._dialect is AlfDialect.TEXT else write_binary
+        self._dialect = messages.AlfDialect(options.dialect)
+        self._write = messages.write_text if self._dialect is messages.AlfDialect.TEXT else messages.write_binary
         self._auto = options.serve == "auto"
         self._laser, self._drive = options.serve != "drive", options.serve != "laser"
         self.follows = (("scan", "scanner") if self._laser else ()) + (("motion",) if self._drive else ())
@@ -212,13 +201,13 @@ class AlfHq(HqSide):
         a, b, c = (self._measured(value / self._acceleration) for value in (x, 0.0 - y, z))
         d, e, f = (self._measured(value / self._gyro) for value in turning)
         speed = round(min(1.0, abs(_finite(motion.speed or 0.0))) * FULL_INFO)
-        message = DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
+        message = messages.DriveInfo(speed, a, b, c, d, e, f, _finite(motion.temperature or 0.0))
         frame = self._write(message)
         return lambda session, now: session.outbox.set("info", (frame,), now) if session.drive else None
 
     def _measured(self, value: float) -> float:
         value = _finite(value)
-        return value if self._dialect is AlfDialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
+        return value if self._dialect is messages.AlfDialect.TEXT else round(max(-_RAW_16, min(_RAW_16, value)))
 
     # What is understood
 
@@ -226,15 +215,15 @@ class AlfHq(HqSide):
         """A turn without speed only sets the wheels, and so is neutral."""
         return command.moving and not (isinstance(command, Drive) and not command.forward and not command.left)
 
-    def take(self, session: AlfClient, message: AlfMessage) -> tuple[Telemetry, ...]:
-        if not isinstance(message, DriveCommand):
+    def take(self, session: AlfClient, message: messages.AlfMessage) -> tuple[Telemetry, ...]:
+        if not isinstance(message, messages.DriveCommand):
             raise ProtocolError(f"{message.spec.name} from an HQ program")
         if not self._drive:
             session.left_out["drive command"] += 1
             return ()
         if self._auto and not session.drive:  # no deployed program can read both kinds ("The gateway as vehicle")
             session.show_drive()
-        straight = FULL_LOCK_DEG if self._dialect is AlfDialect.BINARY else 0
+        straight = FULL_LOCK_DEG if self._dialect is messages.AlfDialect.BINARY else 0
         right = max(-1.0, min(1.0, (message.steering - straight) / FULL_LOCK_DEG))
         speed = min(1.0, message.speed / self._full_speed)
         if not speed and self.view.protocol != NAME:  # it only sets wheels; other robots would turn on the spot

@@ -14,6 +14,7 @@ from typing import Any
 
 import msgspec
 
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.hq_client import TcpUdpClient, commands, each_once, newest_of
 from gateways.tcpudp.maps import (
     TCP_BYTES,
@@ -25,19 +26,6 @@ from gateways.tcpudp.maps import (
     most_side,
     resampled,
     squared,
-)
-from gateways.tcpudp.messages import (
-    PACKETS,
-    ChatMessage,
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-    ServerCamMode,
-    ServerGetSimulatedLidarData,
-    ServerLidarStatus,
-    ServerPosition,
-    ServerSLAMMap,
-    encode_packet,
 )
 from gateways.tcpudp.options import NAME, TcpUdpHqOptions
 from gateways.tcpudp.session.robot_role import RobotRole
@@ -137,11 +125,11 @@ class TcpUdpHq(HqSide):
             self.tell(session, f"the robot's {missing} is not known", now)
 
     def tell(self, session: TcpUdpClient, text: str, now: float) -> None:
-        session.send(DebugMessage(ascii_text(text)))
+        session.send(packets.DebugMessage(ascii_text(text)))
 
     # What is understood
 
-    def take(self, session: TcpUdpClient, message: Packet) -> tuple[Telemetry, ...]:
+    def take(self, session: TcpUdpClient, message: packets.Packet) -> tuple[Telemetry, ...]:
         return commands(session, message, self.options)
 
 
@@ -200,7 +188,9 @@ class TcpUdpDisplay:
         if not math.isfinite(message.x + message.y + message.heading):
             raise EncodeError(f"position {message.x:g}, {message.y:g}, {message.heading:g}")
         heading_deg = math.degrees(message.heading - self._options.heading_offset)
-        return newest_of("pose", ServerPosition(message.x / self._unit_m, message.y / self._unit_m, heading_deg))
+        return newest_of(
+            "pose", packets.ServerPosition(message.x / self._unit_m, message.y / self._unit_m, heading_deg)
+        )
 
     def _map(self, message: Map) -> Send:
         """Show a map to each client in the size that it was announced, or that fits its transport."""
@@ -213,12 +203,12 @@ class TcpUdpDisplay:
             key = (session.geometry if announced else None, most)
             if key not in frames:
                 cells, to_scale = self._cells(message, *key)
-                frame = encode_packet(ServerSLAMMap(cells), session.sender_id)
+                frame = packets.encode_packet(packets.ServerSLAMMap(cells), session.sender_id)
                 frames[key] = (frame, Datagram(frame))
                 larger.update(() if to_scale else (key,))
             if key in larger:
                 session.left_out["map to scale"] += 1
-            session.show("map", ServerSLAMMap.spec.id, frames[key][session.by_udp], now)
+            session.show("map", packets.ServerSLAMMap.spec.id, frames[key][session.by_udp], now)
 
         return send
 
@@ -248,22 +238,22 @@ class TcpUdpDisplay:
         return MapFrame(own=self._view.protocol in (NAME, None), origin=self._options.map_origin)
 
     def _lidar(self, message: Switch) -> Send:
-        return newest_of("lidar", ServerLidarStatus(ON if message.on else OFF))
+        return newest_of("lidar", packets.ServerLidarStatus(ON if message.on else OFF))
 
     def _camera(self, message: Switch) -> Send:
-        return newest_of("camera", ServerCamMode(ON if message.on else OFF))
+        return newest_of("camera", packets.ServerCamMode(ON if message.on else OFF))
 
     def _text(self, message: Text) -> Send | None:
         if message.kind == "request":
             return _request
-        return each_once(DebugMessage(ascii_text(message.text))) if message.text else None
+        return each_once(packets.DebugMessage(ascii_text(message.text))) if message.text else None
 
     def _raw(self, message: Raw) -> Send | None:
         """Pass on packets of the robot that no fleet message holds."""
-        spec = PACKETS.get(message.id)
-        if spec is not None and spec.packet is ChatMessage:
-            return each_once(ChatMessage(message.body))
-        return each_once(OpaquePacket(message.id, message.body)) if spec is None else None
+        spec = packets.PACKETS.get(message.id)
+        if spec is not None and spec.packet is packets.ChatMessage:
+            return each_once(packets.ChatMessage(message.body))
+        return each_once(packets.OpaquePacket(message.id, message.body)) if spec is None else None
 
 
 def ascii_text(text: str) -> str:
@@ -274,12 +264,12 @@ def ascii_text(text: str) -> str:
 def _request(session: TcpUdpClient, now: float) -> None:
     """Ask a client that announced simulated lidar data for it."""
     if Feature.LIDAR_SIM in (session.client.features if session.client is not None else ()):
-        session.show("request", ServerGetSimulatedLidarData.spec.id, _REQUEST, now)
+        session.show("request", packets.ServerGetSimulatedLidarData.spec.id, _REQUEST, now)
     else:
-        session.leave_out(ServerGetSimulatedLidarData.spec.id)
+        session.leave_out(packets.ServerGetSimulatedLidarData.spec.id)
 
 
-_REQUEST = encode_packet(ServerGetSimulatedLidarData(), RobotRole.sender_id)
+_REQUEST = packets.encode_packet(packets.ServerGetSimulatedLidarData(), RobotRole.sender_id)
 _SHOWN: dict[str, Callable[[TcpUdpDisplay, Any], Send | None]] = {
     topics.POSE.path: TcpUdpDisplay._pose,
     topics.MAP.path: TcpUdpDisplay._map,

@@ -10,24 +10,8 @@ import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.maps import TCP_BYTES, Geometry
-from gateways.tcpudp.messages import (
-    PACKETS,
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientJoystickMove,
-    ClientJoystickRotate,
-    ClientJoystickStop,
-    ClientLidarMode,
-    ClientSimulatedLidarData,
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-    ServerPosition,
-    ServerSLAMMap,
-    encode_packet,
-)
 from gateways.tcpudp.options import NAME, TcpUdpHqOptions
 from gateways.tcpudp.session.robot_role import RobotRole
 from gateways.tcpudp.settings import Feature, RobotSettings13, Settings
@@ -38,7 +22,7 @@ from zbridge.protocol import Datagram, EncodeError, Limits, ProtocolError, Send,
 
 _ASKING = ("1.1",)
 """Versions whose first programs have no handlers for packets that they did not ask for ("The gateway as robot")."""
-_ON_REQUEST = frozenset({ServerSLAMMap.spec.id, ServerPosition.spec.id})
+_ON_REQUEST = frozenset({packets.ServerSLAMMap.spec.id, packets.ServerPosition.spec.id})
 
 
 class TcpUdpClient(RobotRole):
@@ -86,14 +70,14 @@ class TcpUdpClient(RobotRole):
 
     def leave_out(self, packet_id: int) -> None:
         """Count a packet that the client does not know."""
-        spec = PACKETS.get(packet_id)
+        spec = packets.PACKETS.get(packet_id)
         name = f"{spec.name} ({packet_id})" if spec is not None else f"packet {packet_id}"
         self.left_out[f"{name} unasked" if packet_id in _ON_REQUEST else name] += 1
 
 
-def newest_of(slot: str, packet: Packet) -> Send:
+def newest_of(slot: str, packet: packets.Packet) -> Send:
     """Encode a packet once for all clients, to be queued as the newest of its slot, by datagram where it may be."""
-    frame = encode_packet(packet, RobotRole.sender_id)
+    frame = packets.encode_packet(packet, RobotRole.sender_id)
     datagram = Datagram(frame) if packet.spec.carrier.value == "udp*" else frame
 
     def send(session: TcpUdpClient, now: float) -> None:
@@ -102,12 +86,12 @@ def newest_of(slot: str, packet: Packet) -> Send:
     return send
 
 
-def each_once(packet: Packet) -> Send:
+def each_once(packet: packets.Packet) -> Send:
     """Encode a packet once for all clients, to be queued behind others; nothing replaces it.
 
     Raises EncodeError if it is longer than programs take by TCP.
     """
-    frame = encode_packet(packet, RobotRole.sender_id)
+    frame = packets.encode_packet(packet, RobotRole.sender_id)
     if len(frame) > TCP_BYTES:
         raise EncodeError(f"packet of {len(frame)} bytes, HQ programs take {TCP_BYTES} by TCP")
     packet_id = frame[5]
@@ -131,13 +115,13 @@ def _without_map_flag(settings: Settings) -> bytes:
 Commands = tuple[Telemetry, ...]
 
 
-def commands(client: TcpUdpClient, packet: Packet, options: TcpUdpHqOptions) -> Commands:
+def commands(client: TcpUdpClient, packet: packets.Packet, options: TcpUdpHqOptions) -> Commands:
     """Translate a packet of a client; raise ProtocolError if it has no meaning."""
     translate = _TRANSLATE.get(type(packet))
     return translate(client, packet, options) if translate is not None else _raw(packet)
 
 
-def _move(client: TcpUdpClient, packet: ClientJoystickMove, options: TcpUdpHqOptions) -> Commands:
+def _move(client: TcpUdpClient, packet: packets.ClientJoystickMove, options: TcpUdpHqOptions) -> Commands:
     speed = packet.speed / options.speed_full
     forward, left = packet.y * speed, 0.0 - packet.x * speed
     if not math.isfinite(forward + left):
@@ -146,34 +130,34 @@ def _move(client: TcpUdpClient, packet: ClientJoystickMove, options: TcpUdpHqOpt
     return ((topics.CMD_DRIVE, Drive(forward=forward / scale, left=left / scale)),)
 
 
-def _rotate(client: TcpUdpClient, packet: ClientJoystickRotate, options: TcpUdpHqOptions) -> Commands:
+def _rotate(client: TcpUdpClient, packet: packets.ClientJoystickRotate, options: TcpUdpHqOptions) -> Commands:
     if not math.isfinite(packet.speed):
         raise ProtocolError(f"clientJoystickRotate at {packet.speed:g}")
     turn = max(-1.0, min(1.0, 0.0 - packet.speed / options.turn_full))
     return ((topics.CMD_DRIVE, Drive(turn=turn)),)
 
 
-def _stop(client: TcpUdpClient, packet: ClientJoystickStop, options: TcpUdpHqOptions) -> Commands:
+def _stop(client: TcpUdpClient, packet: packets.ClientJoystickStop, options: TcpUdpHqOptions) -> Commands:
     return ((topics.CMD_DRIVE, Drive()),)
 
 
-def _mode(client: TcpUdpClient, packet: ClientControllMode, options: TcpUdpHqOptions) -> Commands:
+def _mode(client: TcpUdpClient, packet: packets.ClientControllMode, options: TcpUdpHqOptions) -> Commands:
     if packet.mode not in _MODES:
         raise ProtocolError(f"control mode {packet.mode}, expected 1 (none), 2 (joystick) or 3 (AI)")
     return ((topics.CMD_MODE, _MODES[packet.mode]),)
 
 
-def _lidar(client: TcpUdpClient, packet: ClientLidarMode, options: TcpUdpHqOptions) -> Commands:
+def _lidar(client: TcpUdpClient, packet: packets.ClientLidarMode, options: TcpUdpHqOptions) -> Commands:
     if packet.mode not in (ON, OFF):
         raise ProtocolError(f"lidar mode {packet.mode}, expected {ON} (on) or {OFF} (off)")
     return ((topics.CMD_LIDAR, Switch(packet.mode == ON)),)
 
 
-def _text(client: TcpUdpClient, packet: DebugMessage, options: TcpUdpHqOptions) -> Commands:
+def _text(client: TcpUdpClient, packet: packets.DebugMessage, options: TcpUdpHqOptions) -> Commands:
     return ((topics.CMD_TEXT, Text(packet.text, sender=client.name)),) if packet.text else ()
 
 
-def _scan(client: TcpUdpClient, packet: ClientSimulatedLidarData, options: TcpUdpHqOptions) -> Commands:
+def _scan(client: TcpUdpClient, packet: packets.ClientSimulatedLidarData, options: TcpUdpHqOptions) -> Commands:
     """Translate simulated lidar data: one turn of ranges counter-clockwise from straight ahead, 0 = no measurement."""
     count = len(packet.ranges)
     if not count:
@@ -187,18 +171,18 @@ def _scan(client: TcpUdpClient, packet: ClientSimulatedLidarData, options: TcpUd
     return ((topics.CMD_SCAN, Scan(0.0, 2 * math.pi / count, 0.0, most_m, ranges_m)),)
 
 
-def _ask_map(client: TcpUdpClient, packet: ClientGetSLAMMap, options: TcpUdpHqOptions) -> Commands:
-    client.asks(ServerSLAMMap.spec.id)
+def _ask_map(client: TcpUdpClient, packet: packets.ClientGetSLAMMap, options: TcpUdpHqOptions) -> Commands:
+    client.asks(packets.ServerSLAMMap.spec.id)
     return ((topics.RPC_MAP, Query()),)
 
 
-def _ask_pose(client: TcpUdpClient, packet: ClientGetPosition, options: TcpUdpHqOptions) -> Commands:
-    client.asks(ServerPosition.spec.id)
+def _ask_pose(client: TcpUdpClient, packet: packets.ClientGetPosition, options: TcpUdpHqOptions) -> Commands:
+    client.asks(packets.ServerPosition.spec.id)
     return ((topics.RPC_POSE, Query()),)
 
 
-def _raw(packet: Packet) -> Commands:
-    if isinstance(packet, OpaquePacket):
+def _raw(packet: packets.Packet) -> Commands:
+    if isinstance(packet, packets.OpaquePacket):
         raw = Raw(packet.id, packet.body)
     else:
         raw = Raw(packet.spec.id, packet.spec.codec.encode(packet))
@@ -206,14 +190,14 @@ def _raw(packet: Packet) -> Commands:
 
 
 _MODES = {1: Mode("none"), 2: Mode("manual"), 3: Mode("autonomous")}
-_TRANSLATE: dict[type[Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOptions], Commands]] = {
-    ClientJoystickMove: _move,
-    ClientJoystickRotate: _rotate,
-    ClientJoystickStop: _stop,
-    ClientControllMode: _mode,
-    ClientLidarMode: _lidar,
-    DebugMessage: _text,
-    ClientSimulatedLidarData: _scan,
-    ClientGetSLAMMap: _ask_map,
-    ClientGetPosition: _ask_pose,
+_TRANSLATE: dict[type[packets.Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOptions], Commands]] = {
+    packets.ClientJoystickMove: _move,
+    packets.ClientJoystickRotate: _rotate,
+    packets.ClientJoystickStop: _stop,
+    packets.ClientControllMode: _mode,
+    packets.ClientLidarMode: _lidar,
+    packets.DebugMessage: _text,
+    packets.ClientSimulatedLidarData: _scan,
+    packets.ClientGetSLAMMap: _ask_map,
+    packets.ClientGetPosition: _ask_pose,
 }

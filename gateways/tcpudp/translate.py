@@ -20,21 +20,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    PACKETS,
-    ChatMessage,
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientJoystickMove,
-    ClientJoystickRotate,
-    ClientJoystickStop,
-    ClientMoveAI,
-    ClientSimulatedLidarData,
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-)
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.options import NAME, TcpUdpOptions
 from gateways.tcpudp.session import limits
 from gateways.tcpudp.session.hq_role import HqRole
@@ -166,10 +152,10 @@ class TcpUdpRobot(Robot):
 
     def ask(self, topic: Topic) -> None:
         if topic is not topics.MAP:
-            self._send(ClientGetPosition())
+            self._send(packets.ClientGetPosition())
             return
         if not self._telemetry.sends_parts:
-            self._send(ClientGetSLAMMap())
+            self._send(packets.ClientGetSLAMMap())
         self._telemetry.await_map()
 
     def _drive(self, command: Drive, now: float) -> Outcome:
@@ -180,18 +166,20 @@ class TcpUdpRobot(Robot):
             self._neutral(session, now)
             return Outcome(left_out=left_out)
         translation = math.hypot(command.forward, command.left)
-        packets: list[Packet] = []
+        moves: list[packets.Packet] = []
         if translation:
             speed = min(1.0, translation) * self.options.speed_full
-            packets.append(ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed))
+            moves.append(
+                packets.ClientJoystickMove((0.0 - command.left) / translation, command.forward / translation, speed)
+            )
         if command.turn:
-            packets.append(ClientJoystickRotate(-command.turn * self.options.turn_full))
-        if len(packets) == 2 and self.options.combine == "exclusive":
+            moves.append(packets.ClientJoystickRotate(-command.turn * self.options.turn_full))
+        if len(moves) == 2 and self.options.combine == "exclusive":
             rotates = abs(command.turn) > translation
-            packets = packets[1:] if rotates else packets[:1]
+            moves = moves[1:] if rotates else moves[:1]
             left_out = f"{'forward and left' if rotates else 'turn'}: options.combine = 'exclusive'"
         session = self._connected()
-        frames = tuple(session.encode(packet) for packet in packets)
+        frames = tuple(session.encode(packet) for packet in moves)
         session.outbox.set(_MOTION, frames, now, period_s=REPEAT_S)
         self._stop_until = -math.inf
         return Outcome(left_out=left_out) if left_out else _NOTHING
@@ -226,16 +214,16 @@ class TcpUdpRobot(Robot):
     def _send_text(self, command: Text, now: float) -> None:
         if command.kind != "debug":
             raise Unsupported(f"text of kind {command.kind!r}: only 'debug' has a packet; chat is opaque, send it raw")
-        self._send(DebugMessage(command.text))
+        self._send(packets.DebugMessage(command.text))
 
     def _send_scan(self, command: Scan, now: float) -> Outcome:
-        self._send(ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
+        self._send(packets.ClientSimulatedLidarData(polar_ranges(command, self.options.length_unit_m)))
         return Outcome(telemetry=((topics.SCAN, command),))
 
     def _send_raw(self, command: Raw, now: float) -> None:
         self._connected().send_raw(_raw_packet(command))
 
-    def _send(self, message: Packet) -> None:
+    def _send(self, message: packets.Packet) -> None:
         self._connected().send(message)
 
     def _repeat_stop(self, now: float, *, until: float, period_s: float = math.inf, urgent: bool = False) -> None:
@@ -248,10 +236,11 @@ class TcpUdpRobot(Robot):
         session.outbox.set(_MOTION, frames, now, period_s=period_s, until=until, spacing_s=spacing_s, urgent=urgent)
         self._stop_until = until
 
-    def _stop_packets(self, *, paired: bool) -> tuple[Packet, ...]:
+    def _stop_packets(self, *, paired: bool) -> tuple[packets.Packet, ...]:
         """Packet 13; ``paired``: after a mode that ends mode 3, the one that the holder wants or none."""
         mode = _MODES["manual" if self._chosen == "manual" else "none"]
-        return (ClientControllMode(mode), ClientJoystickStop()) if paired else (ClientJoystickStop(),)
+        stop = packets.ClientJoystickStop()
+        return (packets.ClientControllMode(mode), stop) if paired else (stop,)
 
     def _connected(self) -> HqRole:
         if self._session is None:
@@ -259,10 +248,10 @@ class TcpUdpRobot(Robot):
         return self._session
 
 
-def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
+def _sendable(session: HqRole, wanted: Iterable[packets.Packet]) -> tuple[bytes, ...]:
     """Write the packets that the robot may be sent; raise Refused if it may be sent none of them."""
     frames, refusal = [], None
-    for packet in packets:
+    for packet in wanted:
         try:
             frames.append(session.encode(packet))
         except Refused as refused:
@@ -272,17 +261,17 @@ def _sendable(session: HqRole, packets: Iterable[Packet]) -> tuple[bytes, ...]:
     return tuple(frames)
 
 
-def _raw_packet(command: Raw) -> Packet:
+def _raw_packet(command: Raw) -> packets.Packet:
     """Make the packet of a raw command; raise Refused if a fleet message holds that packet."""
-    spec = PACKETS.get(command.id)
+    spec = packets.PACKETS.get(command.id)
     if spec is None:
         if not 0 <= command.id <= 255:
             raise Malformed(f"packet id {command.id}, expected 0 to 255")
-        return OpaquePacket(command.id, command.body)
-    if spec.packet is ClientMoveAI:
-        return ClientMoveAI(command.body)
-    if spec.packet is ChatMessage:
-        return ChatMessage(command.body)
+        return packets.OpaquePacket(command.id, command.body)
+    if spec.packet is packets.ClientMoveAI:
+        return packets.ClientMoveAI(command.body)
+    if spec.packet is packets.ChatMessage:
+        return packets.ChatMessage(command.body)
     raise Unsupported(f"{spec.name} ({spec.id}) is not raw: use the command or query that holds it")
 
 

@@ -197,8 +197,8 @@ MUTANTS = (
         "stop does not end mode 3",
         "tcpudp",
         TCPUDP,
-        "return (ClientControllMode(mode), ClientJoystickStop()) if paired",
-        "return (ClientJoystickStop(),) if paired",
+        "return (packets.ClientControllMode(mode), stop) if paired",
+        "return (stop,) if paired",
     ),
     Mutant("neutral does not reach the robot", None, TCPUDP, "            self._neutral(session, now)\n", ""),
     Mutant(

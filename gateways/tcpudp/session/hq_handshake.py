@@ -17,18 +17,7 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    HEADER,
-    SERVER_ID,
-    ClientSettings,
-    ClientUDPConnection,
-    ClientUDPConnectionStatus,
-    DebugMessage,
-    Packet,
-    ServerSettings,
-    ServerStartUDP,
-    ServerUDPConnection,
-)
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.session import PacketSession, decoders
 from gateways.tcpudp.settings import ROBOT_BLOCKS, SETTINGS, VERSIONS, Feature, Settings, announced, read_settings
 from zbridge.protocol import Datagram, Handshake, Kept, Limits, ProtocolError, Role, Traffic, agree, parse_versions
@@ -107,8 +96,8 @@ PROBE_S = 2.0
 SILENCE_S = 2.5
 """Seconds after packet 4 in which only one packet 7 may be sent by TCP: the robot sleeps 2 s, and may be late."""
 LATE_START = "handshaking"
-_HEADER_SIZE = HEADER.size
-_FROM_ROBOT = {bytes((SERVER_ID, packet_id)): decode for packet_id, decode in decoders(Role.HQ).items()}
+_HEADER_SIZE = packets.HEADER.size
+_FROM_ROBOT = {bytes((packets.SERVER_ID, packet_id)): decode for packet_id, decode in decoders(Role.HQ).items()}
 """How to read what a robot may send, by ``id`` byte and packet id."""
 
 
@@ -156,7 +145,9 @@ class HqHandshake(PacketSession):
         "_others": int,
     }
     role = Role.HQ
-    handled = frozenset({ServerSettings, ServerStartUDP, ServerUDPConnection, DebugMessage})
+    handled = frozenset(
+        {packets.ServerSettings, packets.ServerStartUDP, packets.ServerUDPConnection, packets.DebugMessage}
+    )
 
     def __init__(self, limits: Limits, *, udp: bool, announce: Iterable[Feature], signs: Signs | None) -> None:
         super().__init__(limits)
@@ -176,7 +167,7 @@ class HqHandshake(PacketSession):
         self._others = 0
         """Packets received that are no telemetry."""
 
-    def decode(self, frame: bytes) -> Packet:
+    def decode(self, frame: bytes) -> packets.Packet:
         decode = _FROM_ROBOT.get(frame[4:6])
         if decode is None:
             raise self.misplaced(frame)
@@ -192,29 +183,29 @@ class HqHandshake(PacketSession):
 
     # Messages of the handshake
 
-    def accept(self, message: Packet, now: float) -> bool:
+    def accept(self, message: packets.Packet, now: float) -> bool:
         return self._accept(message, now, by_datagram=False)
 
-    def accept_datagram(self, message: Packet, now: float) -> bool:
+    def accept_datagram(self, message: packets.Packet, now: float) -> bool:
         return self._accept(message, now, by_datagram=True)
 
-    def _accept(self, message: Packet, now: float, *, by_datagram: bool) -> bool:
-        if isinstance(message, ServerUDPConnection) and (by_datagram or self.settings is not None):
+    def _accept(self, message: packets.Packet, now: float, *, by_datagram: bool) -> bool:
+        if isinstance(message, packets.ServerUDPConnection) and (by_datagram or self.settings is not None):
             self._take_answer(works=message.received and by_datagram, now=now)
-        elif isinstance(message, ServerSettings):
+        elif isinstance(message, packets.ServerSettings):
             self._take_settings(message, now)
         elif self.settings is None:
             raise ProtocolError(f"{type(message).__name__} before serverSettings")
-        elif isinstance(message, ServerStartUDP):
+        elif isinstance(message, packets.ServerStartUDP):
             if not self._handshake.fire(HqEvent.START, now):
                 raise ProtocolError("serverStartUDP a second time")
         else:
-            self._others += isinstance(message, DebugMessage)
+            self._others += isinstance(message, packets.DebugMessage)
             return True
         self._others += 1
         return False
 
-    def _take_settings(self, message: ServerSettings, now: float) -> None:
+    def _take_settings(self, message: packets.ServerSettings, now: float) -> None:
         if self.settings is not None:
             raise ProtocolError("serverSettings a second time")
         self.sender_id = message.client_id
@@ -229,7 +220,7 @@ class HqHandshake(PacketSession):
         udp = self._udp and self.settings.udp
         answer = VERSIONS[agreed].answer or message.versions
         features = self._announce if udp else self._announce - {Feature.UDP}
-        self.send_first(ClientSettings(answer, announced(answer, features)))
+        self.send_first(packets.ClientSettings(answer, announced(answer, features)))
         self._handshake.fire(HqEvent.SETTINGS_UDP if udp else HqEvent.SETTINGS_TCP, now)
 
     def _take_answer(self, *, works: bool, now: float) -> None:
@@ -247,7 +238,7 @@ class HqHandshake(PacketSession):
         """Send 5 by UDP; begin the silence by TCP."""
         self._fall_silent(now)
         self._answered = False
-        self.outbox.put_exempt(Datagram(self.encode(ClientUDPConnection())))
+        self.outbox.put_exempt(Datagram(self.encode(packets.ClientUDPConnection())))
 
     def _probe_late(self, now: float) -> None:
         """Refuse commands; send 5 by UDP; begin the silence by TCP."""
@@ -266,11 +257,11 @@ class HqHandshake(PacketSession):
     def _report_works(self, now: float) -> None:
         """Send 7(true), and use datagrams."""
         self.transport = "udp"
-        self.send_first(ClientUDPConnectionStatus(True))
+        self.send_first(packets.ClientUDPConnectionStatus(True))
 
     def _report_fails(self, now: float) -> None:
         """Send 7(false)."""
-        self.send_first(ClientUDPConnectionStatus(False))
+        self.send_first(packets.ClientUDPConnectionStatus(False))
 
     def _finish(self, now: float) -> None:
         """Establish the session."""

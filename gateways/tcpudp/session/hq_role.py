@@ -14,16 +14,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    HEADER,
-    ClientControllMode,
-    ClientGetPosition,
-    ClientGetSLAMMap,
-    ClientLidarMode,
-    DebugMessage,
-    OpaquePacket,
-    Packet,
-)
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.session.hq_handshake import HqHandshake
 from gateways.tcpudp.settings import ANNOUNCED, Feature
 from zbridge.protocol import FRAME, FRAMES, LIMIT, EncodeError, Frame, Limits, Malformed, Spare, Unsupported
@@ -35,7 +26,7 @@ AGAIN_S = 0.3
 _AUTONOMOUS = 3
 _MODE_AGAIN, _LIDAR_AGAIN = "mode again", "lidar again"
 _MISREADING = frozenset({"1.1", "1.2"})
-_ANSWERED = (ClientGetSLAMMap, ClientGetPosition)
+_ANSWERED = (packets.ClientGetSLAMMap, packets.ClientGetPosition)
 
 
 class _Chosen(Frame):
@@ -44,7 +35,7 @@ class _Chosen(Frame):
     @property
     def autonomous(self) -> bool:
         """True if it lets the robot's own program drive."""
-        return self[HEADER.size] == _AUTONOMOUS
+        return self[packets.HEADER.size] == _AUTONOMOUS
 
 
 class HqRole(HqHandshake):
@@ -70,28 +61,28 @@ class HqRole(HqHandshake):
         self.sent_autonomous: bool = predecessor is not None and predecessor.sent_autonomous
         """Whether the robot was ever sent mode 3; outlives connections. No packet shows that another mode ended it."""
         self._force = frozenset(force)
-        self._registered: set[type[Packet]] = set()
+        self._registered: set[type[packets.Packet]] = set()
         """Classes of packets that the robot's settings were found to allow."""
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
         self._raw: deque[bytes] = deque(maxlen=LIMIT)
         """The undefined packets that were queued; at most as many as the queue holds."""
 
-    def encode(self, message: Packet) -> bytes:
+    def encode(self, message: packets.Packet) -> bytes:
         """Write a packet; raise Refused for one the robot may not know, EncodeError for one it cannot take whole."""
         self.may_send(message)
-        if isinstance(message, DebugMessage) and not message.text:
+        if isinstance(message, packets.DebugMessage) and not message.text:
             raise Malformed("an empty text crashes the robot")
         frame = super().encode(message)
         if len(frame) > MAX_WRITE:
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
 
-    def may_send(self, message: Packet) -> None:
+    def may_send(self, message: packets.Packet) -> None:
         """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
         if type(message) in self._registered:
             return
-        if isinstance(message, OpaquePacket):
+        if isinstance(message, packets.OpaquePacket):
             if message.id not in self._force:
                 raise Unsupported(f"packet {message.id} may crash the robot; list it in options.force if it knows it")
             return
@@ -116,13 +107,13 @@ class HqRole(HqHandshake):
 
     def choose_mode(self, mode: int, now: float) -> None:
         """Send a control mode that was commanded; raise Refused."""
-        frame = _Chosen(self.encode(ClientControllMode(mode)))
+        frame = _Chosen(self.encode(packets.ClientControllMode(mode)))
         self._send_reliably(frame, _MODE_AGAIN, now)
         self._chosen = frame
 
     def switch_lidar(self, mode: int, now: float) -> None:
         """Send a lidar mode; raise Refused."""
-        self._send_reliably(self.encode(ClientLidarMode(mode)), _LIDAR_AGAIN, now)
+        self._send_reliably(self.encode(packets.ClientLidarMode(mode)), _LIDAR_AGAIN, now)
         self._signs.note_queries(self._telemetry_in, 1 + self.outbox.is_set(_LIDAR_AGAIN))
 
     def send_nothing_again(self) -> None:
@@ -130,7 +121,7 @@ class HqRole(HqHandshake):
         self.outbox.clear(_MODE_AGAIN)
         self.outbox.clear(_LIDAR_AGAIN)
 
-    def send_raw(self, packet: Packet) -> None:
+    def send_raw(self, packet: packets.Packet) -> None:
         """Queue an undefined packet; raise Refused, EncodeError."""
         frame = self.encode(packet)
         self.outbox.put(frame)
@@ -149,7 +140,7 @@ class HqRole(HqHandshake):
             self.outbox.unqueue(self._chosen)
             self.outbox.clear(_MODE_AGAIN)
 
-    def send(self, message: Packet) -> None:
+    def send(self, message: packets.Packet) -> None:
         super().send(message)
         if isinstance(message, _ANSWERED):
             self._signs.note_queries(self._telemetry_in)

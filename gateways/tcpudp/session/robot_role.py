@@ -29,18 +29,7 @@ from collections.abc import Callable, Iterable
 from enum import Enum
 from typing import Any, ClassVar
 
-from gateways.tcpudp.messages import (
-    HEADER,
-    SERVER_ID,
-    ClientSettings,
-    ClientUDPConnection,
-    ClientUDPConnectionStatus,
-    Packet,
-    ServerSettings,
-    ServerStartUDP,
-    ServerUDPConnection,
-    read_header,
-)
+from gateways.tcpudp import messages as packets
 from gateways.tcpudp.session import Decode, PacketSession, decoders, id_of
 from gateways.tcpudp.settings import HQ_BLOCKS, LISTED, SETTINGS, VERSIONS, Settings, read_settings
 from zbridge.protocol import (
@@ -64,10 +53,10 @@ CLIENT_PORT = 11000
 """The UDP port that deployed HQ programs bind."""
 FROM_HQ: dict[int, Decode] = decoders(Role.ROBOT)
 """How to read what an HQ program may send, by packet id."""
-_UNASSIGNED = (0, SERVER_ID)
+_UNASSIGNED = (0, packets.SERVER_ID)
 """The ``id`` bytes that no client is given."""
 _NO_HEADER = (-1, -1)
-_PROBE = ClientUDPConnection.spec.id
+_PROBE = packets.ClientUDPConnection.spec.id
 
 
 class ClientSource(Kept):
@@ -126,7 +115,7 @@ class ClientSource(Kept):
 def _header(datagram: bytes) -> tuple[int, int]:
     """Give the ``id`` byte and the packet id of a datagram; -1 each if it is not one packet."""
     try:
-        return read_header(datagram)
+        return packets.read_header(datagram)
     except ProtocolError:
         return _NO_HEADER
 
@@ -136,7 +125,7 @@ PROBE_S = 2.0
 REPORT_S = 3.0
 """Seconds it has for packet 7: it may wait 2 s for a 6 that was lost."""
 RIVAL = "another source of datagrams claims to be this client"
-_HEADER_SIZE = HEADER.size
+_HEADER_SIZE = packets.HEADER.size
 _HANDSHAKING, _ESTABLISHED = State.HANDSHAKING, State.ESTABLISHED
 """As plain names: every client of a host is asked about every datagram that has no owner yet."""
 
@@ -185,8 +174,8 @@ class RobotRole(PacketSession):
         "_handshake": Handshake,
     }
     role = Role.ROBOT
-    handled = frozenset({ClientSettings, ClientUDPConnection, ClientUDPConnectionStatus})
-    sender_id = SERVER_ID
+    handled = frozenset({packets.ClientSettings, packets.ClientUDPConnection, packets.ClientUDPConnectionStatus})
+    sender_id = packets.SERVER_ID
 
     def __init__(
         self,
@@ -222,13 +211,13 @@ class RobotRole(PacketSession):
         super().restore(state)
         self._answer = self.outbox.found(self._answer)
 
-    def decode(self, frame: bytes) -> Packet:
+    def decode(self, frame: bytes) -> packets.Packet:
         decode = FROM_HQ.get(frame[5])
         if decode is None:
             raise self.misplaced(frame)
         return decode(frame, _HEADER_SIZE)
 
-    def may_send(self, message: Packet) -> None:
+    def may_send(self, message: packets.Packet) -> None:
         """Raise Unsupported for a packet that this HQ does not know."""
         if id_of(message) not in self.known:
             raise Unsupported(f"an HQ of version {self._agreed} does not know packet {id_of(message)}")
@@ -236,23 +225,23 @@ class RobotRole(PacketSession):
     # The stream
 
     def opened(self, now: float) -> None:
-        self.send_first(ServerSettings(self.client_id, ",".join(self._versions), self._block))
+        self.send_first(packets.ServerSettings(self.client_id, ",".join(self._versions), self._block))
 
-    def accept(self, message: Packet, now: float) -> bool:
-        if isinstance(message, ClientSettings):
+    def accept(self, message: packets.Packet, now: float) -> bool:
+        if isinstance(message, packets.ClientSettings):
             self._take_settings(message, now)
         elif self.client is None:
             raise ProtocolError(f"{type(message).__name__} before clientSettings")
-        elif isinstance(message, ClientUDPConnectionStatus):
+        elif isinstance(message, packets.ClientUDPConnectionStatus):
             confirmed = message.connected and now < self._report_until
             self._fire(RobotEvent.REPORT_TRUE if confirmed else RobotEvent.REPORT_FALSE, now)
-        elif isinstance(message, ClientUDPConnection):
+        elif isinstance(message, packets.ClientUDPConnection):
             raise ProtocolError("clientUDPConnection by TCP")
         else:
             return True
         return False
 
-    def _take_settings(self, message: ClientSettings, now: float) -> None:
+    def _take_settings(self, message: packets.ClientSettings, now: float) -> None:
         if self.client is not None:
             raise ProtocolError("clientSettings a second time")
         agreed = agree(self._versions, parse_versions(message.versions))
@@ -291,7 +280,7 @@ class RobotRole(PacketSession):
             text = "packets by UDP from another port than this client's are not taken"
             raise NotReady(f"{text} (client_port = {self._source.client_port})")
 
-    def receive_datagram(self, datagram: bytes, now: float) -> list[Packet]:
+    def receive_datagram(self, datagram: bytes, now: float) -> list[packets.Packet]:
         """Take one datagram of the client's source, unless it has the id of another client."""
         self._source.bind()
         sender_id = self._source.sender_of(datagram)
@@ -300,8 +289,8 @@ class RobotRole(PacketSession):
         self.malformed(f"datagram with id {sender_id}, which is another client's")
         return []
 
-    def accept_datagram(self, message: Packet, now: float) -> bool:
-        if isinstance(message, ClientUDPConnection):
+    def accept_datagram(self, message: packets.Packet, now: float) -> bool:
+        if isinstance(message, packets.ClientUDPConnection):
             self._fire(RobotEvent.PROBE, now)
             return False
         if self.state is not State.ESTABLISHED:  # until the 7 the source may be somebody else's
@@ -326,13 +315,13 @@ class RobotRole(PacketSession):
     def _offer_udp(self, now: float) -> None:
         """Send 4; the time limit of the settings ends."""
         self.lift_limit()
-        self.send_first(ServerStartUDP())
+        self.send_first(packets.ServerStartUDP())
         self._report_until = now + PROBE_S
 
     def _answer_probe(self, now: float) -> None:
         """Send 6(true) by UDP to the source of the 5."""
         self.transport = "udp"
-        self._answer = Datagram(self.encode(ServerUDPConnection(True)))
+        self._answer = Datagram(self.encode(packets.ServerUDPConnection(True)))
         self.outbox.put_exempt(self._answer)
 
     def _send_no_answer(self, now: float) -> None:

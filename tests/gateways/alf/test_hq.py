@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gateways.alf import hq as module
+from gateways.alf import messages
 from gateways.alf.conformance import parser
 from gateways.alf.conformance.parser import VehicleReader as Reader
 from gateways.alf.hq import AlfHq, AlfHqOptions
@@ -359,7 +359,7 @@ def test_what_waits_is_the_newest_and_encoded_once_however_many_clients_there_ar
         encoded.append(message.spec.name)
         return write_text(message)
 
-    monkeypatch.setattr(module, "write_text", counting)
+    monkeypatch.setattr(messages, "write_text", counting)
     scene = Scene(clients=250)
     scene.tell(SCANNER)
     for number in range(10):

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateways.tcpudp import hq as display
-from gateways.tcpudp import hq_client as client_module
+from gateways.tcpudp import messages
 from gateways.tcpudp.hq import TcpUdpHq
 from gateways.tcpudp.hq_client import TcpUdpClient
 from gateways.tcpudp.messages import Packet, encode_packet
@@ -473,8 +472,7 @@ def test_a_message_is_encoded_once_for_clients_of_all_versions(topic, message, e
         written.append(packet)
         return encode_packet(packet, sender_id)
 
-    monkeypatch.setattr(client_module, "encode_packet", write)
-    monkeypatch.setattr(display, "encode_packet", write)
+    monkeypatch.setattr(messages, "encode_packet", write)
     listener.show(topic, message)
     assert topic is not topics.MAP or not written, "a map is not made where there is no client"
     assert sum(len(client.shown(topic, message)) for client in crowd) == (8 if message is REQUEST else 12)

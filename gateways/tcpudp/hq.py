@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from gateways.tcpudp import messages as packets
-from gateways.tcpudp.hq_client import TcpUdpClient, commands, each_once, newest_of
+from gateways.tcpudp.hq_client import TRANSLATE, TcpUdpClient, each_once, newest_of, raw_command
 from gateways.tcpudp.maps import (
     TCP_BYTES,
     UDP_BYTES,
@@ -130,7 +130,7 @@ class TcpUdpHq(HqSide):
     # What is understood
 
     def take(self, session: TcpUdpClient, message: packets.Packet) -> tuple[Telemetry, ...]:
-        return commands(session, message, self.options)
+        return TRANSLATE.get(type(message), raw_command)(session, message, self.options)
 
 
 _FEATURES = {feature.value for feature in Feature}

@@ -115,12 +115,6 @@ def _without_map_flag(settings: Settings) -> bytes:
 Commands = tuple[Telemetry, ...]
 
 
-def commands(client: TcpUdpClient, packet: packets.Packet, options: TcpUdpHqOptions) -> Commands:
-    """Translate a packet of a client; raise ProtocolError if it has no meaning."""
-    translate = _TRANSLATE.get(type(packet))
-    return translate(client, packet, options) if translate is not None else _raw(packet)
-
-
 def _move(client: TcpUdpClient, packet: packets.ClientJoystickMove, options: TcpUdpHqOptions) -> Commands:
     speed = packet.speed / options.speed_full
     forward, left = packet.y * speed, 0.0 - packet.x * speed
@@ -181,7 +175,8 @@ def _ask_pose(client: TcpUdpClient, packet: packets.ClientGetPosition, options: 
     return ((topics.RPC_POSE, Query()),)
 
 
-def _raw(packet: packets.Packet) -> Commands:
+def raw_command(client: TcpUdpClient, packet: packets.Packet, options: TcpUdpHqOptions) -> Commands:
+    """Pass on a packet that no fleet message holds."""
     if isinstance(packet, packets.OpaquePacket):
         raw = Raw(packet.id, packet.body)
     else:
@@ -190,7 +185,7 @@ def _raw(packet: packets.Packet) -> Commands:
 
 
 _MODES = {1: Mode("none"), 2: Mode("manual"), 3: Mode("autonomous")}
-_TRANSLATE: dict[type[packets.Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOptions], Commands]] = {
+TRANSLATE: dict[type[packets.Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOptions], Commands]] = {
     packets.ClientJoystickMove: _move,
     packets.ClientJoystickRotate: _rotate,
     packets.ClientJoystickStop: _stop,
@@ -201,3 +196,4 @@ _TRANSLATE: dict[type[packets.Packet], Callable[[TcpUdpClient, Any, TcpUdpHqOpti
     packets.ClientGetSLAMMap: _ask_map,
     packets.ClientGetPosition: _ask_pose,
 }
+"""The translation of each packet; all others are raw commands. They raise ProtocolError for one without a meaning."""

@@ -62,7 +62,7 @@ class HqRole(HqHandshake):
         """Whether the robot was ever sent mode 3; outlives connections. No packet shows that another mode ended it."""
         self._force = frozenset(force)
         self._registered: set[type[packets.Packet]] = set()
-        """Classes of packets that the robot's settings were found to allow."""
+        """Classes of packets that the robot knows, as far as they were checked."""
         self._chosen: _Chosen | None = None
         """The mode that was commanded last."""
         self._raw: deque[bytes] = deque(maxlen=LIMIT)
@@ -70,7 +70,8 @@ class HqRole(HqHandshake):
 
     def encode(self, message: packets.Packet) -> bytes:
         """Write a packet; raise Refused for one the robot may not know, EncodeError for one it cannot take whole."""
-        self.may_send(message)
+        if type(message) not in self._registered:
+            self.may_send(message)
         if isinstance(message, packets.DebugMessage) and not message.text:
             raise Malformed("an empty text crashes the robot")
         frame = super().encode(message)
@@ -80,22 +81,19 @@ class HqRole(HqHandshake):
 
     def may_send(self, message: packets.Packet) -> None:
         """Raise Unsupported for a packet that this robot may not know: an unregistered id crashes it."""
-        if type(message) in self._registered:
-            return
         if isinstance(message, packets.OpaquePacket):
             if message.id not in self._force:
                 raise Unsupported(f"packet {message.id} may crash the robot; list it in options.force if it knows it")
             return
         spec = message.spec
-        if spec.id in self._force or not spec.features or not self._force.isdisjoint(spec.features):
-            return
-        # Of several features the first one that the robot's version has a flag for decides.
-        feature = next((feature for feature in spec.features if hasattr(self.settings, feature.value)), None)
-        if feature is None:
-            names = " or ".join(feature.value for feature in spec.features)
-            raise Unsupported(f"{spec.name}: version {self._agreed} has no {names}")
-        if not getattr(self.settings, feature.value):
-            raise Unsupported(f"{spec.name}: the robot does not announce {feature.value}")
+        if spec.id not in self._force and spec.features and self._force.isdisjoint(spec.features):
+            # Of several features the first one that the robot's version has a flag for decides.
+            feature = next((feature for feature in spec.features if hasattr(self.settings, feature.value)), None)
+            if feature is None:
+                names = " or ".join(feature.value for feature in spec.features)
+                raise Unsupported(f"{spec.name}: version {self._agreed} has no {names}")
+            if not getattr(self.settings, feature.value):
+                raise Unsupported(f"{spec.name}: the robot does not announce {feature.value}")
         self._registered.add(type(message))
 
     @property

@@ -78,7 +78,7 @@ class TcpUdpClient(RobotRole):
 def newest_of(slot: str, packet: packets.Packet) -> Send:
     """Encode a packet once for all clients, to be queued as the newest of its slot, by datagram where it may be."""
     frame = packets.encode_packet(packet, RobotRole.sender_id)
-    datagram = Datagram(frame) if packet.spec.carrier.value == "udp*" else frame
+    datagram = Datagram(frame) if packet.spec.carrier is packets.Carrier.UDP_IF_AGREED else frame
 
     def send(session: TcpUdpClient, now: float) -> None:
         session.show(slot, packet.spec.id, datagram if session.by_udp else frame, now)

@@ -15,7 +15,7 @@ from typing import ClassVar, TypeVar
 import msgspec
 
 from gateways.tcpudp.settings import Feature
-from zbridge.protocol import Codec, EncodeError, ProtocolError
+from zbridge.protocol import Codec, Datagram, EncodeError, ProtocolError
 from zbridge.wire import F32, I32, U8, BinaryCodec, Blob, Bool, F32Array, Message, Rest, Text
 
 MAX_FRAME = 4 * 2**20 + 64
@@ -275,14 +275,19 @@ def frame_end(data: bytes, start: int) -> int:
     return start + 4 + length
 
 
-def encode_packet(message: Packet, sender_id: int) -> bytes:
-    """Write a packet with its header; raise EncodeError for values that do not fit."""
+def encode_packet(message: Packet, sender_id: int, transport: str = "tcp") -> bytes:
+    """Write a packet with its header, a Datagram if ``transport`` is ``udp`` and the table says UDP*.
+
+    Raise EncodeError for values that do not fit.
+    """
+    carrier = Carrier.TCP
     if isinstance(message, OpaquePacket):
         packet_id, body = message.id, message.body
     else:
-        packet_id, body = message.spec.id, message.spec.codec.encode(message)
+        packet_id, body, carrier = message.spec.id, message.spec.codec.encode(message), message.spec.carrier
     try:
-        return HEADER.pack(2 + len(body), sender_id, packet_id) + body
+        frame = HEADER.pack(2 + len(body), sender_id, packet_id) + body
+        return Datagram(frame) if transport == "udp" and carrier is Carrier.UDP_IF_AGREED else frame
     except struct.error as error:
         raise EncodeError(f"packet {packet_id} from {sender_id}: {error}") from error
 

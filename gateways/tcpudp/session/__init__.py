@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable
 from gateways.tcpudp.messages import (
     MAX_FRAME,
     PACKETS,
-    Carrier,
     DebugMessage,
     OpaquePacket,
     Packet,
@@ -20,7 +19,7 @@ from gateways.tcpudp.messages import (
     encode_packet,
     frame_end,
 )
-from zbridge.protocol import Datagram, Limits, ProtocolError, Role, Session
+from zbridge.protocol import Limits, ProtocolError, Role, Session
 
 HANDSHAKE_S = 5.0
 _QUOTED = 80
@@ -55,10 +54,7 @@ class PacketSession(Session[Packet]):
     """The ``id`` byte of what the session sends."""
 
     def encode(self, message: Packet) -> bytes:
-        frame = encode_packet(message, self.sender_id)
-        if self.transport == "udp" and not isinstance(message, OpaquePacket):
-            return Datagram(frame) if message.spec.carrier is Carrier.UDP_IF_AGREED else frame
-        return frame
+        return encode_packet(message, self.sender_id, self.transport)
 
     def misplaced(self, frame: bytes) -> ProtocolError:
         """Make the error for a packet that the peer may not send."""

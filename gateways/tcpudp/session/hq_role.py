@@ -74,7 +74,7 @@ class HqRole(HqHandshake):
             self.may_send(message)
         if isinstance(message, packets.DebugMessage) and not message.text:
             raise Malformed("an empty text crashes the robot")
-        frame = super().encode(message)
+        frame = packets.encode_packet(message, self.sender_id, self.transport)
         if len(frame) > MAX_WRITE:
             raise EncodeError(f"packet of {len(frame)} bytes, the robot reads {MAX_WRITE} at most")
         return frame
